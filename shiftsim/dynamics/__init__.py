@@ -1,0 +1,1 @@
+"""Vehicle dynamics: kinematic bicycle, LQR tracker, perfect tracking."""

@@ -1,0 +1,49 @@
+"""The exception tree. A message says what is wrong, where, and what to do about it."""
+
+
+class ShiftsimError(Exception):
+    """Base of all errors that a user can cause or mend.
+
+    Attributes:
+        hint: One line that says what to do, shown below the message on the command line.
+    """
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.hint = hint
+
+    def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
+        """Keep the hint when the error travels between processes."""
+        return type(self), (str(self), self.hint)
+
+
+class ConfigError(ShiftsimError):
+    """A setting or a command-line value is wrong."""
+
+
+class DataError(ShiftsimError):
+    """A file or store is missing, broken or of another version."""
+
+
+class ConversionError(DataError):
+    """A source recording cannot be converted."""
+
+
+class MapError(DataError):
+    """The map lacks what is needed here."""
+
+
+class PlannerError(ShiftsimError):
+    """A planner failed or returned something invalid."""
+
+
+class CheckpointError(PlannerError):
+    """Weights are missing, have the wrong hash or belong to another network."""
+
+
+class InvalidTrajectoryError(PlannerError):
+    """A planner's trajectory is too short, not finite or does not cover the next step."""
+
+
+class MissingExtraError(ShiftsimError, ImportError):
+    """An optional dependency is not installed."""

@@ -1,0 +1,346 @@
+"""Vehicle states, tracks, traffic lights, trajectories and commands.
+
+Everything is an array with one row per time; the few objects here name the columns. The ego pose is
+the rear axle, a track's pose is the centre of its box (nuplan-simulation.md §3).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
+
+# Columns of an ego state row. Velocities and accelerations are in the body frame at the rear axle.
+X, Y, HEADING = 0, 1, 2  # m, m, rad
+VX, VY = 3, 4  # m/s
+AX, AY = 5, 6  # m/s^2
+STEERING, STEERING_RATE = 7, 8  # rad, rad/s
+YAW_RATE, YAW_ACCEL = 9, 10  # rad/s, rad/s^2
+NUM_STATE = 11
+STATE_COLUMNS = (
+    "x",
+    "y",
+    "heading",
+    "vx",
+    "vy",
+    "ax",
+    "ay",
+    "steering_angle",
+    "steering_rate",
+    "yaw_rate",
+    "yaw_accel",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleParameters:
+    """Dimensions of the ego vehicle [m].
+
+    Attributes:
+        width: Overall width.
+        front_length: Rear axle to front bumper.
+        rear_length: Rear axle to rear bumper.
+        wheel_base: Distance between the axles.
+        height: Overall height.
+    """
+
+    width: float = 2.297
+    front_length: float = 4.049
+    rear_length: float = 1.127
+    wheel_base: float = 3.089
+    height: float = 1.777
+
+    @property
+    def length(self) -> float:
+        """Overall length [m]."""
+        return self.front_length + self.rear_length
+
+    @property
+    def rear_axle_to_center(self) -> float:
+        """Distance from the rear axle to the centre of the box [m]."""
+        return self.length / 2.0 - self.rear_length
+
+
+PACIFICA = VehicleParameters()
+
+
+class AgentKind(IntEnum):
+    """Type of a track, with nuPlan's numbers; the first three are agents, the others static."""
+
+    VEHICLE = 0
+    PEDESTRIAN = 1
+    BICYCLE = 2
+    TRAFFIC_CONE = 3
+    BARRIER = 4
+    CZONE_SIGN = 5
+    GENERIC_OBJECT = 6
+
+
+LAST_AGENT_KIND = AgentKind.BICYCLE  # kinds up to here have a velocity
+
+
+class LightStatus(IntEnum):
+    """State of a traffic light, with nuPlan's numbers; `ABSENT` marks a connector not listed."""
+
+    ABSENT = -1
+    GREEN = 0
+    YELLOW = 1
+    RED = 2
+    UNKNOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Everything that moves or stands except the ego, over a span of time.
+
+    Attributes:
+        valid: (T, N) whether the track is present.
+        poses: (T, N, 3) box centre x [m], y [m], heading [rad]; NaN where not valid.
+        velocities: (T, N, 2) in the map frame [m/s]; NaN where not valid and for static objects.
+        sizes: (T, N, 2) length, width [m]; NaN where not valid.
+        kinds: (N,) AgentKind codes.
+        tokens: N stable ids, unique within the scenario. Order of tracks: as in the first row of
+            the span, then by first appearance.
+    """
+
+    valid: BoolArray
+    poses: FloatArray
+    velocities: FloatArray
+    sizes: FloatArray
+    kinds: IntArray
+    tokens: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.valid)
+
+    @property
+    def num_tracks(self) -> int:
+        """Number of tracks, present or not."""
+        return len(self.tokens)
+
+    def rows(self, index: slice | IntArray) -> "Tracks":
+        """The same tracks over other rows: a view for a slice, a copy for an index array."""
+        return replace(
+            self,
+            valid=self.valid[index],
+            poses=self.poses[index],
+            velocities=self.velocities[index],
+            sizes=self.sizes[index],
+        )
+
+    def select(self, index: BoolArray | IntArray) -> "Tracks":
+        """A subset (or another order) of the tracks, over the same rows."""
+        where = np.flatnonzero(index) if index.dtype == np.bool_ else index
+        return Tracks(
+            self.valid[:, where],
+            self.poses[:, where],
+            self.velocities[:, where],
+            self.sizes[:, where],
+            self.kinds[where],
+            tuple(self.tokens[i] for i in where),
+        )
+
+    @staticmethod
+    def empty(num_rows: int) -> "Tracks":
+        """No tracks at all, over `num_rows` rows."""
+        return Tracks(
+            np.zeros((num_rows, 0), np.bool_),
+            np.zeros((num_rows, 0, 3)),
+            np.zeros((num_rows, 0, 2)),
+            np.zeros((num_rows, 0, 2)),
+            np.zeros(0, np.int64),
+            (),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficLights:
+    """Traffic light states of lane connectors over a span of time.
+
+    Attributes:
+        connector_ids: C lane connector ids.
+        status: (T, C) LightStatus codes, int8; `ABSENT` where the connector is not listed.
+    """
+
+    connector_ids: tuple[str, ...]
+    status: np.ndarray
+
+    def rows(self, index: slice | IntArray) -> "TrafficLights":
+        """The same connectors over other rows."""
+        return TrafficLights(self.connector_ids, self.status[index])
+
+    def at(self, row: int) -> dict[str, LightStatus]:
+        """Status by connector id, of the connectors listed in one row."""
+        return {
+            name: LightStatus(code)
+            for name, code in zip(self.connector_ids, self.status[row].tolist(), strict=True)
+            if code != LightStatus.ABSENT
+        }
+
+    @staticmethod
+    def empty(num_rows: int) -> "TrafficLights":
+        """No lights at all, over `num_rows` rows."""
+        return TrafficLights((), np.zeros((num_rows, 0), np.int8))
+
+
+@dataclass(frozen=True, slots=True)
+class EgoState:
+    """One ego state, as a view on a row of a state array.
+
+    Attributes:
+        time_us: Time stamp [us].
+        values: (11,) the columns named by `STATE_COLUMNS`, at the rear axle.
+    """
+
+    time_us: int
+    values: FloatArray
+
+    @property
+    def pose(self) -> FloatArray:
+        """(3,) rear axle x [m], y [m], heading [rad]."""
+        return self.values[:3]
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) box centre x [m], y [m], heading [rad]."""
+        return center_poses(self.values[None, :3])[0]
+
+    @property
+    def speed(self) -> float:
+        """Speed at the rear axle [m/s], never negative."""
+        return float(np.hypot(self.values[VX], self.values[VY]))
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(2,) velocity at the rear axle in the body frame [m/s]."""
+        return self.values[VX : VY + 1]
+
+    @property
+    def acceleration(self) -> FloatArray:
+        """(2,) acceleration at the rear axle in the body frame [m/s^2]."""
+        return self.values[AX : AY + 1]
+
+    @property
+    def steering_angle(self) -> float:
+        """Tyre angle [rad]."""
+        return float(self.values[STEERING])
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the motion model executes when a planner drives without a tracker.
+
+    Attributes:
+        acceleration: Commanded longitudinal acceleration [m/s^2].
+        steering_rate: Commanded rate of the steering angle [rad/s].
+    """
+
+    acceleration: float
+    steering_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A plan: ego states at times.
+
+    Attributes:
+        time_us: (H,) strictly increasing; log time stamps, or offsets from the moment of planning
+            where `relative` is true [us].
+        states: (H, 11) the columns of `STATE_COLUMNS`, rear axle. The LQR tracker reads the poses
+            only; perfect tracking also reads velocities, accelerations and the steering angle.
+        relative: Whether `time_us` counts from the moment of planning.
+    """
+
+    time_us: IntArray
+    states: FloatArray
+    relative: bool = False
+
+    @staticmethod
+    def from_poses(times: ArrayLike, poses: ArrayLike) -> "Trajectory":
+        """A plan from poses alone.
+
+        Args:
+            times: (H,) seconds from now, strictly increasing, usually 0, 0.1, 0.2, …
+            poses: (H, 3) rear axle x [m], y [m], heading [rad].
+
+        Returns:
+            The trajectory; velocities along the heading follow from the positions.
+
+        Raises:
+            ValueError: The shapes do not fit.
+        """
+        seconds = np.asarray(times, np.float64)
+        pose = np.asarray(poses, np.float64)
+        if seconds.ndim != 1 or pose.shape != (len(seconds), 3):
+            raise ValueError(
+                f"need times (H,) and poses (H, 3), got {seconds.shape} and {pose.shape}"
+            )
+        states = np.zeros((len(seconds), NUM_STATE))
+        states[:, :3] = pose
+        if len(seconds) > 1:
+            step = np.diff(pose[:, :2], axis=0) / np.diff(seconds)[:, None]
+            forward = step[:, 0] * np.cos(pose[:-1, 2]) + step[:, 1] * np.sin(pose[:-1, 2])
+            states[:-1, VX] = forward
+            states[-1, VX] = forward[-1]
+        return Trajectory(np.rint(seconds * 1e6).astype(np.int64), states, relative=True)
+
+    def starting_at(self, now_us: int) -> "Trajectory":
+        """The same plan with log time stamps."""
+        return (
+            replace(self, time_us=self.time_us + now_us, relative=False) if self.relative else self
+        )
+
+
+def center_poses(rear_poses: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
+    """Box centres of rear-axle poses, both (..., 3) x [m], y [m], heading [rad]."""
+    out = np.array(rear_poses, np.float64)
+    out[..., 0] += vehicle.rear_axle_to_center * np.cos(rear_poses[..., 2])
+    out[..., 1] += vehicle.rear_axle_to_center * np.sin(rear_poses[..., 2])
+    return out
+
+
+def rear_poses(centers: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
+    """Rear-axle poses of box centres, both (..., 3) x [m], y [m], heading [rad]."""
+    out = np.array(centers, np.float64)
+    out[..., 0] -= vehicle.rear_axle_to_center * np.cos(centers[..., 2])
+    out[..., 1] -= vehicle.rear_axle_to_center * np.sin(centers[..., 2])
+    return out
+
+
+def center_velocities(states: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
+    """(..., 2) velocity at the box centre in the body frame [m/s], from (..., 11) states."""
+    out = states[..., VX : VY + 1].copy()
+    out[..., 1] += vehicle.rear_axle_to_center * states[..., YAW_RATE]
+    return out
+
+
+def center_accelerations(states: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
+    """(..., 2) acceleration at the box centre in the body frame [m/s^2], from (..., 11) states.
+
+    nuPlan: the centripetal and the angular term both go to the longitudinal part with a plus sign;
+    this is not the rigid-body formula, and the comfort metrics read it (nuplan-simulation.md §3).
+    """
+    out = states[..., AX : AY + 1].copy()
+    distance = vehicle.rear_axle_to_center
+    out[..., 0] += distance * states[..., YAW_RATE] ** 2 + distance * states[..., YAW_ACCEL]
+    return out
+
+
+def speeds(states: FloatArray) -> FloatArray:
+    """(...) speed at the rear axle [m/s], from (..., 11) states."""
+    return np.hypot(states[..., VX], states[..., VY])
+
+
+def join_tracks(parts: Sequence[Tracks]) -> Tracks:
+    """Several sets of tracks over the same rows as one."""
+    return Tracks(
+        np.concatenate([part.valid for part in parts], axis=1),
+        np.concatenate([part.poses for part in parts], axis=1),
+        np.concatenate([part.velocities for part in parts], axis=1),
+        np.concatenate([part.sizes for part in parts], axis=1),
+        np.concatenate([part.kinds for part in parts]),
+        sum((part.tokens for part in parts), ()),
+    )

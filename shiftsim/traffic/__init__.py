@@ -1,0 +1,1 @@
+"""How everything but the ego moves: replayed from the log, or reactive."""

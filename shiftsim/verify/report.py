@@ -1,0 +1,134 @@
+"""Collects the comparisons of one verification and prints them.
+
+A *case* is one compared quantity of one thing (an array of one run, say). Everything in a reference
+folder is compared, or named: as not covered (counts against `--require-all`) or as informative (a
+label, or a value that by the folder's README need not be compared).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass
+class Quantity:
+    """Tally of one quantity over all cases."""
+
+    cases: int = 0
+    mismatches: int = 0
+    max_error: float = 0.0
+    tolerance: float = 0.0
+
+
+@dataclass
+class Report:
+    """All comparisons so far.
+
+    Attributes:
+        quantities: Tally by quantity, in the order of first appearance.
+        mismatches: One line per case that differs.
+        not_covered: Count by description of what should be compared and was not.
+        informative: Descriptions of what need not be compared.
+    """
+
+    quantities: dict[str, Quantity] = field(default_factory=dict)
+    mismatches: list[str] = field(default_factory=list)
+    not_covered: dict[str, int] = field(default_factory=dict)
+    informative: list[str] = field(default_factory=list)
+
+    def compare(
+        self, quantity: str, where: str, actual: object, expected: object, *, atol: float = 0.0
+    ) -> bool:
+        """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
+
+        Args:
+            quantity: What is compared; cases of one quantity are tallied together.
+            where: Which case: file, scene, run.
+            actual: Ours: a scalar, string, list or array.
+            expected: The reference value of the same form.
+            atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
+                compared exactly.
+
+        Returns:
+            Whether they agree.
+        """
+        tally = self.quantities.setdefault(quantity, Quantity())
+        tally.cases += 1
+        tally.tolerance = max(tally.tolerance, atol)
+        ours, theirs = np.asarray(actual), np.asarray(expected)
+        if ours.shape != theirs.shape:
+            return self._differ(tally, quantity, where, f"shape {ours.shape}, not {theirs.shape}")
+        if ours.dtype.kind not in "fiub" or theirs.dtype.kind not in "fiub":
+            bad = np.atleast_1d(ours != theirs)
+        elif ours.dtype.kind in "iub" and theirs.dtype.kind in "iub":
+            bad = np.atleast_1d(ours != theirs)
+        else:
+            left, right = ours.astype(np.float64), theirs.astype(np.float64)
+            same = (left == right) | (np.isnan(left) & np.isnan(right))
+            with np.errstate(invalid="ignore"):
+                error = np.where(same, 0.0, np.abs(left - right))
+            error = np.where(np.isnan(error), np.inf, error)
+            if error.size:
+                tally.max_error = max(tally.max_error, float(error.max()))
+            bad = np.atleast_1d(error > atol)
+        if not bad.any():
+            return True
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        got = np.atleast_1d(ours)[first]
+        want = np.atleast_1d(theirs)[first]
+        at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
+        count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
+        return self._differ(tally, quantity, where, f"{got!r}, not {want!r}{at}{count}")
+
+    def _differ(self, tally: Quantity, quantity: str, where: str, what: str) -> bool:
+        tally.mismatches += 1
+        self.mismatches.append(f"{quantity}: {where}: {what}")
+        return False
+
+    def fail(self, quantity: str, where: str, why: str) -> None:
+        """Count one case as differing because it could not be computed."""
+        tally = self.quantities.setdefault(quantity, Quantity())
+        tally.cases += 1
+        self._differ(tally, quantity, where, why)
+
+    def skip(self, what: str, count: int = 1) -> None:
+        """Name something that should be compared and is not."""
+        self.not_covered[what] = self.not_covered.get(what, 0) + count
+
+    def note(self, what: str) -> None:
+        """Name something that need not be compared."""
+        if what not in self.informative:
+            self.informative.append(what)
+
+    @property
+    def num_cases(self) -> int:
+        """Cases compared."""
+        return sum(tally.cases for tally in self.quantities.values())
+
+    def lines(self, max_mismatches: int = 50) -> list[str]:
+        """The report as text; the last line is the summary."""
+        out = []
+        for name, tally in self.quantities.items():
+            equal = tally.cases - tally.mismatches
+            out.append(
+                f"{name}: {equal}/{tally.cases} equal, max |Δ| {tally.max_error:.3g} "
+                f"(tolerance {tally.tolerance:.3g})"
+            )
+        out += [f"not compared: {what}" for what in self.informative]
+        out += [f"not covered: {what} ({count})" for what, count in self.not_covered.items()]
+        out += [f"MISMATCH {line}" for line in self.mismatches[:max_mismatches]]
+        if len(self.mismatches) > max_mismatches:
+            out.append(f"… and {len(self.mismatches) - max_mismatches} more mismatches")
+        out.append(
+            f"{self.num_cases} cases covered, {len(self.mismatches)} mismatches, "
+            f"{sum(self.not_covered.values())} not covered"
+        )
+        return out
+
+    def exit_code(self, *, require_all: bool = False) -> int:
+        """0 all equal, 1 a mismatch, 2 nothing covered, 3 something not covered and all required."""
+        if self.mismatches:
+            return 1
+        if self.num_cases == 0:
+            return 2
+        return 3 if require_all and self.not_covered else 0
