@@ -126,7 +126,7 @@ class Report:
         return out
 
     def exit_code(self, *, require_all: bool = False) -> int:
-        """0 all equal, 1 a mismatch, 2 nothing covered, 3 something not covered and all required."""
+        """0 all equal, 1 a mismatch, 2 nothing covered, 3 not all covered and all required."""
         if self.mismatches:
             return 1
         if self.num_cases == 0:
