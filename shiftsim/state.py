@@ -123,12 +123,13 @@ class Tracks:
 
     def rows(self, index: slice | IntArray) -> "Tracks":
         """The same tracks over other rows: a view for a slice, a copy for an index array."""
-        return replace(
-            self,
-            valid=self.valid[index],
-            poses=self.poses[index],
-            velocities=self.velocities[index],
-            sizes=self.sizes[index],
+        return Tracks(
+            self.valid[index],
+            self.poses[index],
+            self.velocities[index],
+            self.sizes[index],
+            self.kinds,
+            self.tokens,
         )
 
     def select(self, index: BoolArray | IntArray) -> "Tracks":

@@ -1,1 +1,64 @@
-"""How everything but the ego moves: replayed from the log, or reactive."""
+"""How everything but the ego moves: replayed from the log, or reactive.
+
+A traffic model owns the tracks of a rollout from iteration 0 on. The simulator hands it one buffer
+of tracks whose rows are the past samples followed by the iterations, filled from the log; the model
+rewrites rows as the rollout proceeds. A model is any object with the two methods of `Traffic`.
+"""
+
+from importlib import import_module
+from typing import Protocol
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import ConfigError
+from shiftsim.scenario import Scenario
+from shiftsim.state import Tracks
+
+_MODELS = {
+    "nonreactive": "shiftsim.traffic.log_replay:LogReplay",
+    "reactive": "shiftsim.traffic.idm:IdmTraffic",
+}
+_SHORT = {"nr": "nonreactive", "r": "reactive"}
+
+
+class Traffic(Protocol):
+    """What the simulator asks of a traffic model."""
+
+    def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
+        """Prepare for a new rollout.
+
+        Args:
+            scenario: The scenario.
+            tracks: (B, N, …) tracks of the rollout, filled from the log, writable.
+            row: Row of `tracks` that is iteration 0; earlier rows are history and stay as they are.
+        """
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move everyone from one iteration to the next.
+
+        Args:
+            iteration: The iteration that ends, i.
+            ego: (11,) ego state at iteration i.
+            tracks: The buffer of `start`.
+            row: Row of `tracks` that is iteration i + 1; the model writes it.
+        """
+
+
+def traffic_name(name: str) -> str:
+    """The full name of a traffic mode: `nr` and `r` are accepted.
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+    full = _SHORT.get(name, name)
+    if full not in _MODELS and ":" not in full:
+        raise ConfigError(
+            f"traffic {name!r} unknown", hint=f"available: {', '.join(sorted(_MODELS))}"
+        )
+    return full
+
+
+def make_traffic(name: str) -> Traffic:
+    """A traffic model by name, or by `package.module:Class`."""
+    module, _, attribute = _MODELS.get(full := traffic_name(name), full).partition(":")
+    model: Traffic = getattr(import_module(module), attribute)()
+    return model
