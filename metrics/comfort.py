@@ -1,0 +1,183 @@
+"""Comfort: seven smoothed or differentiated signals, and six bounds on them.
+
+Savitzky-Golay filters with `mode="interp"`: interior samples are weighted sums over a window, the
+first and last half windows lie on the polynomial fitted to the first or last window
+(nuplan-metrics.md §11). Signals shorter than the window lie on one fit altogether.
+"""
+
+from functools import lru_cache
+from math import factorial
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.errors import DataError
+from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.state import AX, AY, HEADING, center_accelerations
+
+MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
+_SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
+# nuPlan: an even window is centred half a sample ahead, so that interior output n is the fitted
+# value at n + 1/2, with a jump to the edge fits (nuplan-metrics.md §13 Q6)
+_SMOOTH_INTERIOR = np.array([-3.0, 3.0, 7.0, 9.0, 9.0, 7.0, 3.0, -3.0]) / 32.0
+
+
+class ComfortSignals(NamedTuple):
+    """Processed signals of one rollout, all (K,).
+
+    Attributes:
+        lon_accel: Smoothed longitudinal acceleration at the centre [m/s^2].
+        lat_accel: Smoothed lateral acceleration at the centre [m/s^2].
+        mag_accel: Smoothed magnitude of the acceleration at the rear axle [m/s^2].
+        lon_jerk: Derivative of `lon_accel` [m/s^3].
+        mag_jerk: Derivative of `mag_accel` [m/s^3].
+        yaw_rate: First derivative of the heading [rad/s].
+        yaw_accel: Second derivative of the heading [rad/s^2].
+    """
+
+    lon_accel: FloatArray
+    lat_accel: FloatArray
+    mag_accel: FloatArray
+    lon_jerk: FloatArray
+    mag_jerk: FloatArray
+    yaw_rate: FloatArray
+    yaw_accel: FloatArray
+
+
+# What is bounded, in nuPlan's order: devkit metric name -> signal. `bounds_of` has the same order.
+BOUNDED_SIGNALS = {
+    "ego_jerk": "mag_jerk",
+    "ego_lat_acceleration": "lat_accel",
+    "ego_lon_acceleration": "lon_accel",
+    "ego_lon_jerk": "lon_jerk",
+    "ego_yaw_acceleration": "yaw_accel",
+    "ego_yaw_rate": "yaw_rate",
+}
+
+
+def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
+    """The seven signals of a driven sequence of states.
+
+    Args:
+        time_us: (K,) time stamps [us].
+        states: (K, 11) rear-axle states, columns of `state.STATE_COLUMNS`.
+
+    Returns:
+        The signals, rounded to 8 decimals as nuPlan does.
+
+    Raises:
+        DataError: There are fewer than 4 samples, or the stamps do not increase.
+    """
+    if len(time_us) < MIN_SAMPLES:
+        raise DataError(
+            f"{len(time_us)} samples are too few for the comfort metrics, which fit cubics to "
+            f"{MIN_SAMPLES} of them",
+            f"simulate at least {MIN_SAMPLES + 1} iterations",
+        )
+    steps = np.diff(time_us / 1e6)
+    if not (steps > 0.0).all():
+        at = int(np.flatnonzero(~(steps > 0.0))[0]) + 1
+        raise DataError(f"time stamps of the rollout do not increase at sample {at}")
+    step = float(np.mean(steps))
+    center = center_accelerations(states)
+    # nuPlan: magnitudes are taken at the rear axle, components at the centre (§13 Q7)
+    magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
+    lon, lat, mag = (_smooth(np.ascontiguousarray(v)) for v in (*center.T, magnitude))
+    heading = _unwrap(states[:, HEADING])
+    return ComfortSignals(
+        lon_accel=lon,
+        lat_accel=lat,
+        mag_accel=mag,
+        lon_jerk=_derive(lon, _JERK_WINDOW, 2, 1, step),
+        mag_jerk=_derive(mag, _JERK_WINDOW, 2, 1, step),
+        yaw_rate=_derive(heading, _YAW_WINDOW, 2, 1, step),
+        yaw_accel=_derive(heading, _YAW_WINDOW, 3, 2, step),
+    )
+
+
+def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:
+    """Lower and upper bound of each entry of `BOUNDED_SIGNALS`."""
+    t = thresholds
+    return [
+        (-t.max_abs_mag_jerk, t.max_abs_mag_jerk),
+        (-t.max_abs_lat_accel, t.max_abs_lat_accel),
+        (t.min_lon_accel, t.max_lon_accel),
+        (-t.max_abs_lon_jerk, t.max_abs_lon_jerk),
+        (-t.max_abs_yaw_accel, t.max_abs_yaw_accel),
+        (-t.max_abs_yaw_rate, t.max_abs_yaw_rate),
+    ]
+
+
+def within_bounds(signals: ComfortSignals, thresholds: Thresholds) -> list[bool]:
+    """Whether each entry of `BOUNDED_SIGNALS` stays strictly within its bounds throughout."""
+    return [
+        bool(((low < values) & (values < high)).all())
+        for values, (low, high) in zip(
+            (getattr(signals, name) for name in BOUNDED_SIGNALS.values()),
+            bounds_of(thresholds),
+            strict=True,
+        )
+    ]
+
+
+def _unwrap(angles: FloatArray) -> FloatArray:
+    turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)))
+    out = np.array(angles, np.float64)
+    out[1:] -= 2.0 * np.pi * turns
+    return out
+
+
+def _smooth(values: FloatArray) -> FloatArray:
+    window = min(_SMOOTH_WINDOW, len(values))
+    fit = _fit_matrix(window, 2, 0)
+    interior = _SMOOTH_INTERIOR if window == _SMOOTH_WINDOW else fit[window // 2]
+    return _filter(values, interior, fit, 1.0)
+
+
+def _derive(values: FloatArray, window: int, degree: int, order: int, step: float) -> FloatArray:
+    window = min(window, len(values))
+    fit = _fit_matrix(window, degree, order)
+    return _filter(values, fit[window // 2], fit, step**order)
+
+
+@lru_cache(maxsize=64)
+def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
+    """(window, window) that maps samples at unit spacing to derivatives of their fit there."""
+    at = np.arange(window) - 0.5 * (window - 1)
+    powers = at[:, None] ** np.arange(degree + 1)
+    fit = np.linalg.solve(powers.T @ powers, powers.T)  # samples -> coefficients
+    derived = np.zeros_like(powers)
+    for power in range(order, degree + 1):
+        scale = factorial(power) / factorial(power - order)
+        derived[:, power] = scale * at ** (power - order)
+    return np.ascontiguousarray(derived @ fit)
+
+
+@kernel
+def _filter(values: FloatArray, interior: FloatArray, fit: FloatArray, scale: float) -> FloatArray:
+    """Filter a signal and round it to 8 decimals.
+
+    Args:
+        values: (K,) the signal.
+        interior: (W,) weights; output n sees the samples from n - (W - 1) // 2 on.
+        fit: (W, W) edge outputs from the first or last W samples, W <= K.
+        scale: What every output is divided by.
+    """
+    count, window = len(values), len(fit)
+    half = window // 2
+    out = np.empty(count)
+    for n in range(count):
+        total = 0.0
+        if n < half:
+            for j in range(window):
+                total += fit[n, j] * values[j]
+        elif n >= count - half:
+            for j in range(window):
+                total += fit[n - count + window, j] * values[count - window + j]
+        else:
+            for j in range(window):
+                total += interior[j] * values[n - (window - 1) // 2 + j]
+        # nuPlan: rounded between smoothing and differentiation, and before comparison (§13 Q8)
+        out[n] = np.rint(total / scale * 1e8) / 1e8
+    return out

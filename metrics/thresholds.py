@@ -1,0 +1,91 @@
+"""Threshold profiles as plain data: `nuplan` (the devkit's defaults) and `deepplan`.
+
+The names follow the devkit's configuration keys (nuplan-metrics.md §2).
+"""
+
+import difflib
+from dataclasses import dataclass, replace
+
+from shiftsim.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Every number that a score depends on; the defaults are nuPlan's.
+
+    Attributes:
+        name: Profile name, which travels with every result.
+        max_abs_mag_jerk: Bound on the derivative of the acceleration magnitude [m/s^3].
+        max_abs_lat_accel: Bound on the lateral acceleration [m/s^2].
+        min_lon_accel: Lower bound on the longitudinal acceleration [m/s^2].
+        max_lon_accel: Upper bound on the longitudinal acceleration [m/s^2].
+        max_abs_lon_jerk: Bound on the longitudinal jerk [m/s^3].
+        max_abs_yaw_accel: Bound on the yaw acceleration [rad/s^2].
+        max_abs_yaw_rate: Bound on the yaw rate [rad/s].
+        max_drivable_area_violation: How far a corner may leave the drivable area [m].
+        driving_direction_compliance: Regress within the window up to which the score is 1 [m].
+        driving_direction_violation: Regress from which on the score is 0 [m].
+        driving_direction_horizon: Length of that window [s].
+        least_min_ttc: The time to collision must exceed this at every sample [s].
+        allowed_vru_collisions: At-fault collisions that halve the score instead of zeroing it.
+        allowed_vehicle_collisions: The same for vehicles.
+        allowed_object_collisions: The same for static objects.
+        min_progress: Progress ratio that counts as making progress.
+        score_progress: Progress below this counts as this, for ego and expert alike [m].
+        max_overspeed: Over-speed that costs the whole score when held throughout [m/s].
+        max_lane_change_fail_rate: Share of failed lane changes that still passes; not scored.
+    """
+
+    name: str
+    max_abs_mag_jerk: float = 8.37
+    max_abs_lat_accel: float = 4.89
+    min_lon_accel: float = -4.05
+    max_lon_accel: float = 2.40
+    max_abs_lon_jerk: float = 4.13
+    max_abs_yaw_accel: float = 1.93
+    max_abs_yaw_rate: float = 0.95
+    max_drivable_area_violation: float = 0.3
+    driving_direction_compliance: float = 2.0
+    driving_direction_violation: float = 6.0
+    driving_direction_horizon: float = 1.0
+    least_min_ttc: float = 0.95
+    allowed_vru_collisions: int = 0
+    allowed_vehicle_collisions: int = 0
+    allowed_object_collisions: int = 1
+    min_progress: float = 0.2
+    score_progress: float = 2.0
+    max_overspeed: float = 2.23
+    max_lane_change_fail_rate: float = 0.3
+
+
+NUPLAN = Thresholds("nuplan")
+# least_min_ttc is taken literally from the paper's table, nuplan-metrics.md §2
+DEEPPLAN = replace(
+    NUPLAN,
+    name="deepplan",
+    min_lon_accel=-6.0,
+    max_lon_accel=4.0,
+    max_abs_lon_jerk=6.0,
+    max_drivable_area_violation=3.0,
+    driving_direction_compliance=4.0,
+    driving_direction_violation=10.0,
+    least_min_ttc=0.5,
+)
+PROFILES = {profile.name: profile for profile in (NUPLAN, DEEPPLAN)}
+
+
+def thresholds_of(profile: str | Thresholds) -> Thresholds:
+    """The profile of a name, or the thresholds themselves.
+
+    Raises:
+        ConfigError: There is no profile of that name.
+    """
+    if isinstance(profile, Thresholds):
+        return profile
+    if profile not in PROFILES:
+        near = difflib.get_close_matches(profile, PROFILES, n=1)
+        raise ConfigError(
+            f"unknown threshold profile {profile!r}; valid are {', '.join(PROFILES)}",
+            f"did you mean {near[0]!r}" if near else "",
+        )
+    return PROFILES[profile]
