@@ -1,0 +1,456 @@
+"""nuPlan's map.gpkg -> VectorMap, without GDAL (nuplan-formats.md §3).
+
+A GeoPackage is an SQLite file whose geometries are a short header followed by WKB. Layers are kept
+in longitude and latitude and projected to the metric system named in the table `meta`.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import shapely
+
+from shiftsim.arrays import FloatArray
+from shiftsim.data.untrusted_sqlite import Database, open_database
+from shiftsim.errors import DataError, MapError
+from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+
+_MEND = "the map is damaged or not a nuPlan map; get it again from its source"
+_ENVELOPE_BYTES = (0, 32, 48, 48, 64)
+_MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
+_BIKE_LANE = 1
+_TURN_UNKNOWN = 4
+
+# Drivable area: the rows of these layers one after the other, nuplan-formats.md §3 rule 4.
+_DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One layer: ids, projected geometries and the columns asked for."""
+
+    name: str
+    ids: list[str]
+    shapes: list[shapely.Geometry]
+    columns: dict[str, list[object]]
+
+    def text_ids(self, column: str) -> list[str | None]:
+        """A column of references as strings; None where it is empty."""
+        values = self.columns[column]
+        return [None if v is None or v == "" else _id(v, self.name, column) for v in values]
+
+    def integers(self, column: str, default: int) -> list[int]:
+        """A column of codes; `default` where it is empty."""
+        values = self.columns[column]
+        return [default if v is None else int(_id(v, self.name, column)) for v in values]
+
+
+class _Gpkg:
+    """Reads and projects the layers of one file."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+        self.path = database.path
+        meta = database.columns("meta", ["key", "value"])
+        system = dict(zip(meta["key"], meta["value"], strict=True)).get("projectedCoordSystem")
+        self.epsg = self._epsg(system)
+        self._to_metres = _transformer(self.epsg)
+
+    def _epsg(self, system: object) -> int:
+        name, _, code = str(system).lower().partition(":")
+        if name != "epsg" or not code.isdigit():
+            raise DataError(
+                f"{self.path}: table 'meta': projectedCoordSystem is {system!r}, not 'epsg:<code>'",
+                hint=_MEND,
+            )
+        return int(code)
+
+    def table(self, name: str, columns: Sequence[str] = (), extra: Sequence[str] = ()) -> _Table:
+        raw = self.database.columns(name, ["fid", "geom", *columns], extra)
+        bodies = [self._wkb(b, name, f) for f, b in zip(raw["fid"], raw["geom"], strict=True)]
+        try:
+            shapes = shapely.force_2d(shapely.from_wkb(np.array(bodies, object)))
+            xy = shapely.get_coordinates(shapes)
+            x, y = self._to_metres.transform(xy[:, 0], xy[:, 1])
+        except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
+            raise DataError(
+                f"{self.path}: layer {name!r}: broken geometry: {error}", hint=_MEND
+            ) from error
+        if not (np.isfinite(x).all() and np.isfinite(y).all()):
+            raise DataError(
+                f"{self.path}: layer {name!r}: a coordinate is not finite in epsg:{self.epsg}",
+                hint=_MEND,
+            )
+        projected = shapely.set_coordinates(shapes, np.column_stack([x, y]))
+        ids = [_id(v, name, "fid") for v in raw["fid"]]
+        return _Table(name, ids, list(projected), raw)
+
+    def _wkb(self, blob: object, layer: str, fid: object) -> bytes:
+        where = f"{self.path}: layer {layer!r}: geometry of fid {fid!r}"
+        if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+            raise DataError(f"{where} is not a GeoPackage geometry", hint=_MEND)
+        envelope = (blob[3] >> 1) & 7
+        if envelope >= len(_ENVELOPE_BYTES) or blob[3] & 0x30:
+            raise DataError(f"{where} is empty or of an unknown kind", hint=_MEND)
+        (system,) = struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])
+        if system != 4326:
+            raise DataError(f"{where} has the coordinate system {system}, not 4326", hint=_MEND)
+        return blob[8 + _ENVELOPE_BYTES[envelope] :]
+
+
+@lru_cache(maxsize=8)
+def _transformer(epsg: int) -> pyproj.Transformer:
+    try:
+        return pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
+    except pyproj.exceptions.CRSError as error:
+        raise DataError(f"epsg:{epsg} is not a coordinate system: {error}", hint=_MEND) from error
+
+
+def _id(value: object, layer: str, column: str) -> str:
+    # nuPlan: reference columns are cast to int as a whole (nuplan-formats.md §3 rule 5).
+    try:
+        number = float(value)  # type: ignore[arg-type]  # anything SQLite can hold
+        if number == int(number):
+            return str(int(value)) if not isinstance(value, float) else str(int(number))  # type: ignore[call-overload]
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise DataError(
+        f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", hint=_MEND
+    )
+
+
+def read_map(path: Path, name: str) -> VectorMap:
+    """Read a nuPlan map.
+
+    Args:
+        path: The file `map.gpkg`.
+        name: Name of the map (city).
+
+    Returns:
+        The map in metres. Flaws that nuPlan tolerates are counted in its `flaws`.
+
+    Raises:
+        DataError: The file is missing or broken, or lacks a layer or column.
+    """
+    with open_database(Path(path)) as database:
+        gpkg = _Gpkg(database)
+        try:
+            return _assemble(gpkg, name)
+        except MapError as error:
+            raise MapError(f"{path}: {error}", hint=_MEND) from error
+        except DataError as error:
+            if str(error).startswith(str(path)):
+                raise
+            raise DataError(f"{path}: {error}", hint=error.hint) from error
+
+
+def _assemble(gpkg: _Gpkg, name: str) -> VectorMap:
+    flaws: dict[str, int] = {}
+    boundaries = _lines(gpkg.table("boundaries"))
+    baselines = _baselines(gpkg)
+    intersections = gpkg.table("intersections", extra=["intersection_type_fid"])
+    stops = gpkg.table("stop_polygons", ["stop_polygon_type_fid"])
+    connectors = gpkg.table(
+        "lane_connectors",
+        [
+            "exit_lane_fid",
+            "entry_lane_fid",
+            "lane_group_connector_fid",
+            "speed_limit_mps",
+            "traffic_light_stop_line_fids",
+        ],
+        ["intersection_fid", "turn_type_fid"],
+    )
+    edges = [
+        *_lanes(gpkg, baselines, boundaries, connectors, flaws),
+        *_connectors(gpkg, baselines, boundaries, connectors, stops, flaws),
+    ]
+    blocks = _blocks(gpkg, flaws)
+    lanes = [spec.polygon for spec in edges if not spec.is_connector]
+    _count(flaws, "overlapping lanes", _num_overlaps(lanes))
+    roadblocks = [spec.polygon for spec in blocks if not spec.is_connector]
+    _count(flaws, "overlapping roadblocks", _num_overlaps(roadblocks))
+    tables = {t: gpkg.table(t) for t in _DRIVABLE_LAYERS if t != "intersections"}
+    tables["intersections"] = intersections
+    road = build_map(
+        name,
+        epsg=gpkg.epsg,
+        edges=edges,
+        blocks=blocks,
+        intersections=_areas(intersections, intersections.integers("intersection_type_fid", 0)),
+        stop_polygons=_areas(stops, stops.integers("stop_polygon_type_fid", 5)),
+        crosswalks=_areas(gpkg.table("crosswalks")),
+        walkways=_areas(gpkg.table("walkways")),
+        car_parks=_areas(tables["carpark_areas"]),
+        drivable_areas=[area for layer in _DRIVABLE_LAYERS for area in _areas(tables[layer])],
+    )
+    return replace(road, flaws={**flaws, **road.flaws})
+
+
+def _count(flaws: dict[str, int], flaw: str, number: int) -> None:
+    if number:
+        flaws[flaw] = flaws.get(flaw, 0) + number
+
+
+def _lines(table: _Table) -> dict[str, FloatArray]:
+    for fid, shape in zip(table.ids, table.shapes, strict=True):
+        if shape.geom_type != "LineString":
+            raise DataError(
+                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=_MEND
+            )
+    return {
+        fid: shapely.get_coordinates(shape)
+        for fid, shape in zip(table.ids, table.shapes, strict=True)
+    }
+
+
+def _baselines(gpkg: _Gpkg) -> dict[str, FloatArray]:
+    table = gpkg.table("baseline_paths", ["lane_fid", "lane_connector_fid"])
+    lines = _lines(table)
+    out: dict[str, FloatArray] = {}
+    lanes, connectors = table.text_ids("lane_fid"), table.text_ids("lane_connector_fid")
+    for fid, lane, connector in zip(table.ids, lanes, connectors, strict=True):
+        for owner in (lane, connector):
+            if owner is not None:
+                out.setdefault(owner, lines[fid])
+    return out
+
+
+def _lanes(
+    gpkg: _Gpkg,
+    baselines: dict[str, FloatArray],
+    boundaries: dict[str, FloatArray],
+    connectors: _Table,
+    flaws: dict[str, int],
+) -> list[EdgeSpec]:
+    table = gpkg.table(
+        "lanes_polygons",
+        [
+            "lane_fid",
+            "lane_group_fid",
+            "lane_index",
+            "left_boundary_fid",
+            "right_boundary_fid",
+            "speed_limit_mps",
+        ],
+        ["lane_type_fid"],
+    )
+    outgoing = _group(connectors.text_ids("exit_lane_fid"), connectors.ids)
+    incoming = _group(connectors.text_ids("entry_lane_fid"), connectors.ids)
+    groups, indices = table.text_ids("lane_group_fid"), table.integers("lane_index", -1)
+    left, right = table.text_ids("left_boundary_fid"), table.text_ids("right_boundary_fid")
+    lane_at = {
+        (group, index): fid for group, index, fid in zip(groups, indices, table.ids, strict=True)
+    }
+    different = sum(i != j for i, j in zip(table.ids, table.text_ids("lane_fid"), strict=True))
+    _count(flaws, "lane_fid differs from fid", different)
+    kinds = table.integers("lane_type_fid", 0)
+    return [
+        EdgeSpec(
+            id=fid,
+            is_connector=False,
+            polygon=_one_polygon(table, row, flaws),
+            baseline=_find(baselines, fid, "lane", "baseline"),
+            block_id=groups[row] or "",
+            incoming=incoming.get(fid, []),
+            outgoing=outgoing.get(fid, []),
+            left=_optional(boundaries, left[row], flaws),
+            right=_optional(boundaries, right[row], flaws),
+            left_id=left[row] or "",
+            right_id=right[row] or "",
+            speed_limit=_speed(table, row),
+            lane_index=indices[row],
+            left_lane=lane_at.get((groups[row], indices[row] - 1)),
+            right_lane=lane_at.get((groups[row], indices[row] + 1)),
+            is_bike=kinds[row] == _BIKE_LANE,
+        )
+        for row, fid in enumerate(table.ids)
+    ]
+
+
+def _connectors(
+    gpkg: _Gpkg,
+    baselines: dict[str, FloatArray],
+    boundaries: dict[str, FloatArray],
+    table: _Table,
+    stops: _Table,
+    flaws: dict[str, int],
+) -> list[EdgeSpec]:
+    areas = gpkg.table(
+        "gen_lane_connectors_scaled_width_polygons",
+        ["lane_connector_fid", "left_boundary_fid", "right_boundary_fid"],
+    )
+    row_of = {fid: row for row, fid in enumerate(table.ids)}
+    owners = areas.text_ids("lane_connector_fid")
+    bare = set(table.ids) - set(owners)
+    if bare:
+        raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=_MEND)
+    left, right = areas.text_ids("left_boundary_fid"), areas.text_ids("right_boundary_fid")
+    start, end = table.text_ids("exit_lane_fid"), table.text_ids("entry_lane_fid")
+    groups = table.text_ids("lane_group_connector_fid")
+    crossings = table.text_ids("intersection_fid")
+    turns = table.integers("turn_type_fid", _TURN_UNKNOWN)
+    stop_shapes = dict(zip(stops.ids, stops.shapes, strict=True))
+    out = []
+    # In the order of the polygons: nuPlan's point queries run over that layer.
+    for area, fid in enumerate(owners):
+        if fid is None or fid not in row_of:
+            _count(flaws, "polygon of an unknown lane connector", 1)
+            continue
+        row = row_of[fid]
+        baseline = _find(baselines, fid, "lane connector", "baseline")
+        listed = str(table.columns["traffic_light_stop_line_fids"][row] or "")
+        out.append(
+            EdgeSpec(
+                id=fid,
+                is_connector=True,
+                polygon=_one_polygon(areas, area, flaws),
+                baseline=baseline,
+                block_id=groups[row] or "",
+                incoming=_known(start[row]),
+                outgoing=_known(end[row]),
+                left=_optional(boundaries, left[area], flaws),
+                right=_optional(boundaries, right[area], flaws),
+                left_id=left[area] or "",
+                right_id=right[area] or "",
+                speed_limit=_speed(table, row),
+                has_traffic_lights=listed != "",
+                stop_lines=_stop_lines(listed, baseline, stop_shapes),
+                intersection_id=crossings[row],
+                turn_type=turns[row],
+            )
+        )
+    return out
+
+
+def _blocks(gpkg: _Gpkg, flaws: dict[str, int]) -> list[BlockSpec]:
+    roadblocks = gpkg.table("lane_groups_polygons")
+    links = gpkg.table(
+        "lane_group_connectors", ["from_lane_group_fid", "to_lane_group_fid", "intersection_fid"]
+    )
+    start, end = links.text_ids("from_lane_group_fid"), links.text_ids("to_lane_group_fid")
+    crossings = links.text_ids("intersection_fid")
+    outgoing, incoming = _group(start, links.ids), _group(end, links.ids)
+    out = [
+        BlockSpec(
+            fid,
+            False,
+            _one_polygon(roadblocks, row, flaws),
+            incoming.get(fid, []),
+            outgoing.get(fid, []),
+        )
+        for row, fid in enumerate(roadblocks.ids)
+    ]
+    out += [
+        BlockSpec(
+            fid,
+            True,
+            _one_polygon(links, row, flaws),
+            _known(start[row]),
+            _known(end[row]),
+            crossings[row],
+        )
+        for row, fid in enumerate(links.ids)
+    ]
+    return out
+
+
+def _stop_lines(
+    listed: str, baseline: FloatArray, polygons: dict[str, shapely.Polygon]
+) -> list[str]:
+    # nuPlan: the listed polygons that meet the baseline, else the one nearest to its first point
+    # (nuplan-simulation.md §10.6). Unknown ids stay, for `build_map` to count them.
+    ids = [part.strip() for part in listed.split(",") if part.strip()]
+    unknown = [i for i in ids if i not in polygons]
+    known = [i for i in ids if i in polygons]
+    line = shapely.LineString(baseline)
+    meeting = [i for i in known if shapely.intersects(polygons[i], line)]
+    if not meeting and known:
+        first = shapely.Point(baseline[0])
+        meeting = [min(known, key=lambda i: float(shapely.distance(polygons[i], first)))]
+    return meeting + unknown
+
+
+def _group(keys: Sequence[str | None], ids: Sequence[str]) -> dict[str, list[str]]:
+    out: dict[str, list[str]] = {}
+    for key, fid in zip(keys, ids, strict=True):
+        if key is not None:
+            out.setdefault(key, []).append(fid)
+    return out
+
+
+def _known(fid: str | None) -> list[str]:
+    return [] if fid is None else [fid]
+
+
+def _find(lines: dict[str, FloatArray], fid: str, owner: str, what: str) -> FloatArray:
+    if fid not in lines:
+        raise DataError(f"{owner} {fid!r} has no {what}", hint=_MEND)
+    return lines[fid]
+
+
+def _optional(
+    lines: dict[str, FloatArray], fid: str | None, flaws: dict[str, int]
+) -> FloatArray | None:
+    if fid is not None and fid not in lines:
+        _count(flaws, "edge names an unknown boundary", 1)
+    return None if fid is None else lines.get(fid)
+
+
+def _speed(table: _Table, row: int) -> float | None:
+    value = table.columns["speed_limit_mps"][row]
+    if value is None:
+        return None
+    if not isinstance(value, int | float):
+        raise DataError(
+            f"layer {table.name!r}: speed_limit_mps of fid {table.ids[row]} is {value!r}",
+            hint=_MEND,
+        )
+    return float(value)
+
+
+def _one_polygon(table: _Table, row: int, flaws: dict[str, int]) -> shapely.Polygon:
+    parts = _polygons(table, row)
+    if len(parts) > 1:
+        _count(flaws, "lane or roadblock in several pieces: the largest is kept", 1)
+    return max(parts, key=lambda part: float(shapely.area(part)))
+
+
+def _polygons(table: _Table, row: int) -> list[shapely.Polygon]:
+    parts = list(shapely.get_parts(table.shapes[row]))
+    if not parts or any(p.geom_type != "Polygon" or shapely.is_empty(p) for p in parts):
+        kind = table.shapes[row].geom_type
+        raise DataError(
+            f"layer {table.name!r}: geometry of fid {table.ids[row]} is a {kind} without area",
+            hint=_MEND,
+        )
+    return parts
+
+
+def _areas(table: _Table, kinds: Sequence[int] | None = None) -> list[AreaSpec]:
+    return [
+        AreaSpec(fid, part, 0 if kinds is None else kinds[row])
+        for row, fid in enumerate(table.ids)
+        for part in _polygons(table, row)
+    ]
+
+
+def _num_overlaps(polygons: Sequence[shapely.Polygon]) -> int:
+    shapes = np.array(polygons, object)
+    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = first < second
+    common = [
+        _common_area(a, b) for a, b in zip(shapes[first[pairs]], shapes[second[pairs]], strict=True)
+    ]
+    return sum(area > _MIN_OVERLAP for area in common)
+
+
+def _common_area(a: shapely.Polygon, b: shapely.Polygon) -> float:
+    try:
+        return float(shapely.area(shapely.intersection(a, b)))
+    except shapely.errors.GEOSException:  # a polygon that crosses itself
+        return float(shapely.area(shapely.intersection(shapely.buffer(a, 0), shapely.buffer(b, 0))))

@@ -1,0 +1,108 @@
+"""Reading SQLite files that come from somewhere else: read-only, and nothing in them is executed.
+
+Only ordinary tables are read. A view or a virtual table under an expected name is refused, so that
+no SQL of the file runs; triggers never fire, since nothing is written.
+"""
+
+import re
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+from shiftsim.errors import DataError
+
+_MEND = "the file is damaged or of another format; get it again from its source"
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+
+
+class Database:
+    """An open file. Made by `open_database`.
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._connection = connection
+        self._columns: dict[str, list[str]] = {}
+        for name, kind, sql in self.query(
+            "SELECT name, type, sql FROM sqlite_master", "its schema"
+        ):
+            plain = kind == "table" and not str(sql or "").upper().startswith("CREATE VIRTUAL")
+            if plain and isinstance(name, str) and _NAME.match(name):
+                info = self.query(f'PRAGMA table_xinfo("{name}")', f"table {name!r}")
+                self._columns[name] = [row[1] for row in info]
+
+    def query(self, sql: str, what: str, parameters: Sequence[object] = ()) -> list[tuple]:  # type: ignore[type-arg]  # rows of any kind
+        """All rows of a query of ours.
+
+        Args:
+            sql: The query; names in it are ours or were checked by `require`.
+            what: What is read, for the error message.
+            parameters: Values of the question marks.
+
+        Raises:
+            DataError: The file cannot be read.
+        """
+        try:
+            return self._connection.execute(sql, tuple(parameters)).fetchall()  # type: ignore[arg-type]  # values of ours
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise DataError(f"{self.path}: cannot read {what}: {error}", hint=_MEND) from error
+
+    def require(self, table: str, columns: Sequence[str]) -> None:
+        """Make sure that an ordinary table with these columns exists.
+
+        Raises:
+            DataError: It does not.
+        """
+        if table not in self._columns:
+            raise DataError(f"{self.path}: table {table!r} is missing", hint=_MEND)
+        missing = [name for name in columns if name not in self._columns[table]]
+        if missing:
+            raise DataError(
+                f"{self.path}: table {table!r} has no column {missing[0]!r}", hint=_MEND
+            )
+
+    def columns(
+        self, table: str, required: Sequence[str], optional: Sequence[str] = ()
+    ) -> dict[str, list[object]]:
+        """Whole columns of a table in the order of its rows; None where an optional one is missing.
+
+        Raises:
+            DataError: The table or a required column is missing, or the file cannot be read.
+        """
+        self.require(table, required)
+        present = [*required, *(name for name in optional if name in self._columns[table])]
+        names = ", ".join(f'"{name}"' for name in present)
+        rows = self.query(f'SELECT {names} FROM "{table}" ORDER BY rowid', f"table {table!r}")
+        out = {name: [row[i] for row in rows] for i, name in enumerate(present)}
+        out.update({name: [None] * len(rows) for name in optional if name not in out})
+        return out
+
+
+@contextmanager
+def open_database(path: Path) -> Iterator[Database]:
+    """Open a file for reading; nothing in it is trusted and nothing is written.
+
+    Raises:
+        DataError: There is no such file, or it is not an SQLite database.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file", hint="check the path")
+    # Without a journal beside it, nobody can be writing: no locks, also on read-only media.
+    busy = any(path.with_name(path.name + end).exists() for end in ("-wal", "-journal"))
+    uri = f"file:{quote(str(path.resolve()))}?mode=ro" + ("" if busy else "&immutable=1")
+    try:
+        connection = sqlite3.connect(uri, uri=True)
+    except sqlite3.Error as error:
+        raise DataError(f"{path}: cannot open the file: {error}", hint=_MEND) from error
+    try:
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA query_only = ON")
+        connection.execute("PRAGMA cell_size_check = ON")
+        yield Database(path, connection)
+    finally:
+        connection.close()
