@@ -1,0 +1,97 @@
+"""Closed loops of the nuplan folder: simulated from the log, compared with the recorded rollout."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim import state
+from shiftsim.arrays import FloatArray
+from shiftsim.metrics import compute_metrics
+from shiftsim.planners import load_planner
+from shiftsim.scenario import Scenario
+from shiftsim.simulation import simulate
+from shiftsim.verify.report import Report
+from shiftsim.verify.tables import Group, read_groups
+
+# column of the reference → index in a state row, tolerance
+STATE_COLUMNS = {
+    "x": (state.X, 1e-6),
+    "y": (state.Y, 1e-6),
+    "heading": (state.HEADING, 1e-7),
+    "vx": (state.VX, 1e-6),
+    "vy": (state.VY, 1e-6),
+    "ax": (state.AX, 1e-6),
+    "ay": (state.AY, 1e-6),
+    "tire_steering_angle": (state.STEERING, 1e-6),
+    "tire_steering_rate": (state.STEERING_RATE, 1e-6),
+    "angular_velocity": (state.YAW_RATE, 1e-6),
+    "angular_acceleration": (state.YAW_ACCEL, 1e-6),
+}
+CENTER_COLUMNS = {"center_x": (0, 1e-6), "center_y": (1, 1e-6), "center_heading": (2, 1e-7)}
+SCORE_TOLERANCE = 1e-9
+PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
+CONTROLLERS = {"NR": "lqr", "PT": "perfect"}
+_SCRIPTED = "scripted_"
+
+
+def verify_simulation(
+    folder: Path, report: Report, scenes: dict[str, Scenario], mode: str | None = None
+) -> None:
+    """Simulate every non-reactive run of `expected/ego.parquet` and compare states and scores.
+
+    Args:
+        folder: The nuplan folder.
+        report: Filled with the comparisons.
+        scenes: The scenarios by scene name.
+        mode: Only runs of this challenge.
+    """
+    runs = read_groups(folder / "expected" / "ego.parquet")
+    scores = read_groups(
+        folder / "expected" / "scores.parquet", ("scene", "challenge", "planner", "thresholds")
+    )
+    for (scene, challenge, planner), rows in runs.items():
+        if mode not in (None, challenge) or challenge not in CONTROLLERS:
+            continue
+        where = f"{scene} {challenge} {planner}"
+        log = simulate(
+            scenes[scene],
+            load_planner(*reference_planner(planner, folder)),
+            controller=CONTROLLERS[challenge],
+        )
+        compare_ego(report, where, log.time_us, log.ego, rows)
+        for thresholds, profile in PROFILES.items():
+            expected = scores.get((scene, challenge, planner, thresholds))
+            if expected is None:
+                report.fail("simulated score", where, f"no row with thresholds {thresholds}")
+                continue
+            result = compute_metrics(log, scenes[scene].map, thresholds=profile)
+            for metric, score in {**result.scores, "score": result.score}.items():
+                if score is not None:
+                    report.compare(
+                        "simulated score",
+                        f"{where} {thresholds} {metric}",
+                        score,
+                        float(expected[metric][0]),
+                        atol=SCORE_TOLERANCE,
+                    )
+
+
+def reference_planner(name: str, folder: Path) -> tuple[str, dict[str, str]]:
+    """Our planner and its arguments for a planner name of the reference."""
+    if name.startswith(_SCRIPTED):
+        file = str(folder / "scripted.parquet")
+        return "scripted", {"file": file, "name": name.removeprefix(_SCRIPTED)}
+    return name.replace("_", "-"), {}
+
+
+def compare_ego(
+    report: Report, where: str, time_us: np.ndarray, ego: FloatArray, rows: Group
+) -> None:
+    """Compare simulated ego states (K, 11) with the rows of one run of `ego.parquet`."""
+    report.compare("ego iteration", where, np.arange(len(time_us)), rows["iteration"])
+    report.compare("ego time", where, time_us, rows["time_us"])
+    for column, (index, tolerance) in STATE_COLUMNS.items():
+        report.compare(f"ego {column}", where, ego[:, index], rows[column], atol=tolerance)
+    centers = state.center_poses(ego[:, :3])
+    for column, (index, tolerance) in CENTER_COLUMNS.items():
+        report.compare(f"ego {column}", where, centers[:, index], rows[column], atol=tolerance)
