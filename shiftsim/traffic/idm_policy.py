@@ -1,0 +1,68 @@
+"""Intelligent Driver Model: acceleration behind a lead, and nuPlan's forward Euler step.
+
+Used by reactive agents and by the IDM planner (nuplan-simulation.md §10.3).
+"""
+
+import numpy as np
+
+from shiftsim.arrays import kernel
+
+EXPONENT = 4.0  # of the free-road term, nuPlan
+
+
+@kernel
+def idm_acceleration(
+    speed: float,
+    gap: float,
+    lead_speed: float,
+    target_speed: float,
+    min_gap: float,
+    headway: float,
+    accel_max: float,
+    decel_max: float,
+) -> float:
+    """Unclipped IDM acceleration [m/s^2].
+
+    Args:
+        speed: Own speed [m/s].
+        gap: Free distance to the lead's rear, own progress and the lead's rear length taken off;
+            less than `min_gap` counts as `min_gap` [m].
+        lead_speed: Speed of the lead along the own direction, may be negative [m/s].
+        target_speed: Speed on a free road [m/s].
+        min_gap: Gap kept at standstill [m].
+        headway: Time gap kept [s].
+        accel_max: Largest acceleration [m/s^2].
+        decel_max: Comfortable deceleration, positive [m/s^2].
+    """
+    # nuPlan: the desired gap is not clamped at zero, it is squared
+    desired = (
+        min_gap
+        + speed * headway
+        + speed * (speed - lead_speed) / (2.0 * np.sqrt(accel_max * decel_max))
+    )
+    ratio = desired / max(gap, min_gap)
+    return accel_max * (1.0 - (speed / target_speed) ** EXPONENT - ratio**2)
+
+
+@kernel
+def idm_step(
+    speed: float,
+    gap: float,
+    lead_speed: float,
+    target_speed: float,
+    min_gap: float,
+    headway: float,
+    accel_max: float,
+    decel_max: float,
+    dt: float,
+) -> tuple[float, float]:
+    """One forward Euler step: distance driven [m] and new speed [m/s], which may be negative.
+
+    The acceleration is clipped to [-decel_max, accel_max] first; the distance follows from the old
+    speed. Arguments as for `idm_acceleration`, and the step `dt` [s].
+    """
+    accel = idm_acceleration(
+        speed, gap, lead_speed, target_speed, min_gap, headway, accel_max, decel_max
+    )
+    accel = min(max(accel, -decel_max), accel_max)
+    return dt * speed, speed + dt * accel
