@@ -1,0 +1,240 @@
+"""Settings of a run: one frozen dataclass, read from TOML, checked before anything starts.
+
+A setting is wrong at the moment it is read, not an hour later: types, ranges and names that are
+known here are checked by the constructor; planners, stores and splits are checked by the runner.
+"""
+
+import difflib
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from shiftsim.errors import ConfigError
+
+Value: TypeAlias = bool | int | float | str | list[Any]
+
+NOISE_LEVELS = ("low", "mid", "high")
+ALL_NOISE = ("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in NOISE_LEVELS))
+SAVE_ROLLOUTS = ("all", "none")
+DEFAULT_STORE = "demo"
+MAX_SEED = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """Everything that one run depends on.
+
+    Attributes:
+        planners: Names, `package.module:Class`, or names with a checkpoint.
+        planner_args: Arguments of the planners, by planner as named in `planners`.
+        noise: Names of noise models.
+        seeds: Seeds of the noise; ignored for `none`.
+        traffic: Traffic mode.
+        controller: How a plan moves the ego.
+        thresholds: Threshold profile of the metrics.
+        store: Name or path of the scenario store.
+        split: Name or file of a split; empty for all scenarios of the store.
+        limit: Use only the first scenarios of the split, 0 for all.
+        workers: Worker processes; 0 chooses from the cores.
+        out: Run folder; empty for `runs/<id>`.
+        save_rollouts: `all` or `none`.
+        allow_partial: Print a labelled mean over the survivors when tasks fail or are missing.
+    """
+
+    planners: tuple[str, ...]
+    planner_args: dict[str, dict[str, Value]] = field(default_factory=dict)
+    noise: tuple[str, ...] = ("none",)
+    seeds: tuple[int, ...] = (0,)
+    traffic: str = "nonreactive"
+    controller: str = "lqr"
+    thresholds: str = "nuplan"
+    store: str = DEFAULT_STORE
+    split: str = ""
+    limit: int = 0
+    workers: int = 0
+    out: str = ""
+    save_rollouts: str = "all"
+    allow_partial: bool = False
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            _check_type(item.name, getattr(self, item.name))
+        if "all" in self.noise:
+            object.__setattr__(self, "noise", ALL_NOISE)
+        _not_empty("planners", self.planners)
+        _not_empty("noise", self.noise)
+        _not_empty("seeds", self.seeds)
+        for name in ("planners", "noise", "seeds"):
+            _no_repeats(name, getattr(self, name))
+        if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
+            raise ConfigError(f"seeds {list(self.seeds)!r}: a seed is an integer from 0 on")
+        for name in ("limit", "workers"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} is {getattr(self, name)!r}; it cannot be negative")
+        one_of("save_rollouts", self.save_rollouts, SAVE_ROLLOUTS)
+        for planner in self.planner_args:
+            one_of("planner in planner_args", planner, self.planners)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON or TOML values."""
+        out = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
+
+
+_LISTS = {"planners": str, "noise": str, "seeds": int}
+_SCALARS = {"limit": int, "workers": int, "allow_partial": bool}
+
+
+def _check_type(name: str, value: object) -> None:
+    """Types are checked strictly: TOML and Python callers get the same message."""
+    if name in _LISTS:
+        kind = _LISTS[name]
+        good = isinstance(value, tuple) and all(_is_a(item, kind) for item in value)
+        wanted = f"a list of {kind.__name__}"
+    elif name == "planner_args":
+        good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
+        wanted = "a table of arguments per planner"
+    else:
+        kind = _SCALARS.get(name, str)
+        good, wanted = _is_a(value, kind), kind.__name__
+    if not good:
+        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+
+
+def _is_a(value: object, kind: type) -> bool:
+    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+
+
+def _not_empty(name: str, values: tuple[object, ...]) -> None:
+    if not values:
+        raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
+
+
+def _no_repeats(name: str, values: tuple[object, ...]) -> None:
+    if len(set(values)) != len(values):
+        raise ConfigError(f"{name} {list(values)!r}: a value is listed twice")
+
+
+def one_of(what: str, value: str, choices: Iterable[str]) -> str:
+    """The value, when it is among the choices.
+
+    Raises:
+        ConfigError: It is not; the hint names the nearest choice.
+    """
+    valid = sorted(choices)
+    if value in valid:
+        return value
+    near = difflib.get_close_matches(value, valid, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ConfigError(f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}")
+
+
+def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
+    """Settings from plain values, such as those of a TOML file.
+
+    Raises:
+        ConfigError: A name is unknown, or a value is wrong.
+    """
+    known = {item.name for item in fields(RunConfig)}
+    for name in values:
+        try:
+            one_of("setting", name, known)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}", hint=error.hint) from error
+    if "planners" not in values:
+        raise ConfigError(f"{where}: no planner", hint="name one, for example --planner idm")
+    plain: dict[str, Any] = dict(values)
+    for name in _LISTS:
+        if isinstance(plain.get(name), list):
+            plain[name] = tuple(plain[name])
+    try:
+        return RunConfig(**plain)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}", hint=error.hint) from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The table in a TOML file.
+
+    Raises:
+        ConfigError: There is no such file, or it is not TOML.
+    """
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read {str(path)!r}: {error.strerror or error}", hint="check the path"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{str(path)!r} is not TOML: {error}", hint="mend the line named above"
+        ) from error
+
+
+def write_toml(config: RunConfig) -> str:
+    """The settings as the text of a TOML file that `read_toml` and `make_config` take back."""
+    values = config.to_dict()
+    arguments = values.pop("planner_args")
+    lines = [f"{name} = {_toml(value)}" for name, value in values.items()]
+    for planner, table in arguments.items():
+        lines += ["", f"[planner_args.{_toml(planner)}]"]
+        lines += [f"{_toml(name)} = {_toml(value)}" for name, value in table.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return repr(value)
+
+
+def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
+    """Planner, name and value of one `key=value`, or `planner.key=value` with several planners.
+
+    The value is read as a TOML value; anything that is none is taken as a string.
+
+    Raises:
+        ConfigError: It has another form, or it does not say which planner is meant.
+    """
+    key, equals, raw = text.partition("=")
+    if not equals or not key:
+        raise ConfigError(
+            f"planner argument {text!r} is not key=value", hint="for example --planner-arg gap=1.0"
+        )
+    named = [name for name in planners if key.startswith(f"{name}.")]
+    if not named and len(planners) != 1:
+        raise ConfigError(
+            f"planner argument {text!r} does not say which planner is meant",
+            hint=f"write PLANNER.{text}; planners: {', '.join(planners)}",
+        )
+    planner = max(named, key=len) if named else planners[0]
+    name = key[len(planner) + 1 :] if named else key
+    try:
+        value = tomllib.loads(f"value = {raw}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = raw
+    return planner, name, value
+
+
+def store_path(name: str) -> Path:
+    """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`)."""
+    path = Path(name).expanduser()
+    if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
+        return path
+    return Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
+
+
+def default_workers() -> int:
+    """Worker processes when nothing is said: one per core that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

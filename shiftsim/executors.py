@@ -1,0 +1,230 @@
+"""Run a function over many tasks: in this process, or in supervised worker processes.
+
+A worker process is a fresh interpreter that talks over one socket: nothing is forked, the caller's
+main script is not imported again, and a worker that dies costs the one task it was working on. The
+standard pools do not give that: theirs break as a whole.
+"""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe, wait
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
+
+from shiftsim.errors import ConfigError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+MakeFunction = Callable[[], Callable[[T], R]]
+_MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a task
+# one thread per worker: the parallelism is across scenarios
+_ONE_THREAD = {
+    name: "1"
+    for name in (
+        "NUMBA_NUM_THREADS",
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+    )
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Generic[T, R]):
+    """What became of one task.
+
+    Attributes:
+        task: The task.
+        result: What the function returned; None when the worker died.
+        death: How the worker died, empty when it did not.
+    """
+
+    task: T
+    result: R | None
+    death: str = ""
+
+
+def map_unordered(
+    make: MakeFunction[T, R], tasks: Iterable[T], *, workers: int, alone: int = 0
+) -> Iterator[Outcome[T, R]]:
+    """Apply a function to every task, in whatever order they finish.
+
+    Args:
+        make: Called once per worker; returns the function. Must pickle when `workers` is above 1,
+            and so must the tasks and results. A `close` attribute of the function is called at
+            the end.
+        tasks: The tasks.
+        workers: Number of worker processes; with 1 everything happens in this process.
+        alone: So many leading tasks are done by the first worker before the others get one, so
+            that kernels which are not in the disk cache yet are compiled once.
+
+    Yields:
+        One outcome per task.
+
+    Raises:
+        ConfigError: Workers cannot be started.
+    """
+    if workers <= 1:
+        yield from _serial(make, tasks)
+        return
+    if sys.platform == "win32":
+        raise ConfigError("worker processes need a POSIX system", hint="use --workers 1")
+    pool = _Pool(pickle.dumps((sys.path, pickle.dumps(make))), workers)
+    try:
+        yield from pool.run(tasks, alone)
+    finally:
+        pool.close()
+
+
+def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Iterator[Outcome[T, R]]:
+    function = make()
+    try:
+        for task in tasks:
+            yield Outcome(task, function(task))
+    finally:
+        _close(function)
+
+
+def _close(function: object) -> None:
+    close = getattr(function, "close", None)
+    if close is not None:
+        close()
+
+
+class _Worker:
+    """One interpreter and the socket to it."""
+
+    def __init__(self, payload: bytes) -> None:
+        self.connection, theirs = Pipe()
+        command = "from shiftsim.executors import serve; import sys; serve(int(sys.argv[1]))"
+        search = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", command, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            process_group=0,  # an interrupt from the terminal reaches the parent only
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, search))},
+        )
+        theirs.close()
+        self.task: Any = None
+        self.state: Literal["starting", "idle", "busy"] = "starting"
+        with suppress(OSError):  # a worker that is dead already is noticed when it is waited for
+            self.connection.send_bytes(payload)
+
+    def give(self, task: object) -> None:
+        self.task, self.state = task, "busy"
+        with suppress(OSError):
+            self.connection.send(task)
+
+    def receive(self) -> Any:
+        """The next message.
+
+        Raises:
+            _DeathError: The process has ended.
+        """
+        try:
+            message = self.connection.recv()
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
+            raise _DeathError(self.end()) from error
+        self.state = "idle"
+        return message
+
+    def end(self) -> str:
+        """Close the socket, wait for the process, and say how it ended."""
+        self.connection.close()
+        try:
+            code = self.process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            code = self.process.wait()
+        if code < 0:
+            with suppress(ValueError):
+                return f"worker process killed by {signal.Signals(-code).name}"
+        return f"worker process ended with exit code {code}"
+
+
+class _DeathError(Exception):
+    """A worker process has ended; the text says how."""
+
+
+class _Pool:
+    """Keeps a number of workers busy, and replaces those that die."""
+
+    def __init__(self, payload: bytes, size: int) -> None:
+        self.payload, self.size = payload, size
+        self.workers: list[_Worker] = []
+        self.failed_starts = 0
+
+    def run(self, tasks: Iterable[Any], alone: int) -> Iterator[Outcome[Any, Any]]:
+        waiting = deque(tasks)
+        done = 0
+        while waiting or self._in("busy"):
+            while len(self.workers) < min(self.size, len(waiting) + len(self._in("busy"))):
+                self.workers.append(_Worker(self.payload))
+            ready = self._in("idle")
+            if done < alone:
+                ready = ready[: 1 - len(self._in("busy"))]
+            for worker in ready[: len(waiting)]:
+                worker.give(waiting.popleft())
+            watched: dict[Any, _Worker] = {
+                worker.connection: worker for worker in self.workers if worker.state != "idle"
+            }
+            for connection in wait(list(watched)):
+                outcome = self._hear(watched[connection])
+                if outcome is not None:
+                    done += 1
+                    yield outcome
+
+    def _in(self, state: str) -> list[_Worker]:
+        return [worker for worker in self.workers if worker.state == state]
+
+    def _hear(self, worker: _Worker) -> Outcome[Any, Any] | None:
+        starting = worker.state == "starting"
+        try:
+            message = worker.receive()
+        except _DeathError as death:
+            self.workers.remove(worker)
+            if not starting:
+                return Outcome(worker.task, None, str(death))
+            self.failed_starts += 1
+            if self.failed_starts >= _MAX_START_FAILURES:
+                raise ConfigError(
+                    f"workers cannot start: {death}", hint="run with --workers 1 to see why"
+                ) from death
+            return None
+        self.failed_starts = 0
+        return None if starting else Outcome(worker.task, message)
+
+    def close(self) -> None:
+        """End all workers: idle ones leave by themselves, the others are killed."""
+        for worker in self.workers:
+            if worker.state != "idle":
+                worker.process.kill()
+            worker.connection.close()
+        for worker in self.workers:
+            worker.end()
+
+
+def serve(handle: int) -> None:
+    """Main function of a worker process: do tasks from a socket until it closes."""
+    connection: Connection[Any, Any] = Connection(handle)
+    try:
+        path, pickled = pickle.loads(connection.recv_bytes())
+        sys.path[:] = path
+        function = pickle.loads(pickled)()
+        try:
+            connection.send("ready")
+            while True:
+                connection.send(function(connection.recv()))
+        finally:
+            _close(function)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the parent has gone

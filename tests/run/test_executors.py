@@ -1,0 +1,111 @@
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+
+import pytest
+
+from shiftsim.errors import ConfigError
+from shiftsim.executors import map_unordered
+
+
+class Square:
+    def __call__(self, number):
+        if number == 13:
+            os._exit(7)
+        if number == 14:
+            os.kill(os.getpid(), 9)
+        return os.getpid(), number**2
+
+
+def broken_start():
+    raise RuntimeError("no")
+
+
+def run(numbers, workers, alone=0, make=Square):
+    return list(map_unordered(make, numbers, workers=workers, alone=alone))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_every_task_is_done_once_for_any_number_of_workers(workers):
+    outcomes = run(range(10), workers)
+    assert sorted(o.task for o in outcomes) == list(range(10))
+    assert all(o.result[1] == o.task**2 and not o.death for o in outcomes)
+
+
+def test_workers_are_other_processes_and_are_kept():
+    pids = {o.result[0] for o in run(range(12), 2)}
+    assert os.getpid() not in pids
+    assert 1 <= len(pids) <= 2
+
+
+def test_a_worker_that_dies_costs_one_task_and_is_named():
+    outcomes = {o.task: o for o in run([1, 13, 2, 14, 3, 13, 4], 2)}
+    assert outcomes[13].death == "worker process ended with exit code 7"
+    assert outcomes[14].death == "worker process killed by SIGKILL"
+    assert [outcomes[n].result[1] for n in (1, 2, 3, 4)] == [1, 4, 9, 16]
+
+
+def test_every_task_may_kill_its_worker():
+    assert [o.death != "" for o in run([13] * 6, 2)] == [True] * 6
+
+
+def test_workers_that_cannot_start_are_reported_instead_of_retried_for_ever(capfd):
+    with pytest.raises(ConfigError, match="workers cannot start"):
+        run([1], 2, make=broken_start)
+    assert "RuntimeError: no" in capfd.readouterr().err
+
+
+def test_the_first_worker_does_the_leading_tasks_alone():
+    outcomes = run(range(6), 2, alone=3)
+    assert len({o.result[0] for o in outcomes if o.task < 3}) == 1
+    assert [o.task for o in outcomes[:3]] == [0, 1, 2]
+
+
+class Closing:
+    def __init__(self, path):
+        self.path = path
+
+    def __call__(self, number):
+        return number
+
+    def close(self):
+        with open(self.path, "a") as file:
+            file.write("closed\n")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_functions_are_closed_at_the_end(workers, tmp_path):
+    list(map_unordered(partial(Closing, tmp_path / "log"), range(4), workers=workers))
+    assert set((tmp_path / "log").read_text().split()) == {"closed"}
+
+
+class Sleep:
+    def __call__(self, seconds):
+        time.sleep(seconds)
+        return os.getpid()
+
+
+def test_leaving_early_ends_the_workers_at_once():
+    began = time.monotonic()
+    outcomes = map_unordered(Sleep, [0.0, 0.0, 60.0, 60.0], workers=2)
+    pids = [next(outcomes).result, next(outcomes).result]
+    outcomes.close()
+    assert time.monotonic() - began < 30
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_a_script_without_a_main_guard_may_use_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import operator\n"
+        "from functools import partial\n"
+        "from shiftsim.executors import map_unordered\n"
+        "make = partial(partial, pow, 2)\n"
+        "print(sorted(o.result for o in map_unordered(make, [1, 2, 3], workers=2)))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[2, 4, 8]\n"
