@@ -119,12 +119,12 @@ def parse_noise(name: str) -> NoiseModel:
 
 
 def sample_noise(
-    model: NoiseModel, *, seed: int, token: str, num_steps: int, dt: float = 0.1
+    model: NoiseModel | str, *, seed: int, token: str, num_steps: int, dt: float = 0.1
 ) -> FloatArray:
     """The noise of a whole rollout.
 
     Args:
-        model: Kind and strength.
+        model: Kind and strength, or a name for `parse_noise`.
         seed: Seed of the run.
         token: Id of the scenario.
         num_steps: T, number of steps.
@@ -135,8 +135,11 @@ def sample_noise(
         sigma is 0.
 
     Raises:
-        ConfigError: An own model returned something else than (T, 2) finite numbers.
+        ConfigError: The name is unknown, or an own model returned something else than (T, 2)
+            finite numbers.
     """
+    if isinstance(model, str):
+        model = parse_noise(model)
     if model.kind == "none":
         return np.zeros((num_steps, 2))
     accel, steering = (keyed_generator(seed, token, channel) for channel in CHANNELS)

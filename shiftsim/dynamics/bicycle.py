@@ -13,6 +13,7 @@ from shiftsim.state import (
     AX,
     AY,
     HEADING,
+    PACIFICA,
     STEERING,
     STEERING_RATE,
     VX,
@@ -26,6 +27,7 @@ from shiftsim.state import (
 MAX_STEERING = np.pi / 3.0  # rad, nuPlan kinematic bicycle
 ACCEL_TIME_CONSTANT = 0.2  # s, nuPlan kinematic bicycle
 STEERING_TIME_CONSTANT = 0.05  # s, nuPlan kinematic bicycle
+WHEEL_BASE = PACIFICA.wheel_base  # m
 
 
 @kernel
@@ -112,10 +114,9 @@ def command_and_step(
     command: FloatArray,
     noise_accel: float,
     noise_rate: float,
-    wheel_base: float,
     out_state: FloatArray,
 ) -> None:
-    """One step for a planner that returns the command itself: noise, then the motion model.
+    """One step of nuPlan's vehicle for a planner that returns commands: noise, then the model.
 
     Args:
         now_us: Time stamp of `state` [us].
@@ -124,7 +125,6 @@ def command_and_step(
         command: (2,) clean acceleration [m/s^2] and steering rate [rad/s].
         noise_accel: Added to the acceleration, unless exactly 0 [m/s^2].
         noise_rate: Added to the steering rate, unless exactly 0 [rad/s].
-        wheel_base: Distance between the axles [m].
         out_state: (11,) receives the next state.
     """
     accel, rate = command[0], command[1]
@@ -132,4 +132,4 @@ def command_and_step(
         accel += noise_accel
     if noise_rate != 0.0:
         rate += noise_rate
-    step_bicycle(state, accel, rate, wheel_base, step_seconds(now_us, next_us), out_state)
+    step_bicycle(state, accel, rate, WHEEL_BASE, step_seconds(now_us, next_us), out_state)

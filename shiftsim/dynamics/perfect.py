@@ -10,9 +10,20 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
 from shiftsim.geometry import wrap_angle
-from shiftsim.state import HEADING, STEERING, STEERING_RATE, VX, VY, YAW_ACCEL, YAW_RATE
+from shiftsim.state import (
+    HEADING,
+    NUM_STATE,
+    STEERING,
+    STEERING_RATE,
+    VX,
+    VY,
+    YAW_ACCEL,
+    YAW_RATE,
+    Trajectory,
+)
 
 MAX_SPEED = 50.0  # m/s, nuPlan perfect tracking controller
+SAMPLE_US = 100_000  # us, spacing of the poses of a plan that a rollout keeps
 
 
 @kernel
@@ -85,14 +96,24 @@ def interpolate(
     return True
 
 
-def track_perfectly(
-    traj_time_us: IntArray, traj_states: FloatArray, next_us: int, out: FloatArray
+@kernel
+def sample_poses(
+    traj_time_us: IntArray, traj_states: FloatArray, now_us: int, out: FloatArray
 ) -> None:
+    """Poses of a trajectory every 0.1 s from now on, into `out` (P, 3); NaN where it has none."""
+    state = np.empty(NUM_STATE)
+    for row in range(len(out)):
+        if interpolate(traj_time_us, traj_states, now_us + row * SAMPLE_US, state):
+            out[row] = state[:3]
+        else:
+            out[row] = np.nan
+
+
+def follow_perfectly(plan: Trajectory, next_us: int, out: FloatArray) -> None:
     """Put the ego where the plan wants it at the next iteration.
 
     Args:
-        traj_time_us: (H,) time stamps of the plan [us].
-        traj_states: (H, 11) states of the plan.
+        plan: The plan, with log time stamps.
         next_us: Time stamp of the next iteration [us].
         out: (11,) receives the state.
 
@@ -100,15 +121,15 @@ def track_perfectly(
         InvalidTrajectoryError: The plan does not cover the next iteration.
         PlannerError: The plan is there at 50 m/s or more.
     """
-    if not interpolate(traj_time_us, traj_states, next_us, out):
+    if not interpolate(plan.time_us, plan.states, next_us, out):
         raise InvalidTrajectoryError(
             f"trajectory does not cover the next iteration at {next_us} us",
-            "return at least two states from the present iteration to beyond the next one",
+            "return at least two states, from the present iteration to the next one or beyond",
         )
     speed = float(np.hypot(out[VX], out[VY]))
     if speed >= MAX_SPEED:
         raise PlannerError(
             f"trajectory has speed {speed:.6g} m/s at {next_us} us; "
             f"perfect tracking needs less than {MAX_SPEED:g} m/s",
-            "give velocities in m/s in the body frame",
+            "give velocities in m/s, in the body frame",
         )
