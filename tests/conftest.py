@@ -2,9 +2,15 @@
 
 import hashlib
 import os
+import tarfile
 from pathlib import Path
 
+import numpy as np
+import pytest
+from hypothesis import settings
+
 REPOSITORY = Path(__file__).resolve().parent.parent
+GOLDEN = REPOSITORY / "tests" / "golden"
 
 
 def _kernel_cache() -> Path:
@@ -17,3 +23,31 @@ def _kernel_cache() -> Path:
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache()))
+
+settings.register_profile("fast", max_examples=25, deadline=None, derandomize=True)
+settings.register_profile("thorough", max_examples=500, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with a fixed seed."""
+    return np.random.default_rng(20260101)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder with all reference outputs and maps; absent from most clones."""
+    folder = REPOSITORY.parent / "shared"
+    if not (folder / "reference").is_dir():
+        pytest.skip("needs the full reference folder beside the repository")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def nuplan_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The nuplan reference folder: logs, maps and outputs of the official stack."""
+    folder = tmp_path_factory.mktemp("reference")
+    with tarfile.open(GOLDEN / "nuplan.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder / "nuplan"
