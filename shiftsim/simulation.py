@@ -13,7 +13,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.dynamics.bicycle import command_and_step
-from shiftsim.dynamics.lqr import track_and_step
+from shiftsim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.dynamics.perfect import follow_perfectly, sample_poses
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.log import SimulationLog
@@ -80,8 +80,8 @@ def simulate(
         noise: Actuation noise, by name or model; added to the command before the motion model.
         seed: Seed of the noise.
         traffic: `nonreactive`, `reactive`, or a traffic model.
-        controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says)
-            or `log-playback` (the ego is where the recording was; plans are ignored).
+        controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan
+            says) or `log-playback` (the ego is where the recording was; plans are ignored).
 
     Returns:
         The rollout, K = T - 1 samples.
@@ -173,9 +173,10 @@ def _advance(
     elif isinstance(plan, Trajectory) and controller == "perfect":
         follow_perfectly(plan, int(next_us), after)
     elif isinstance(plan, Trajectory):
-        track_and_step(
+        status = track_and_step(
             now_us, next_us, state, plan.time_us, plan.states, noise[0], noise[1], after, command
         )
+        raise_for_status(status, int(now_us), plan.time_us)
 
 
 def _make_buffer(scenario: Scenario) -> _Buffer:

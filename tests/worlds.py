@@ -1,0 +1,114 @@
+"""Small worlds to simulate in: a straight two-lane road and whoever is on it."""
+
+import numpy as np
+import shapely
+
+from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.scenario import Scenario
+from shiftsim.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
+
+LANE_WIDTH = 3.5  # m
+
+
+def straight_road(
+    speed_limit: float | None = 15.0, offset: tuple[float, float] = (0, 0)
+) -> VectorMap:
+    """One direction, two lanes: lane — connector — lane, along +x; the right lane has y = 0."""
+    spans = {"1": (0.0, 200.0), "2": (200.0, 220.0), "3": (220.0, 420.0)}
+    edges, blocks = [], []
+    for name, (start, stop) in spans.items():
+        is_connector = name == "2"
+        for lane, y in enumerate((LANE_WIDTH, 0.0)):  # left lane first
+            x = np.linspace(start, stop, int(stop - start) + 1)
+            low, high = y - LANE_WIDTH / 2, y + LANE_WIDTH / 2
+            follower = [f"{int(name) + 1}{lane}"] if name != "3" else []
+            edges.append(
+                EdgeSpec(
+                    id=f"{name}{lane}",
+                    is_connector=is_connector,
+                    polygon=_shift(shapely.box(start, low, stop, high), offset),
+                    baseline=np.c_[x, np.full_like(x, y)] + offset,
+                    block_id=name,
+                    incoming=[f"{int(name) - 1}{lane}"] if name != "1" else [],
+                    outgoing=follower,
+                    left=np.c_[x, np.full_like(x, high)] + offset,
+                    right=np.c_[x, np.full_like(x, low)] + offset,
+                    speed_limit=speed_limit,
+                    lane_index=None if is_connector else lane,
+                    left_lane=f"{name}0" if lane == 1 and not is_connector else None,
+                    right_lane=f"{name}1" if lane == 0 and not is_connector else None,
+                    intersection_id="9" if is_connector else None,
+                )
+            )
+        blocks.append(
+            BlockSpec(
+                id=name,
+                is_connector=is_connector,
+                polygon=_shift(shapely.box(start, -1.75, stop, 5.25), offset),
+                incoming=[str(int(name) - 1)] if name != "1" else [],
+                outgoing=[str(int(name) + 1)] if name != "3" else [],
+            )
+        )
+    crossing = _shift(shapely.box(200.0, -1.75, 220.0, 5.25), offset)
+    return build_map(
+        "straight",
+        edges=edges,
+        blocks=blocks,
+        intersections=[AreaSpec("9", crossing)],
+        drivable_areas=[AreaSpec("90", _shift(shapely.box(0, -1.75, 420, 5.25), offset))],
+    )
+
+
+def _shift(polygon: shapely.Polygon, offset: tuple[float, float]) -> shapely.Polygon:
+    return shapely.transform(polygon, lambda xy: xy + np.array(offset))
+
+
+def standing_tracks(num_rows: int, poses: np.ndarray, kinds: list[AgentKind]) -> Tracks:
+    """Tracks that stand at (N, 3) poses for the whole time, 4.5 m x 2 m."""
+    count = len(poses)
+    agents = np.array([kind <= AgentKind.BICYCLE for kind in kinds])
+    velocities = np.where(agents[None, :, None], 0.0, np.nan) * np.ones((num_rows, count, 2))
+    return Tracks(
+        np.ones((num_rows, count), np.bool_),
+        np.tile(np.asarray(poses, np.float64), (num_rows, 1, 1)),
+        velocities,
+        np.tile([4.5, 2.0], (num_rows, count, 1)),
+        np.array([int(kind) for kind in kinds], np.int64),
+        tuple(f"{index:016x}" for index in range(count)),
+    )
+
+
+def cruise_scenario(
+    *,
+    speed: float = 8.0,
+    iterations: int = 151,
+    history_rows: int = 60,
+    future_rows: int = 160,
+    tracks: Tracks | None = None,
+    road: VectorMap | None = None,
+    start: tuple[float, float, float] = (10.0, 0.0, 0.0),
+) -> Scenario:
+    """An ego that was recorded driving straight at constant speed, 20 Hz rows, 10 Hz iterations."""
+    num_rows = history_rows + 2 * (iterations - 1) + 1 + future_rows
+    time = (np.arange(num_rows) - history_rows) * 0.05
+    ego = np.zeros((num_rows, NUM_STATE))
+    ego[:, X] = start[0] + speed * time * np.cos(start[2])
+    ego[:, Y] = start[1] + speed * time * np.sin(start[2])
+    ego[:, HEADING] = start[2]
+    ego[:, VX] = speed
+    return Scenario(
+        token="0123456789abcdef",
+        scenario_type="unknown",
+        log_name="toy",
+        city="straight",
+        map=road or straight_road(),
+        time_us=1_600_000_000_000_000 + np.arange(num_rows, dtype=np.int64) * 50_000,
+        ego=ego,
+        tracks=tracks if tracks is not None else Tracks.empty(num_rows),
+        traffic_lights=TrafficLights.empty(num_rows),
+        iteration_rows=history_rows + 2 * np.arange(iterations, dtype=np.int64),
+        row_step=2,
+        route=("1", "2", "3"),
+        mission_goal=np.array([400.0, 0.0, 0.0]),
+        mapping=(15.0, 0.0, 0.5),
+    )
