@@ -74,8 +74,8 @@ class Report:
         if not bad.any():
             return True
         first = tuple(int(i) for i in np.argwhere(bad)[0])
-        got = np.atleast_1d(ours)[first]
-        want = np.atleast_1d(theirs)[first]
+        got = np.asarray(np.atleast_1d(ours)[first]).tolist()
+        want = np.asarray(np.atleast_1d(theirs)[first]).tolist()
         at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
         count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
         return self._differ(tally, quantity, where, f"{got!r}, not {want!r}{at}{count}")
