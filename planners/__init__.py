@@ -1,4 +1,236 @@
-"""Placeholder until the sub-package is filled."""
+"""Planners by name, and users' own ones by `package.module:Class`; nothing is imported before use."""
+
+import hashlib
+import importlib
+import inspect
+import sys
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shiftsim.config import one_of
+from shiftsim.errors import ConfigError
+from shiftsim.planner import Planner
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerEntry:
+    """One registered planner.
+
+    Attributes:
+        name: Its name everywhere.
+        kind: `rule-based`, `oracle` (looks at the recording) or `replay`.
+        target: `package.module:Class`.
+        description: One line.
+        arguments: Names of the arguments it takes.
+    """
+
+    name: str
+    kind: str
+    target: str
+    description: str
+    arguments: tuple[str, ...] = ()
+
+
+_ENTRIES = (
+    PlannerEntry(
+        "constant-velocity",
+        "rule-based",
+        "shiftsim.planners.constant_velocity:ConstantVelocity",
+        "keeps heading and speed",
+    ),
+    PlannerEntry(
+        "idm",
+        "rule-based",
+        "shiftsim.planners.idm:Idm",
+        "nuPlan's IDM planner: follows the route's lanes behind the nearest object",
+        ("target_velocity", "min_gap", "headway", "accel_max", "decel_max"),
+    ),
+    PlannerEntry(
+        "log-future",
+        "oracle",
+        "shiftsim.planners.log_future:LogFuture",
+        "drives the recorded future",
+    ),
+    PlannerEntry(
+        "scripted",
+        "replay",
+        "shiftsim.planners.scripted:Scripted",
+        "replays pose sequences from a Parquet or CSV file",
+        ("file", "name"),
+    ),
+    PlannerEntry(
+        "simple",
+        "rule-based",
+        "shiftsim.planners.simple:Simple",
+        "nuPlan's SimplePlanner: straight on, slows down to a limit",
+        ("max_velocity",),
+    ),
+)
+PLANNERS = types.MappingProxyType({entry.name: entry for entry in _ENTRIES})
+
+_WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+
+
+def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Planner:
+    """A new planner.
+
+    Args:
+        spec: Registered name, or `package.module:Class` of an own planner, which may lie in the
+            current directory.
+        arguments: Arguments of its constructor; texts are converted to what it asks for.
+
+    Raises:
+        ConfigError: The name, the module, the class or an argument is wrong.
+    """
+    factory = planner_factory(spec)
+    values = _bind(spec, factory, arguments or {})
+    planner = factory(**values)
+    _require_methods(spec, planner)
+    return planner
+
+
+def planner_factory(spec: str) -> Any:
+    """The class, or other callable, that makes the planner `spec` (see `load_planner`).
+
+    Raises:
+        ConfigError: There is none.
+    """
+    entry = PLANNERS.get(spec)
+    if entry is None and ":" not in spec:
+        one_of("planner", spec, PLANNERS)
+    module_name, _, attribute = (spec if entry is None else entry.target).partition(":")
+    if not module_name or not attribute.isidentifier():
+        raise ConfigError(
+            f"planner {spec!r} is not of the form package.module:Class",
+            hint="for example my_package.my_module:MyPlanner",
+        )
+    if entry is None and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(
+            f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
+            hint="install it, or run from the directory that holds it",
+        ) from error
+    factory = getattr(module, attribute, None)
+    if not callable(factory):
+        names = [n for n, v in vars(module).items() if inspect.isclass(v) and hasattr(v, "plan")]
+        raise ConfigError(
+            f"planner {spec!r}: module {module_name!r} has no class {attribute!r}",
+            hint=f"planners in it: {', '.join(sorted(names)) or 'none'}",
+        )
+    return factory
+
+
+def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """All that tells one planner from another, as JSON values.
+
+    Own planners carry the hash of their module's source, file arguments that of the file; what
+    else they depend on is not seen.
+
+    Raises:
+        ConfigError: The planner or an argument is wrong.
+    """
+    entry = PLANNERS.get(spec)
+    factory = planner_factory(spec)
+    values = _bind(spec, factory, arguments or {})
+    out: dict[str, Any] = {
+        "planner": spec,
+        "target": spec if entry is None else entry.target,
+        "arguments": {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in sorted(values.items())
+        },
+    }
+    files = {n: v for n, v in values.items() if isinstance(v, Path)}
+    if files:
+        out["files"] = {name: _hash_file(path, spec, name) for name, path in sorted(files.items())}
+    source = inspect.getsourcefile(inspect.unwrap(factory)) if entry is None else None
+    if source is not None:
+        out["source"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
+    return out
+
+
+def _hash_file(path: Path, spec: str, argument: str) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(
+            f"planner {spec!r}: argument {argument}={str(path)!r} cannot be read ({error.strerror})"
+        ) from error
+
+
+def _require_methods(spec: str, planner: object) -> None:
+    for method in ("reset", "plan"):
+        if not callable(getattr(planner, method, None)):
+            raise ConfigError(
+                f"planner {spec!r}: {type(planner).__name__} has no method {method}()",
+                hint="a planner has reset(self, scene) and plan(self, observation)",
+            )
+
+
+def _bind(spec: str, factory: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments converted to what the constructor asks for."""
+    try:
+        parameters = inspect.signature(factory, eval_str=True).parameters
+    except (TypeError, ValueError, NameError):
+        return dict(arguments)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    known = {n: p for n, p in parameters.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+    unknown = sorted(set(arguments) - set(known))
+    if unknown and not takes_any:
+        raise ConfigError(
+            f"planner {spec!r} has no argument {unknown[0]!r}",
+            hint=f"its arguments: {', '.join(known) or 'none'}",
+        )
+    missing = [n for n, p in known.items() if p.default is p.empty and n not in arguments]
+    if missing:
+        raise ConfigError(
+            f"planner {spec!r} needs the argument {missing[0]!r}",
+            hint=f"--planner-arg {missing[0]}=…",
+        )
+    return {
+        name: _convert(spec, name, value, known[name]) if name in known else value
+        for name, value in arguments.items()
+    }
+
+
+def _convert(spec: str, name: str, value: Any, parameter: inspect.Parameter) -> Any:
+    kind = _kind_of(parameter)
+    try:
+        if kind is bool:
+            return value if isinstance(value, bool) else _WORDS[str(value).lower()]
+        if kind in (int, float):
+            return _number(value, kind)
+        return kind(value) if kind in (str, Path) else value
+    except (KeyError, TypeError, ValueError):
+        raise ConfigError(
+            f"planner {spec!r}: argument {name}={value!r} is not a {kind.__name__}",
+            hint=f"--planner-arg {name}=<{kind.__name__}>",
+        ) from None
+
+
+def _number(value: Any, kind: type) -> Any:
+    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
+        raise TypeError
+    return kind(value)
+
+
+def _kind_of(parameter: inspect.Parameter) -> type:
+    """What an argument is to be converted to; `object` where nothing is known."""
+    annotation = parameter.annotation
+    options = [a for a in typing.get_args(annotation) if a is not types.NoneType]
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
+        annotation = options[0] if len(options) == 1 else object
+    if annotation is parameter.empty and isinstance(parameter.default, (bool, int, float, str)):
+        annotation = type(parameter.default)
+    return annotation if isinstance(annotation, type) else object
+
 
 if __name__ == "planners":  # pragma: no cover
     raise ImportError("import it as shiftsim.planners")

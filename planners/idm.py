@@ -1,0 +1,223 @@
+"""nuPlan's IDM planner: follow the route's lanes, keep a gap to what stands in the corridor.
+
+Everything that moves is taken as standing still during the 8 s roll-out; its speed enters only
+through the desired gap (idm-planner.md §4, quirk I3).
+"""
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.errors import PlannerError
+from shiftsim.geometry import box_corners, boxes_to_corners, wrap_angle
+from shiftsim.planner import Observation, SceneInfo
+from shiftsim.planners.idm_corridor import (
+    CLEAR,
+    HIT,
+    OPEN,
+    Occupants,
+    find_hits,
+    near_path,
+    nearest_hit,
+    sub_path,
+)
+from shiftsim.planners.idm_path import (
+    Path,
+    RoutePlan,
+    build_path,
+    candidate_edges,
+    interpolate,
+    plan_route,
+    route_blocks,
+)
+from shiftsim.state import (
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    VX,
+    LightStatus,
+    Trajectory,
+    rear_poses,
+)
+from shiftsim.traffic.idm_policy import idm_acceleration
+
+STEPS = 16
+STEP = 0.5  # s
+STEP_US = 500_000
+HORIZON = STEPS * STEP  # s
+RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
+_EGO_TOKEN = "ego_token"
+
+
+class Idm:
+    """Intelligent Driver Model along the route."""
+
+    name = "idm"
+
+    def __init__(
+        self,
+        *,
+        target_velocity: float = 10.0,
+        min_gap: float = 1.0,
+        headway: float = 1.5,
+        accel_max: float = 1.0,
+        decel_max: float = 3.0,
+    ) -> None:
+        """Set the model's parameters.
+
+        Args:
+            target_velocity: Speed on a free road where the map has no speed limit [m/s].
+            min_gap: Gap kept at standstill [m].
+            headway: Time gap kept [s].
+            accel_max: Largest acceleration [m/s^2].
+            decel_max: Largest deceleration, positive [m/s^2].
+        """
+        self._fallback_velocity = target_velocity
+        self._limits = (min_gap, headway, accel_max, decel_max)
+        self._scene: SceneInfo | None = None
+        self._blocks: list[int] = []
+        self._candidates: set[int] = set()
+        self.route_plan: RoutePlan | None = None
+        self.path: Path | None = None
+        self.target_velocity = target_velocity
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Look up the route; the path is built at the first plan.
+
+        Raises:
+            PlannerError: The route is too short or unknown to the map.
+        """
+        self._scene = scene
+        self._blocks = route_blocks(scene.map, scene.route, scene.token)
+        self._candidates = candidate_edges(scene.map, self._blocks)
+        self.route_plan = self.path = None
+
+    def plan(self, observation: Observation) -> Trajectory:
+        """17 states, 0.5 s apart, from the path's point nearest to the ego on."""
+        centers, speeds = self.roll_out(observation)
+        states = np.zeros((STEPS + 1, NUM_STATE))
+        states[:, :3] = rear_poses(centers)
+        states[:, VX] = speeds
+        return Trajectory(observation.time_us + STEP_US * np.arange(STEPS + 1), states)
+
+    def roll_out(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
+        """Box centres (17, 3) x [m], y [m], heading [rad] and speeds (17,) [m/s] of the plan."""
+        scene = self._scene
+        if scene is None:
+            raise PlannerError("idm: plan() was called before reset()")
+        ego = observation.ego
+        x, y, heading = ego.center.tolist()
+        path = self.path or self._make_path(scene, observation)
+        progress, speed = path.project(x, y), float(ego.values[VX])
+        occupants = self._occupants(observation, path, progress, speed)
+        hits = np.empty(len(occupants.speeds), np.int64)
+        half_width, half_length = 0.5 * scene.vehicle.width, 0.5 * scene.vehicle.length
+        footprint = np.empty((4, 2))
+        centers, speeds = np.empty((STEPS + 1, 3)), np.empty(STEPS + 1)
+        centers[0], speeds[0] = interpolate(path, progress), speed
+        for step in range(1, STEPS + 1):
+            box_corners(x, y, heading, scene.vehicle.length, scene.vehicle.width, footprint)
+            low = min(max(progress, 0.0), path.end)
+            high = min(max(progress + abs(self.target_velocity) * HORIZON, 0.0), path.end)
+            line = sub_path(path, low, high)
+            if find_hits(line, half_width, footprint, occupants, hits):
+                _close_open(line, half_width, footprint, occupants, hits)
+            lead, gap = nearest_hit(footprint, occupants, hits)
+            lead_speed = 0.0
+            if lead < 0:
+                gap = path.end - progress - half_length
+            else:
+                turn = wrap_angle(float(occupants.headings[lead]) - heading)
+                lead_speed = float(occupants.speeds[lead] * np.cos(turn))
+            accel = idm_acceleration(speed, gap, lead_speed, self.target_velocity, *self._limits)
+            accel = min(max(accel, -self._limits[3]), self._limits[2])
+            progress += STEP * speed
+            speed = max(0.0, speed + STEP * accel)
+            x, y, heading = centers[step] = interpolate(path, progress)
+            speeds[step] = speed
+        return centers, speeds
+
+    def _make_path(self, scene: SceneInfo, observation: Observation) -> Path:
+        """Choose lanes and target velocity, once per scenario."""
+        ego = observation.ego
+        self.route_plan = plan_route(scene.map, self._blocks, ego.center, scene.vehicle)
+        self.path = build_path(scene.map, self.route_plan.edges)
+        limit = float(scene.map.speed_limits[self.route_plan.edges[0]])
+        if np.isnan(limit) or limit == 0.0:
+            # nuPlan: the value of the scenario before, where an instance is used again (I9); here a
+            # scenario never depends on those before it
+            limit = self._fallback_velocity
+        self.target_velocity = max(limit, ego.speed)  # nuPlan: frozen at the first edge (I2)
+        if self.target_velocity <= 0.0:
+            raise PlannerError(
+                f"idm: the speed limit at the start of scenario {scene.token!r} is {limit} m/s",
+                hint="speed limits must be positive, or absent",
+            )
+        return self.path
+
+    def _occupants(
+        self, observation: Observation, path: Path, progress: float, speed: float
+    ) -> Occupants:
+        """Objects and red lights that can come into the corridor during the roll-out."""
+        assert self._scene is not None
+        vehicle, tracks = self._scene.vehicle, observation.history.tracks
+        center = observation.ego.center
+        poses, sizes = tracks.poses[-1], tracks.sizes[-1]
+        distance = np.hypot(poses[:, 0] - center[0], poses[:, 1] - center[1])
+        near = np.flatnonzero(tracks.valid[-1] & (distance < RADIUS))
+        # nuPlan: whatever has a part of "ego_token" for a token is overlooked (I8)
+        near = near[[tracks.tokens[i] not in _EGO_TOKEN for i in near.tolist()]]
+        boxes = boxes_to_corners(poses[near], sizes[near])
+        radii = 0.5 * np.hypot(sizes[near, 0], sizes[near, 1])
+        is_agent = tracks.kinds[near] <= LAST_AGENT_KIND
+        velocities = tracks.velocities[-1, near]
+        agent_speeds = np.where(is_agent, np.hypot(velocities[:, 0], velocities[:, 1]), 0.0)
+        reds = self._red_lights(observation)
+        circles = np.concatenate(
+            [np.column_stack([poses[near, :2], radii]), *(_circle(ring)[None] for ring in reds)]
+        )
+        reach = 0.5 * float(np.hypot(vehicle.length, vehicle.width))
+        travel = HORIZON * (max(abs(speed), self.target_velocity) + 1.0)
+        high = progress + travel + HORIZON * self.target_velocity
+        kept = near_path(
+            path, progress - abs(speed) - 1.0, high, circles, center[0], center[1], reach
+        )
+        rings = [boxes[i] if i < len(near) else reds[i - len(near)] for i in kept.tolist()]
+        nothing = np.zeros(len(reds))
+        return Occupants(
+            np.concatenate(rings) if rings else np.zeros((0, 2)),
+            np.cumsum([0, *(len(ring) for ring in rings)]),
+            circles[kept],
+            np.concatenate([poses[near, 2], nothing])[kept],
+            np.concatenate([agent_speeds, nothing])[kept],
+        )
+
+    def _red_lights(self, observation: Observation) -> list[FloatArray]:
+        """Shells (V, 2) of the connectors of the route whose light is red [m]."""
+        assert self._scene is not None
+        edges = self._scene.map.edges
+        return [
+            edges.rings(edges.index[name])[0]
+            for name, status in observation.traffic_lights.items()
+            if status == LightStatus.RED and edges.index.get(name, -1) in self._candidates
+        ]
+
+
+def _circle(ring: FloatArray) -> FloatArray:
+    middle = 0.5 * (ring.min(axis=0) + ring.max(axis=0))
+    radius = np.hypot(ring[:, 0] - middle[0], ring[:, 1] - middle[1]).max()
+    return np.array([middle[0], middle[1], radius])
+
+
+def _close_open(
+    line: FloatArray,
+    half_width: float,
+    footprint: FloatArray,
+    occupants: Occupants,
+    hits: IntArray,
+) -> None:
+    """Decide the open cases with the polygon nuPlan uses."""
+    buffer = shapely.LineString(line).buffer(half_width, cap_style="square")
+    corridor = buffer.union(shapely.Polygon(footprint))
+    for index in np.flatnonzero(hits == OPEN).tolist():
+        ring = shapely.Polygon(occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]])
+        hits[index] = HIT if corridor.intersects(ring) else CLEAR

@@ -1,0 +1,209 @@
+"""Which objects stand in the IDM planner's way (idm-planner.md §4.2).
+
+nuPlan buffers the path by half the ego's width with square ends, unites it with the footprint, and
+asks which polygons intersect the result. Distances to the path decide the same thing at a fraction
+of the cost, except in a thin band: the buffer is a polygon that stays within 2 % of its radius
+around the true outline, and its ends are square. Objects in that band are left open here and get
+the real buffer.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.geometry import EXTERIOR, locate_in_ring, point_segment_distance, segments_intersect
+from shiftsim.planners.idm_path import Path, interpolate
+
+CLEAR, HIT, OPEN = 0, 1, 2
+# GEOS drops vertices of the line within 1 % of the radius, and its arcs (16 segments per quarter)
+# lie 0.1 % inside the circle; twice that is safe
+BAND = 0.02
+
+
+class Occupants(NamedTuple):
+    """Polygons around the ego. M objects.
+
+    Attributes:
+        xy: (V, 2) vertices of all rings, not closed [m].
+        ptr: (M + 1,) first vertex of each ring.
+        circles: (M, 3) x, y, radius of a circle around each ring [m].
+        headings: (M,) heading, 0 for a red light [rad].
+        speeds: (M,) speed, 0 for static objects and red lights [m/s].
+    """
+
+    xy: FloatArray
+    ptr: IntArray
+    circles: FloatArray
+    headings: FloatArray
+    speeds: FloatArray
+
+
+@kernel
+def sub_path(path: Path, low: float, high: float) -> FloatArray:
+    """(K', 2) points of the path between two progresses, the interpolated ends included [m]."""
+    count = len(path.progress)
+    first = int(np.searchsorted(path.progress, low, side="right"))
+    last = int(np.searchsorted(path.progress, high, side="left"))  # one past the last vertex
+    if first == count:
+        return path.xy[count - 2 :].copy()
+    if last == 0:
+        return path.xy[:2].copy()
+    inner = max(last - first, 0)
+    out = np.empty((inner + 2, 2))
+    out[0, 0], out[0, 1], _ = interpolate(path, low)
+    out[1 : inner + 1] = path.xy[first : first + inner]
+    out[inner + 1, 0], out[inner + 1, 1], _ = interpolate(path, high)
+    return out
+
+
+@kernel
+def near_path(
+    path: Path, low: float, high: float, circles: FloatArray, x: float, y: float, reach: float
+) -> IntArray:
+    """Circles (M, 3) within `reach` [m] of a stretch of the path or of the point (x, y)."""
+    first = max(int(np.searchsorted(path.progress, low)) - 1, 0)
+    last = min(int(np.searchsorted(path.progress, high)) + 1, len(path.progress))
+    out = np.empty(len(circles), np.int64)
+    found = 0
+    for index in range(len(circles)):
+        if _is_near(path, first, last, circles[index], x, y, reach):
+            out[found] = index
+            found += 1
+    return out[:found]
+
+
+@kernel
+def _is_near(
+    path: Path, first: int, last: int, circle: FloatArray, x: float, y: float, reach: float
+) -> bool:
+    cx, cy = circle[0], circle[1]
+    limit = circle[2] + reach
+    if np.hypot(cx - x, cy - y) <= limit:
+        return True
+    xy = path.xy
+    for index in range(first, last - 1):
+        distance = point_segment_distance(
+            cx, cy, xy[index, 0], xy[index, 1], xy[index + 1, 0], xy[index + 1, 1]
+        )
+        if distance <= limit:
+            return True
+    return False
+
+
+@kernel
+def find_hits(
+    line: FloatArray, half_width: float, footprint: FloatArray, occupants: Occupants, out: IntArray
+) -> bool:
+    """Decide which occupants touch the corridor, as far as distances can.
+
+    Args:
+        line: (K, 2) the stretch of path [m].
+        half_width: Radius of the buffer around it [m].
+        footprint: (4, 2) corners of the ego, which belongs to the corridor [m].
+        occupants: The polygons.
+        out: (M,) receives CLEAR, HIT or OPEN.
+
+    Returns:
+        Whether any is OPEN.
+    """
+    is_open = False
+    for index in range(len(out)):
+        ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
+        if rings_touch(ring, footprint):
+            out[index] = HIT
+        else:
+            out[index] = _side_of_corridor(line, half_width, ring, occupants.circles[index])
+        is_open = is_open or out[index] == OPEN
+    return is_open
+
+
+@kernel
+def _side_of_corridor(
+    line: FloatArray, half_width: float, ring: FloatArray, circle: FloatArray
+) -> int:
+    inner, outer = (1.0 - BAND) * half_width, (1.0 + BAND) * half_width
+    nearest = np.inf
+    for index in range(len(line) - 1):
+        a, b = line[index], line[index + 1]
+        if point_segment_distance(circle[0], circle[1], a[0], a[1], b[0], b[1]) < (
+            circle[2] + outer
+        ):
+            nearest = min(nearest, _segment_distance(ring, a, b))
+            if nearest <= inner:
+                return HIT
+    # the square ends: beyond the first and the last point the corridor goes on by half a width
+    before = _beyond(line[1], line[0], outer)
+    after = _beyond(line[-2], line[-1], outer)
+    nearest = min(nearest, _segment_distance(ring, before, line[0]))
+    nearest = min(nearest, _segment_distance(ring, line[-1], after))
+    return OPEN if nearest <= outer else CLEAR
+
+
+@kernel
+def _beyond(a: FloatArray, b: FloatArray, distance: float) -> FloatArray:
+    length = np.hypot(b[0] - a[0], b[1] - a[1])
+    share = distance / length if length > 0.0 else 0.0
+    return b + share * (b - a)
+
+
+@kernel
+def _segment_distance(ring: FloatArray, a: FloatArray, b: FloatArray) -> float:
+    """Distance between the area of a simple ring (V, 2) and the segment a-b [m]."""
+    if locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
+        return 0.0
+    best = np.inf
+    before = len(ring) - 1
+    for vertex in range(len(ring)):
+        c, d = ring[before], ring[vertex]
+        if segments_intersect(a, b, c, d):
+            return 0.0
+        best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
+        best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
+        best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
+        before = vertex
+    return best
+
+
+@kernel
+def rings_touch(a: FloatArray, b: FloatArray) -> bool:
+    """Whether the areas of two simple rings (V, 2) share a point; touching counts."""
+    if (
+        locate_in_ring(a, b[0, 0], b[0, 1]) != EXTERIOR
+        or locate_in_ring(b, a[0, 0], a[0, 1]) != EXTERIOR
+    ):
+        return True
+    for i in range(len(a)):
+        for j in range(len(b)):
+            if segments_intersect(a[i - 1], a[i], b[j - 1], b[j]):
+                return True
+    return False
+
+
+@kernel
+def nearest_hit(
+    footprint: FloatArray, occupants: Occupants, hits: IntArray
+) -> tuple[int, float]:
+    """The HIT occupant nearest to the footprint (4, 2) and its distance [m]; (-1, inf) if none."""
+    found, best = -1, np.inf
+    for index in range(len(hits)):
+        if hits[index] != HIT:
+            continue
+        ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
+        distance = _ring_gap(footprint, ring)
+        if distance < best:
+            found, best = index, distance
+    return found, best
+
+
+@kernel
+def _ring_gap(a: FloatArray, b: FloatArray) -> float:
+    if rings_touch(a, b):
+        return 0.0
+    best = np.inf
+    for i in range(len(a)):
+        for j in range(len(b)):
+            p, q, r, s = a[i - 1], a[i], b[j - 1], b[j]
+            best = min(best, point_segment_distance(p[0], p[1], r[0], r[1], s[0], s[1]))
+            best = min(best, point_segment_distance(r[0], r[1], p[0], p[1], q[0], q[1]))
+    return best
