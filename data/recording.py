@@ -2,7 +2,12 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.track_order import order_tracks
+from shiftsim.map import VectorMap
+from shiftsim.scenario import Scenario
 from shiftsim.state import Tracks, TrafficLights
 
 
@@ -11,7 +16,8 @@ class Recording:
     """Everything observed during one recorded drive, except the ego. R rows.
 
     Attributes:
-        log_name: Name of the recording, unique in a store.
+        log_name: Name of the recording, unique in a store. A part of a longer log is named
+            `<log>@<anything>`; its scenarios then carry the name of the log alone.
         city: Name of the map it was recorded on.
         time_us: (R,) time stamps, strictly increasing [us].
         tracks: All tracks over the rows; a track that serves as ego in some scenario is among
@@ -76,3 +82,74 @@ class Window:
     mapping: tuple[float, float, float]
     is_short: bool = False
     metadata: dict[str, object] = field(default_factory=dict)
+
+
+def scenario(
+    recording: Recording, ego: EgoTrace, window: Window, road: VectorMap, *, offset: int = 0
+) -> Scenario:
+    """The scenario that a window shows. Its arrays are read-only.
+
+    Args:
+        recording: The recording, or a span of it that holds the window.
+        ego: States of the window's ego over (at least) the window.
+        window: The window.
+        road: Map of the recording.
+        offset: Row of the recording that is the first one of the span.
+    """
+    rows = slice(window.first_row - offset, window.last_row - offset)
+    start = window.first_row - ego.first_row - offset
+    count = window.last_row - window.first_row
+    out = Scenario(
+        token=window.token,
+        scenario_type=window.scenario_type,
+        log_name=recording.log_name.partition("@")[0],
+        city=recording.city,
+        map=road,
+        time_us=recording.time_us[rows].copy(),
+        ego=ego.states[start : start + count].copy(),
+        tracks=visible_tracks(recording.tracks.rows(rows), without=window.ego),
+        traffic_lights=listed_lights(recording.lights.rows(rows)),
+        iteration_rows=window.iteration_rows - window.first_row,
+        row_step=window.row_step,
+        route=window.route,
+        mission_goal=None if window.mission_goal is None else window.mission_goal.copy(),
+        mapping=window.mapping,
+        is_short=window.is_short,
+    )
+    freeze(out)
+    return out
+
+
+def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
+    """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
+    seen = np.flatnonzero(tracks.valid.any(axis=0))
+    kept = tracks.select(seen[[tracks.tokens[i] != without for i in seen.tolist()]])
+    return kept.select(order_tracks(*np.nonzero(kept.valid), kept.kinds))
+
+
+def listed_lights(lights: TrafficLights) -> TrafficLights:
+    """The connectors listed in the rows given, ordered by first appearance."""
+    listed = lights.status >= 0
+    seen = np.flatnonzero(listed.any(axis=0))
+    kept = seen[np.argsort(listed.argmax(axis=0)[seen], kind="stable")]
+    names = tuple(lights.connector_ids[i] for i in kept.tolist())
+    return TrafficLights(names, np.ascontiguousarray(lights.status[:, kept]))
+
+
+def freeze(scene: Scenario) -> None:
+    """Make the arrays of a scenario read-only."""
+    tracks, lights = scene.tracks, scene.traffic_lights
+    for array in (
+        scene.time_us,
+        scene.ego,
+        scene.iteration_rows,
+        tracks.valid,
+        tracks.poses,
+        tracks.velocities,
+        tracks.sizes,
+        tracks.kinds,
+        lights.status,
+    ):
+        array.flags.writeable = False
+    if scene.mission_goal is not None:
+        scene.mission_goal.flags.writeable = False
