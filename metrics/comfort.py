@@ -13,9 +13,11 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import DataError
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.state import AX, AY, HEADING, center_accelerations
 
+NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
 _SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
 # nuPlan: an even window is centred half a sample ahead, so that interior output n is the fitted
@@ -53,6 +55,14 @@ BOUNDED_SIGNALS = {
     "ego_lon_jerk": "lon_jerk",
     "ego_yaw_acceleration": "yaw_accel",
     "ego_yaw_rate": "yaw_rate",
+}
+_UNITS = {
+    "ego_jerk": "meters_per_second_cubed",
+    "ego_lat_acceleration": "meters_per_second_squared",
+    "ego_lon_acceleration": "meters_per_second_squared",
+    "ego_lon_jerk": "meters_per_second_cubed",
+    "ego_yaw_acceleration": "radians_per_second_squared",
+    "ego_yaw_rate": "radians_per_second",
 }
 
 
@@ -119,6 +129,58 @@ def within_bounds(signals: ComfortSignals, thresholds: Thresholds) -> list[bool]
             strict=True,
         )
     ]
+
+
+def judge(
+    signals: ComfortSignals, time_us: IntArray, thresholds: Thresholds
+) -> tuple[list[MetricPart], MetricPart]:
+    """The six unscored signals in the order of `BOUNDED_SIGNALS`, and the comfort score."""
+    parts = []
+    for (metric, signal), bounds in zip(
+        BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True
+    ):
+        parts.append(_judge_signal(metric, getattr(signals, signal), time_us, bounds))
+    broken = [part.row.violation for part in parts if part.row.violation is not None]
+    score = float(not broken)
+    first = min(broken, key=lambda violation: violation.iteration, default=None)
+    row = MetricRow(NAME, score, float(len(broken)), "count", 0.0, first)
+    return parts, MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
+
+
+def _judge_signal(
+    metric: str, values: FloatArray, time_us: IntArray, bounds: tuple[float, float]
+) -> MetricPart:
+    low, high = bounds
+    margins = np.minimum(values - low, high - values)
+    broken = ~((low < values) & (values < high))
+    worst = int(np.argmin(margins))
+    violation = None
+    if broken.any():
+        at = int(np.argmax(broken))
+        violation = Violation(at, int(time_us[at]), None, float(values[at]))
+    value = float(values[worst])
+    nearest = low if value - low < high - value else high
+    unit = _UNITS[metric]
+    row = MetricRow(metric, None, value, unit, nearest, violation)
+    statistics = (
+        Statistic(metric, f"max_{metric}", unit, "MAX", float(values.max())),
+        Statistic(metric, f"min_{metric}", unit, "MIN", float(values.min())),
+        Statistic(metric, f"avg_{metric}", unit, "MEAN", float(np.mean(values))),
+        Statistic(metric, f"p90_{metric}", unit, "P90", _percentile_90(values)),
+        Statistic(
+            metric, f"abs_{metric}_within_bounds", "boolean", "BOOLEAN", float(violation is None)
+        ),
+    )
+    return MetricPart(row, statistics, Series(unit, values))
+
+
+def _percentile_90(values: FloatArray) -> float:
+    """The 90th percentile by numpy's method `closest_observation`, without interpolation."""
+    rank = len(values) * 0.9 - 1.5
+    below = int(np.floor(rank))
+    # an exact tie goes to the even rank (numpy 1.26, as nuPlan pins it)
+    tie = rank == below and below % 2 == 0
+    return float(np.sort(values)[max(0, below if tie else below + 1)])
 
 
 def _unwrap(angles: FloatArray) -> FloatArray:

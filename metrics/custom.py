@@ -1,0 +1,69 @@
+"""Own metrics: callables `(log, road) -> float | MetricRow`, reported beside the official ones."""
+
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from shiftsim.errors import ConfigError
+from shiftsim.log import SimulationLog
+from shiftsim.map import VectorMap
+from shiftsim.metrics.result import MetricRow
+from shiftsim.metrics.score import SHORT_NAMES, MetricResult
+
+CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
+
+
+def load_metric(spec: str | CustomMetric) -> CustomMetric:
+    """The callable that `module:attribute` names, or the callable itself.
+
+    Raises:
+        ConfigError: It cannot be imported, or is not callable.
+    """
+    if not isinstance(spec, str):
+        return spec
+    module_name, _, attribute = spec.partition(":")
+    hint = "name it as module:attribute, for example my_package.metrics:min_gap"
+    if not module_name or not attribute:
+        raise ConfigError(f"metric {spec!r} is not of the form module:attribute", hint)
+    try:
+        metric = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"metric {spec!r} cannot be imported: {error}", hint) from error
+    if not callable(metric):
+        raise ConfigError(f"metric {spec!r} is not callable but {type(metric).__name__}", hint)
+    found: CustomMetric = metric
+    return found
+
+
+def add_metrics(
+    result: MetricResult,
+    log: SimulationLog,
+    road: VectorMap,
+    metrics: Sequence[str | CustomMetric],
+) -> MetricResult:
+    """The same result with the rows of own metrics in `extra`; the score stays as it is.
+
+    Raises:
+        ConfigError: A metric cannot be loaded, or two rows have the same name.
+    """
+    rows = [_run(load_metric(metric), log, road) for metric in metrics]
+    taken = {*result.scores, *SHORT_NAMES}
+    for row in rows:
+        if row.metric in taken:
+            raise ConfigError(f"metric name {row.metric!r} is taken", "rename the own metric")
+        taken.add(row.metric)
+    return replace(result, extra=tuple(rows))
+
+
+def _run(metric: CustomMetric, log: SimulationLog, road: VectorMap) -> MetricRow:
+    name = getattr(metric, "__name__", type(metric).__name__)
+    value = metric(log, road)
+    if isinstance(value, MetricRow):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"metric {name!r} returned {value!r}", "return a number or a MetricRow"
+        ) from error
+    return MetricRow(name, None, number, "", None, None)
