@@ -59,8 +59,9 @@ def box_corners(x: float, y: float, heading: float, length: float, width: float,
     for index in range(4):
         lon = 0.5 * length if index == 0 or index == 3 else -0.5 * length
         lat = 0.5 * width if index < 2 else -0.5 * width
-        out[index, 0] = x + lon * lon_x + lat * lat_x
-        out[index, 1] = y + lon * lon_y + lat * lat_y
+        # nuPlan: the offset is summed first, which decides the last bit
+        out[index, 0] = x + (lat * lat_x + lon * lon_x)
+        out[index, 1] = y + (lat * lat_y + lon * lon_y)
 
 
 @kernel
@@ -302,8 +303,8 @@ def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
     lat = np.stack([np.cos(heading + np.pi / 2.0), np.sin(heading + np.pi / 2.0)], -1)
     half_length = 0.5 * sizes[..., 0, None, None] * np.array([1.0, -1.0, -1.0, 1.0])[:, None]
     half_width = 0.5 * sizes[..., 1, None, None] * np.array([1.0, 1.0, -1.0, -1.0])[:, None]
-    corners: FloatArray = (
-        poses[..., None, :2] + half_length * lon[..., None, :] + half_width * lat[..., None, :]
+    corners: FloatArray = poses[..., None, :2] + (
+        half_width * lat[..., None, :] + half_length * lon[..., None, :]
     )
     return corners
 
