@@ -375,6 +375,7 @@ def _idm_steps(file: ArrayFile) -> None:
         )
     for array, names in IDM_NAMES.items():
         file.columns(array, names)
+    file.note("lead progress, length_rear: not read where the gap is below min_gap")
     file.note("integrators that no configuration uses", "odeint", "rk45")
 
 
