@@ -14,7 +14,7 @@ from shiftsim.errors import DataError
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
 from shiftsim.state import AgentKind, LightStatus, center_poses
-from shiftsim.verify.expert_route import expert_route
+from shiftsim.verify.expert_route import expert_points, expert_route
 from shiftsim.verify.nuplan_maps import verify_maps
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import Group, read_groups
@@ -115,7 +115,7 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
         name, scene = entry["scene"], scenes[entry["scene"]]
         _verify_manifest(folder, entry, scene, report)
         if name in meta:
-            _verify_meta(name, meta[name], scene, report)
+            _verify_meta(folder / entry["db"], name, meta[name], scene, report)
         else:
             report.skip(f"scene {name} is not in scenario_meta.json")
         if (name,) in ego:
@@ -214,18 +214,22 @@ def _compare_pose(
     report.compare(quantity, f"{where} [rad]", pose[2:], theirs[2:], atol=_RADIANS)
 
 
-def _verify_meta(name: str, meta: dict[str, Any], scene: Scenario, report: Report) -> None:
+def _verify_meta(
+    path: Path, name: str, meta: dict[str, Any], scene: Scenario, report: Report
+) -> None:
     times = scene.iteration_times
-    # nuPlan: both stamps become seconds first, which costs up to 0.24 us at today's epoch.
+    with open_log(path) as log:
+        route = expert_route(scene.map, expert_points(log, log.row_of[scene.token]))
+    # nuPlan: both stamps become seconds first, and the difference is cut to whole microseconds.
     duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
     ours = {
         "token": scene.token,
         "log_name": scene.log_name,
         "iterations": scene.num_iterations,
         "route_roadblock_ids": list(scene.route),
-        "route_from_expert": expert_route(scene),
+        "route_from_expert": route,
         "database_interval": 0.05 / scene.mapping[2],
-        "duration_s": round(duration, 6),
+        "duration_s": int(duration * 1e6) / 1e6,
         "time_us": times.tolist(),
     }
     poses = {"mission_goal": scene.mission_goal, "expert_goal_state": scene.expert[-1, :3]}
@@ -319,6 +323,7 @@ def _verify_objects(
     values = boxes.values[chosen].copy()
     values[kinds > AgentKind.BICYCLE, 3:5] = np.nan  # static objects have no velocity
     _verify_dense(name, iteration, tokens, values, scene, report)
+    values[kinds > AgentKind.BICYCLE, 3:5] = 0.0  # and the official table shows none as 0
     if group is None:
         report.compare("objects (log)", f"{name}: number", len(tokens), 0)
         return

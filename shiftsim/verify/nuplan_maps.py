@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.geometry import point_on_polyline
 from shiftsim.layers import Layer, Lists, Polylines, distance_to, in_any, nearest
 from shiftsim.map import NONE, VectorMap
@@ -272,16 +272,32 @@ def _answer(road: VectorMap, x: float, y: float) -> dict[str, Any]:
         layer, first, last = _require_layer(road, name)
         found = layer.containing(x, y)
         out[name] = _join(layer, found[(found >= first) & (found < last)])
-    for name in ("LANE", "LANE_CONNECTOR", "STOP_LINE"):
-        layer, first, last = _require_layer(road, name)
-        found = layer.within_box(x, y, _NEAR)
-        out[f"near20_{name}"] = _join(layer, found[(found >= first) & (found < last)])
+    near = road.edges.within_box(x, y, _NEAR)
+    out["near20_LANE"] = _join(road.edges, near[near < road.num_lanes])
+    out["near20_LANE_CONNECTOR"] = _join(road.edges, connectors_near(road, x, y, _NEAR))
+    stops = road.stop_polygons
+    out["near20_STOP_LINE"] = _join(stops, stops.within_box(x, y, _NEAR))
     areas = road.drivable_areas.polygons
     out["in_DRIVABLE_AREA"] = bool(in_any(areas, x, y))
     out["in_INTERSECTION"] = bool(in_any(road.intersections.polygons, x, y))
     out["drivable_area_distance"] = float(nearest(areas, x, y, np.inf)[1])
     out.update(_nearest_lane(road, x, y))
     return out
+
+
+def connectors_near(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
+    """Lane connectors whose centre line meets an axis-parallel square around (x, y).
+
+    nuPlan: its table of lane connectors holds lines, and searches by distance run over that one.
+    """
+    square = shapely.box(x - half_width, y - half_width, x + half_width, y + half_width)
+    lines = road.baselines
+    found = [
+        edge
+        for edge in range(road.num_lanes, len(road.edges))
+        if shapely.intersects(shapely.LineString(lines.at(edge)), square)
+    ]
+    return np.array(found, np.int64)
 
 
 def _require_layer(road: VectorMap, name: str) -> tuple[Layer, int, int]:
