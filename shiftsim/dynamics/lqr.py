@@ -22,10 +22,10 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.dynamics.bicycle import step_bicycle, step_seconds
-from shiftsim.dynamics.perfect import segment_end, unwrap_correction
+from shiftsim.dynamics.perfect import interpolate, unwrap_correction
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.geometry import wrap_angle
-from shiftsim.state import HEADING, PACIFICA, STEERING, VX, X, Y
+from shiftsim.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
 
 INITIAL_CURVATURE_PENALTY = 1e-10  # nuPlan tracker utilities
 MIN_POSES = 3  # of the resampled plan; fewer have no second difference
@@ -205,28 +205,6 @@ def profile_at(profile: FloatArray, start_us: int, step_us: int, seconds: float)
 
 
 @kernel
-def reference_pose(
-    traj_time_us: IntArray, traj_states: FloatArray, now_us: int
-) -> tuple[float, float, float]:
-    """Pose x, y, heading of a trajectory at a time it covers, as `perfect.interpolate` has it."""
-    end = segment_end(traj_time_us, now_us)
-    begin = end - 1
-    turn = 0.0
-    for knot in range(1, end):
-        turn += unwrap_correction(traj_states[knot - 1, HEADING], traj_states[knot, HEADING])
-    span = float(traj_time_us[end] - traj_time_us[begin])
-    ahead = float(now_us - traj_time_us[begin])
-    x, y, heading = traj_states[begin, X], traj_states[begin, Y], traj_states[begin, HEADING] + turn
-    turn += unwrap_correction(traj_states[begin, HEADING], traj_states[end, HEADING])
-    last = traj_states[end, HEADING] + turn
-    return (
-        (traj_states[end, X] - x) / span * ahead + x,
-        (traj_states[end, Y] - y) / span * ahead + y,
-        wrap_angle((last - heading) / span * ahead + heading),
-    )
-
-
-@kernel
 def fit_profiles(
     traj_time_us: IntArray, traj_states: FloatArray, params: LqrParameters
 ) -> tuple[FloatArray, FloatArray]:
@@ -258,13 +236,13 @@ def reference(
         params: Parameters of the tracker.
     """
     curvature = np.zeros(params.horizon)
-    count = len(traj_time_us)
-    if count < 2 or now_us < traj_time_us[0] or now_us > traj_time_us[count - 1]:
+    target = np.empty(NUM_STATE)
+    if not interpolate(traj_time_us, traj_states, now_us, target):
         return Reference(NOT_COVERED, 0.0, 0.0, 0.0, curvature)
     if num_resampled(traj_time_us, params.step_us) < MIN_POSES:
         return Reference(TOO_SHORT, 0.0, 0.0, 0.0, curvature)
-    x, y, heading = reference_pose(traj_time_us, traj_states, now_us)
-    lateral = -(state[X] - x) * np.sin(heading) + (state[Y] - y) * np.cos(heading)
+    heading = target[HEADING]
+    lateral = -(state[X] - target[X]) * np.sin(heading) + (state[Y] - target[Y]) * np.cos(heading)
     speeds, curvatures = fit_profiles(traj_time_us, traj_states, params)
     start_us, dt, now = traj_time_us[0], params.step_us / 1e6, now_us * 1e-6
     for step in range(params.horizon):

@@ -103,10 +103,9 @@ def sample_poses(
     """Poses of a trajectory every 0.1 s from now on, into `out` (P, 3); NaN where it has none."""
     state = np.empty(NUM_STATE)
     for row in range(len(out)):
-        if interpolate(traj_time_us, traj_states, now_us + row * SAMPLE_US, state):
-            out[row] = state[:3]
-        else:
-            out[row] = np.nan
+        covered = interpolate(traj_time_us, traj_states, now_us + row * SAMPLE_US, state)
+        for column in range(3):
+            out[row, column] = state[column] if covered else np.nan
 
 
 def follow_perfectly(plan: Trajectory, next_us: int, out: FloatArray) -> None:

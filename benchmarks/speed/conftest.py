@@ -1,0 +1,60 @@
+"""Speed figures, each in µs and as a ratio to one fixed calculation in the same session."""
+
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from shiftsim.arrays import kernel
+
+CALIBRATION_STEPS = 10_000  # dependent multiply-adds: about 8 cycles each, whatever the machine
+ROUNDS = 200
+
+
+@kernel
+def calibration(steps: int) -> float:
+    """A chain of float operations that no compiler can shorten or vectorise."""
+    value = 0.5
+    for _ in range(steps):
+        value = value * 0.999999 + 1e-7
+    return value
+
+
+def median_seconds(
+    function: Callable[[], object], *, rounds: int = ROUNDS, calls: int = 1
+) -> float:
+    """Median time of one call [s], over rounds of several calls each; warm."""
+    function()
+    times = []
+    for _ in range(rounds):
+        began = perf_counter()
+        for _ in range(calls):
+            function()
+        times.append((perf_counter() - began) / calls)
+    return float(np.median(times))
+
+
+@pytest.fixture(scope="session")
+def calibration_seconds() -> float:
+    """Median time of the calibration kernel [s]."""
+    return median_seconds(lambda: calibration(CALIBRATION_STEPS))
+
+
+@pytest.fixture
+def measure(benchmark, calibration_seconds):
+    """Benchmark a call and note its median in µs and as a ratio to the calibration kernel."""
+
+    def run(function: Callable[..., object], *arguments: object, calls: int = 100) -> float:
+        benchmark.pedantic(
+            function, args=arguments, rounds=ROUNDS, iterations=calls, warmup_rounds=3
+        )
+        median = benchmark.stats.stats.median
+        ratio = median / calibration_seconds
+        benchmark.extra_info["median_us"] = round(median * 1e6, 3)
+        benchmark.extra_info["ratio"] = round(ratio, 4)
+        name = benchmark.name.removeprefix("test_")
+        print(f"\n{name}: {median * 1e6:.2f} µs, {ratio:.3f} of the calibration", end="")
+        return median
+
+    return run
