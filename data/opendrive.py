@@ -1,8 +1,8 @@
 """OpenDRIVE XML to the records of `opendrive_records`.
 
-Nothing is evaluated here. Real files are seldom quite right (opendrive.md §7): what can be mended is
-mended and counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error that
-names file, road and element.
+Nothing is evaluated here. Real files are seldom quite right (opendrive.md §7): what can be mended
+is mended and counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error
+that names file, road and element.
 """
 
 import io

@@ -1,9 +1,9 @@
 """From lanes of lane sections to lanes, roadblocks and connectors of the map: topology only.
 
 A *group* holds the drivable lanes of one direction of one lane section. Groups that follow each
-other one lane to one lane are joined to a run, which becomes a roadblock. Every other link becomes a
-connector: through a junction along its connecting roads, elsewhere over a short seam cut from the
-lanes before it (deepplan-conversion.md §2.3, §2.4).
+other one lane to one lane are joined to a run, which becomes a roadblock. Every other link becomes
+a connector: through a junction along its connecting roads, elsewhere over a short seam cut from
+the lanes before it (deepplan-conversion.md §2.3, §2.4).
 """
 
 from collections import Counter, defaultdict
@@ -16,7 +16,7 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive_geometry import ReferenceLine
 from shiftsim.data.opendrive_lanes import LaneKey, lane_links, runs_forward, section_borders
-from shiftsim.data.opendrive_records import Lane, OpenDrive, Road
+from shiftsim.data.opendrive_records import Lane, OpenDrive
 
 DRIVABLE = frozenset(
     "driving entry exit onRamp offRamp connectingRamp slipLane bidirectional HOV bus taxi "
@@ -194,10 +194,7 @@ class _Builder:
             self.warnings["lane link missing between sections, inferred"] += inferred
 
     def _is_forward(self, key: LaneKey) -> bool:
-        piece = self.nodes[key]
-        return piece.begin <= piece.end and runs_forward(
-            self.od.roads[key.road], key.section, key.lane
-        )
+        return runs_forward(self.od.roads[key.road], key.section, key.lane)
 
     def _link_through(self, key: LaneKey) -> None:
         """Take a lane out and join what lies before it to what lies after it."""
@@ -346,13 +343,3 @@ def split_pieces(pieces: list[Piece], at: float) -> tuple[list[Piece], list[Piec
             head.append(replace(piece, end=float(cut)))
         return head, tail
     return head, []
-
-
-def driven_length(od: OpenDrive) -> float:
-    """Length of all reference lines [m]."""
-    return float(sum(road.length for road in od.roads.values()))
-
-
-def road_of(od: OpenDrive, piece: Piece) -> Road:
-    """The road a piece lies on."""
-    return od.roads[piece.key.road]
