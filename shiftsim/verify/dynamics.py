@@ -240,6 +240,8 @@ def _drive_loops(file: ArrayFile, whole_plan: list[bool], noise: FloatArray) -> 
     for case, whole in enumerate(whole_plan):
         _check_stamps(ref_time[case], f"reference of case {case}")
         _check_stamps(iter_time[case], f"iterations of case {case}")
+        grid = ref_time[case, 0] + lqr.NUPLAN.step_us * np.arange(ref_time.shape[1])
+        file.compare("ref_time_us", case, grid, ref_time[case], EXACT)
         plan = _plan_states(*references[case].T)
         window = len(plan) if whole else WINDOW_KNOTS
         driven, commands = _drive(
@@ -251,7 +253,7 @@ def _drive_loops(file: ArrayFile, whole_plan: list[bool], noise: FloatArray) -> 
         file.compare("state_time_us", case, file["state_time_us"][case], iter_time[case], EXACT)
     file.columns("state_columns", STATE_NAMES)
     file.columns("centre_columns", CENTER_NAMES)
-    file.note("ref_pose, ref_time_us: knots behind the last window are read by no step")
+    file.note("ref_pose: knots behind the last window are read by no step")
 
 
 def _drive(

@@ -14,7 +14,7 @@ LABELS = {"case", "kind", "shape"}
 UNREAD = LABELS | {"odeint", "rk45", "sig_in_vx"}
 # Inputs of which only some columns or rows are read; their first value is.
 PARTLY_READ = {
-    *("in_state", "ego_state", "knot_state", "ref_pose", "ref_time_us", "rear_state"),
+    *("in_state", "ego_state", "knot_state", "ref_pose", "rear_state"),
     *("sig_in_time_us", "knot_time_us", "lead"),
 }
 FIRST_READ = {"lead": 1}  # a lead's position is not read below the minimum gap, its speed is
