@@ -1,4 +1,7 @@
-"""Planners by name, and users' own ones by `package.module:Class`; nothing is imported before use."""
+"""Planners by name, and users' own ones by `package.module:Class`.
+
+Nothing is imported before it is asked for.
+"""
 
 import hashlib
 import importlib

@@ -7,7 +7,7 @@ through the desired gap (idm-planner.md §4, quirk I3).
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
 from shiftsim.geometry import box_corners, boxes_to_corners, wrap_angle
 from shiftsim.planner import Observation, SceneInfo
@@ -15,10 +15,11 @@ from shiftsim.planners.idm_corridor import (
     CLEAR,
     HIT,
     OPEN,
+    UNKNOWN,
     Occupants,
-    find_hits,
+    find_lead,
+    find_sides,
     near_path,
-    nearest_hit,
     sub_path,
 )
 from shiftsim.planners.idm_path import (
@@ -105,36 +106,24 @@ class Idm:
         if scene is None:
             raise PlannerError("idm: plan() was called before reset()")
         ego = observation.ego
-        x, y, heading = ego.center.tolist()
         path = self.path or self._make_path(scene, observation)
-        progress, speed = path.project(x, y), float(ego.values[VX])
-        occupants = self._occupants(observation, path, progress, speed)
-        hits = np.empty(len(occupants.speeds), np.int64)
-        half_width, half_length = 0.5 * scene.vehicle.width, 0.5 * scene.vehicle.length
-        footprint = np.empty((4, 2))
-        centers, speeds = np.empty((STEPS + 1, 3)), np.empty(STEPS + 1)
-        centers[0], speeds[0] = interpolate(path, progress), speed
-        for step in range(1, STEPS + 1):
-            box_corners(x, y, heading, scene.vehicle.length, scene.vehicle.width, footprint)
-            low = min(max(progress, 0.0), path.end)
-            high = min(max(progress + abs(self.target_velocity) * HORIZON, 0.0), path.end)
-            line = sub_path(path, low, high)
-            if find_hits(line, half_width, footprint, occupants, hits):
-                _close_open(line, half_width, footprint, occupants, hits)
-            lead, gap = nearest_hit(footprint, occupants, hits)
-            lead_speed = 0.0
+        centers, motion = np.empty((STEPS + 1, 3)), np.empty((STEPS + 1, 2))
+        centers[0] = ego.center
+        start = path.project(centers[0, 0], centers[0, 1])
+        motion[0] = start, ego.values[VX]
+        occupants = self._occupants(observation, path, start, float(ego.values[VX]))
+        sides = np.full((STEPS, len(occupants.speeds)), UNKNOWN)
+        size = (scene.vehicle.length, scene.vehicle.width)
+        model = (self.target_velocity, *self._limits)
+        step = 0
+        while True:
+            step, lead = _roll_on(step, path, occupants, size, model, centers, motion, sides)
             if lead < 0:
-                gap = path.end - progress - half_length
-            else:
-                turn = wrap_angle(float(occupants.headings[lead]) - heading)
-                lead_speed = float(occupants.speeds[lead] * np.cos(turn))
-            accel = idm_acceleration(speed, gap, lead_speed, self.target_velocity, *self._limits)
-            accel = min(max(accel, -self._limits[3]), self._limits[2])
-            progress += STEP * speed
-            speed = max(0.0, speed + STEP * accel)
-            x, y, heading = centers[step] = interpolate(path, progress)
-            speeds[step] = speed
-        return centers, speeds
+                break
+            reach = _look_ahead(path, motion[step, 0], self.target_velocity)
+            sides[step, lead] = _exact_side(reach, centers[step], size, occupants, lead)
+        centers[0] = interpolate(path, start)
+        return centers, motion[:, 1]
 
     def _make_path(self, scene: SceneInfo, observation: Observation) -> Path:
         """Choose lanes and target velocity, once per scenario."""
@@ -208,16 +197,75 @@ def _circle(ring: FloatArray) -> FloatArray:
     return np.array([middle[0], middle[1], radius])
 
 
-def _close_open(
-    line: FloatArray,
-    half_width: float,
-    footprint: FloatArray,
+@kernel
+def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
+    """(K, 2) the stretch of path that the ego would cover at its target velocity [m]."""
+    end = path.progress[-1]
+    low = min(max(progress, 0.0), end)
+    return sub_path(path, low, min(max(progress + abs(target) * HORIZON, 0.0), end))
+
+
+@kernel
+def _roll_on(
+    first: int,
+    path: Path,
     occupants: Occupants,
-    hits: IntArray,
-) -> None:
-    """Decide the open cases with the polygon nuPlan uses."""
-    buffer = shapely.LineString(line).buffer(half_width, cap_style="square")
-    corridor = buffer.union(shapely.Polygon(footprint))
-    for index in np.flatnonzero(hits == OPEN).tolist():
-        ring = shapely.Polygon(occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]])
-        hits[index] = HIT if corridor.intersects(ring) else CLEAR
+    size: tuple[float, float],
+    model: tuple[float, float, float, float, float],
+    centers: FloatArray,
+    motion: FloatArray,
+    sides: IntArray,
+) -> tuple[int, int]:
+    """Fill the rows behind `first` until the end, or until an OPEN occupant would be the lead.
+
+    Args:
+        first: Row that is known.
+        path: The path.
+        occupants: What may stand in the way.
+        size: Length and width of the ego [m].
+        model: Target velocity [m/s] and the remaining parameters of `idm_acceleration`.
+        centers: (17, 3) box centres x [m], y [m], heading [rad].
+        motion: (17, 2) progress [m] and speed [m/s].
+        sides: (16, M) side of every occupant at every step, decided as far as needed.
+
+    Returns:
+        The row and the occupant to decide, or -1 for the occupant at the end.
+    """
+    target, min_gap, headway, accel_max, decel_max = model
+    footprint = np.empty((4, 2))
+    for step in range(first, STEPS):
+        x, y, heading = centers[step]
+        progress, speed = motion[step]
+        box_corners(x, y, heading, size[0], size[1], footprint)
+        line = _look_ahead(path, progress, target)
+        find_sides(line, 0.5 * size[1], footprint, occupants, sides[step])
+        lead, gap = find_lead(footprint, occupants, sides[step])
+        lead_speed = 0.0
+        if lead < 0:
+            gap = path.progress[-1] - progress - 0.5 * size[0]
+        elif sides[step, lead] == OPEN:
+            return step, lead
+        else:
+            turn = wrap_angle(occupants.headings[lead] - heading)
+            lead_speed = occupants.speeds[lead] * np.cos(turn)
+        accel = idm_acceleration(
+            speed, gap, lead_speed, target, min_gap, headway, accel_max, decel_max
+        )
+        motion[step + 1, 0] = progress + STEP * speed
+        motion[step + 1, 1] = max(0.0, speed + STEP * min(max(accel, -decel_max), accel_max))
+        centers[step + 1] = interpolate(path, motion[step + 1, 0])
+    return STEPS, -1
+
+
+def _exact_side(
+    line: FloatArray,
+    center: FloatArray,
+    size: tuple[float, float],
+    occupants: Occupants,
+    index: int,
+) -> int:
+    """The side of an OPEN occupant, by the polygon nuPlan uses."""
+    buffer = shapely.LineString(line).buffer(0.5 * size[1], cap_style="square")
+    corridor = buffer.union(shapely.Polygon(boxes_to_corners(center, np.array(size))))
+    ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
+    return HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR

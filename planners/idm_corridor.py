@@ -15,7 +15,7 @@ from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.geometry import EXTERIOR, locate_in_ring, point_segment_distance, segments_intersect
 from shiftsim.planners.idm_path import Path, interpolate
 
-CLEAR, HIT, OPEN = 0, 1, 2
+UNKNOWN, CLEAR, HIT, OPEN = 0, 1, 2, 3
 # GEOS drops vertices of the line within 1 % of the radius, and its arcs (16 segments per quarter)
 # lie 0.1 % inside the circle; twice that is safe
 BAND = 0.02
@@ -92,9 +92,9 @@ def _is_near(
 
 
 @kernel
-def find_hits(
+def find_sides(
     line: FloatArray, half_width: float, footprint: FloatArray, occupants: Occupants, out: IntArray
-) -> bool:
+) -> None:
     """Decide which occupants touch the corridor, as far as distances can.
 
     Args:
@@ -102,20 +102,16 @@ def find_hits(
         half_width: Radius of the buffer around it [m].
         footprint: (4, 2) corners of the ego, which belongs to the corridor [m].
         occupants: The polygons.
-        out: (M,) receives CLEAR, HIT or OPEN.
-
-    Returns:
-        Whether any is OPEN.
+        out: (M,) CLEAR, HIT or OPEN is written where UNKNOWN stands.
     """
-    is_open = False
     for index in range(len(out)):
+        if out[index] != UNKNOWN:
+            continue
         ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
         if rings_touch(ring, footprint):
             out[index] = HIT
         else:
             out[index] = _side_of_corridor(line, half_width, ring, occupants.circles[index])
-        is_open = is_open or out[index] == OPEN
-    return is_open
 
 
 @kernel
@@ -181,29 +177,48 @@ def rings_touch(a: FloatArray, b: FloatArray) -> bool:
 
 
 @kernel
-def nearest_hit(
-    footprint: FloatArray, occupants: Occupants, hits: IntArray
-) -> tuple[int, float]:
-    """The HIT occupant nearest to the footprint (4, 2) and its distance [m]; (-1, inf) if none."""
-    found, best = -1, np.inf
-    for index in range(len(hits)):
-        if hits[index] != HIT:
-            continue
-        ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
-        distance = _ring_gap(footprint, ring)
-        if distance < best:
-            found, best = index, distance
-    return found, best
+def find_lead(footprint: FloatArray, occupants: Occupants, sides: IntArray) -> tuple[int, float]:
+    """The occupant nearest to the footprint (4, 2) and its gap [m]; (-1, inf) if all are CLEAR.
+
+    It may be OPEN; those farther away need not be decided.
+    """
+    found, best, best_gap = -1, np.inf, np.inf
+    for index in range(len(sides)):
+        if sides[index] != CLEAR:
+            ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
+            distance, gap = _ring_gap(footprint, ring)
+            if distance < best:
+                found, best, best_gap = index, distance, gap
+    return found, best_gap
 
 
 @kernel
-def _ring_gap(a: FloatArray, b: FloatArray) -> float:
+def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Distance between two rings, and the same measured between their nearest points [m].
+
+    nuPlan takes the latter, and the nearest point on an edge is rounded to what a coordinate in
+    UTM can hold.
+    """
     if rings_touch(a, b):
-        return 0.0
-    best = np.inf
-    for i in range(len(a)):
-        for j in range(len(b)):
-            p, q, r, s = a[i - 1], a[i], b[j - 1], b[j]
-            best = min(best, point_segment_distance(p[0], p[1], r[0], r[1], s[0], s[1]))
-            best = min(best, point_segment_distance(r[0], r[1], p[0], p[1], q[0], q[1]))
-    return best
+        return 0.0, 0.0
+    best, gap = np.inf, np.inf
+    for swap in range(2):
+        points, ring = (a, b) if swap == 0 else (b, a)
+        for i in range(len(points)):
+            for j in range(len(ring)):
+                p, c, d = points[i], ring[j - 1], ring[j]
+                distance = point_segment_distance(p[0], p[1], c[0], c[1], d[0], d[1])
+                if distance < best:
+                    best, gap = distance, _gap_to_edge(p, c, d)
+    return best, gap
+
+
+@kernel
+def _gap_to_edge(p: FloatArray, a: FloatArray, b: FloatArray) -> float:
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    square = dx * dx + dy * dy
+    along = ((p[0] - a[0]) * dx + (p[1] - a[1]) * dy) / square if square > 0.0 else 0.0
+    along = min(max(along, 0.0), 1.0)
+    x = b[0] if along == 1.0 else a[0] + along * dx
+    y = b[1] if along == 1.0 else a[1] + along * dy
+    return np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2)

@@ -33,8 +33,6 @@ EGO_COLUMNS = {
     "angular_acceleration": state.YAW_ACCEL,
 }
 TOLERANCE = 1e-9
-IDM_TOLERANCE = 1e-6  # the README allows 1e-3 m
-IDM_HEADING_TOLERANCE = 1e-7
 EVERY = 10  # iterations between recorded plans; the last one is recorded as well
 _KEYS = ("scene", "challenge", "planner", "iteration", "index", "time_us")
 
@@ -55,7 +53,7 @@ def verify_planners(
     objects = read_groups(folder / "expected" / "objects.parquet")
     for key in egos:
         if key not in plans and not key[2].startswith("scripted") and mode in (None, key[1]):
-            report.fail("plan iterations", " ".join(key), "no plans recorded")
+            report.fail("plan iterations", " ".join(key), "no plans are recorded")
     for key, rows in plans.items():
         scene, challenge, name = key
         if mode not in (None, challenge):
@@ -85,16 +83,18 @@ def _verify_run(
 ) -> None:
     recorded = sorted(set(rows["iteration"].tolist()))
     last = len(ego["iteration"]) - 1
-    report.compare(
-        "plan iterations", where, sorted({*range(0, last + 1, EVERY), last}), recorded
-    )
-    planner.reset(scene_info(scenario))
+    report.compare("plan iterations", where, sorted({*range(0, last + 1, EVERY), last}), recorded)
+    try:
+        planner.reset(scene_info(scenario))
+    except ShiftsimError as error:
+        report.fail("plan", where, str(error))
+        return
     for iteration in sorted({0, *recorded}):
         at = f"{where} iteration {iteration}"
         plan = _plan(report, at, planner, scenario, iteration, ego, objects)
         if plan is not None and iteration in recorded:
             members = np.flatnonzero(rows["iteration"] == iteration)
-            _compare_plan(report, at, plan, {n: rows[n][members] for n in rows})
+            _compare_plan(report, rows["planner"][0], at, plan, {n: rows[n][members] for n in rows})
 
 
 def _plan(
@@ -140,17 +140,13 @@ def _tracks(objects: Group, iteration: int) -> Tracks:
     )
 
 
-def _compare_plan(report: Report, at: str, plan: Trajectory, rows: Group) -> None:
-    name = at.split()[2]
+def _compare_plan(report: Report, name: str, at: str, plan: Trajectory, rows: Group) -> None:
     report.compare(f"{name} plan index", at, np.arange(len(plan.time_us)), rows["index"])
     report.compare(f"{name} plan time", at, plan.time_us, rows["time_us"])
     for column, index in PLAN_COLUMNS.items():
-        tolerance = TOLERANCE
-        if name == "idm":
-            tolerance = IDM_HEADING_TOLERANCE if column == "heading" else IDM_TOLERANCE
         if column not in rows:
             report.fail(f"{name} plan {column}", at, "no such column")
             continue
         report.compare(
-            f"{name} plan {column}", at, plan.states[:, index], rows[column], atol=tolerance
+            f"{name} plan {column}", at, plan.states[:, index], rows[column], atol=TOLERANCE
         )
