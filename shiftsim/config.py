@@ -17,8 +17,6 @@ from shiftsim.errors import ConfigError
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
-NOISE_LEVELS = ("low", "mid", "high")
-ALL_NOISE = ("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in NOISE_LEVELS))
 SAVE_ROLLOUTS = ("all", "none")
 DEFAULT_STORE = "demo"
 MAX_SEED = 2**63 - 1
@@ -31,11 +29,12 @@ class RunConfig:
     Attributes:
         planners: Names, `package.module:Class`, or names with a checkpoint.
         planner_args: Arguments of the planners, by planner as named in `planners`.
-        noise: Names of noise models.
+        noise: Names of noise models; `all` stands for the seven of the benchmark.
         seeds: Seeds of the noise; ignored for `none`.
         traffic: Traffic mode.
         controller: How a plan moves the ego.
         thresholds: Threshold profile of the metrics.
+        metrics: Own metrics as `module:attribute`, reported beside the official ones.
         store: Name or path of the scenario store.
         split: Name or file of a split; empty for all scenarios of the store.
         limit: Use only the first scenarios of the split, 0 for all.
@@ -52,6 +51,7 @@ class RunConfig:
     traffic: str = "nonreactive"
     controller: str = "lqr"
     thresholds: str = "nuplan"
+    metrics: tuple[str, ...] = ()
     store: str = DEFAULT_STORE
     split: str = ""
     limit: int = 0
@@ -63,12 +63,10 @@ class RunConfig:
     def __post_init__(self) -> None:
         for item in fields(self):
             _check_type(item.name, getattr(self, item.name))
-        if "all" in self.noise:
-            object.__setattr__(self, "noise", ALL_NOISE)
         _not_empty("planners", self.planners)
         _not_empty("noise", self.noise)
         _not_empty("seeds", self.seeds)
-        for name in ("planners", "noise", "seeds"):
+        for name in _LISTS:
             _no_repeats(name, getattr(self, name))
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
             raise ConfigError(f"seeds {list(self.seeds)!r}: a seed is an integer from 0 on")
@@ -85,7 +83,7 @@ class RunConfig:
         return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
 
 
-_LISTS = {"planners": str, "noise": str, "seeds": int}
+_LISTS = {"planners": str, "noise": str, "seeds": int, "metrics": str}
 _SCALARS = {"limit": int, "workers": int, "allow_partial": bool}
 
 

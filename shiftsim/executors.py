@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe, wait
@@ -54,7 +54,7 @@ class Outcome(Generic[T, R]):
 
 def map_unordered(
     make: MakeFunction[T, R], tasks: Iterable[T], *, workers: int, alone: int = 0
-) -> Iterator[Outcome[T, R]]:
+) -> Generator[Outcome[T, R], None, None]:
     """Apply a function to every task, in whatever order they finish.
 
     Args:
@@ -84,7 +84,7 @@ def map_unordered(
         pool.close()
 
 
-def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Iterator[Outcome[T, R]]:
+def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T, R], None, None]:
     function = make()
     try:
         for task in tasks:
@@ -163,7 +163,7 @@ class _Pool:
         self.workers: list[_Worker] = []
         self.failed_starts = 0
 
-    def run(self, tasks: Iterable[Any], alone: int) -> Iterator[Outcome[Any, Any]]:
+    def run(self, tasks: Iterable[Any], alone: int) -> Generator[Outcome[Any, Any], None, None]:
         waiting = deque(tasks)
         done = 0
         while waiting or self._in("busy"):

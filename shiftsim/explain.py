@@ -1,0 +1,120 @@
+"""Why a rollout has its score: every metric, its value, threshold and first violation."""
+
+import difflib
+from typing import Any
+
+from shiftsim.errors import ConfigError
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
+from shiftsim.results import Run
+from shiftsim.rollouts import Task
+
+
+def select_tasks(
+    run: Run,
+    token: str,
+    *,
+    planner: str | None = None,
+    noise: str | None = None,
+    seed: int | None = None,
+) -> list[dict[str, Any]]:
+    """The tasks of one scenario, each with its score row and its metric rows.
+
+    Args:
+        run: The run.
+        token: Scenario token, or an unambiguous beginning of one.
+        planner: Only this planner.
+        noise: Only this noise.
+        seed: Only this seed.
+
+    Returns:
+        Rows of `tasks.parquet`, with `cls` and `metrics` added.
+
+    Raises:
+        ConfigError: There is no such task, or several scenarios begin like that.
+    """
+    full = _find_token(run, token)
+    wanted = {"planner": planner, "noise": noise, "seed": seed, "token": full}
+    rows = [
+        row
+        for row in run.tasks.to_pylist()
+        if all(value is None or row[name] == value for name, value in wanted.items())
+    ]
+    if not rows:
+        config = run.manifest["config"]
+        raise ConfigError(
+            f"run {run.path.name!r} has no task planner={planner} noise={noise} seed={seed}",
+            hint=f"planners {config['planners']}, noise {config['noise']}, seeds {config['seeds']}",
+        )
+    scores = {_key(row): row for row in run.scores.to_pylist()}
+    metrics: dict[Task, list[dict[str, Any]]] = {}
+    for row in run.metrics.to_pylist():
+        metrics.setdefault(_key(row), []).append(row)
+    return [
+        {**row, "cls": scores.get(_key(row), {}).get("cls"), "metrics": metrics.get(_key(row), [])}
+        for row in rows
+    ]
+
+
+def _key(row: dict[str, Any]) -> Task:
+    return Task(*(row[name] for name in Task._fields))
+
+
+def _find_token(run: Run, token: str) -> str:
+    tokens = sorted(set(run.tasks["token"].to_pylist()))
+    if token in tokens:
+        return token
+    found = [known for known in tokens if known.startswith(token)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ConfigError(
+            f"{len(found)} scenarios begin with {token!r}", hint=f"such as {', '.join(found[:4])}"
+        )
+    near = difflib.get_close_matches(token, tokens, n=1) or tokens[:1]
+    raise ConfigError(
+        f"run {run.path.name!r} has no scenario {token!r}",
+        hint=f"did you mean {near[0]!r}?" if near else "the run is empty",
+    )
+
+
+def explain_lines(task: dict[str, Any]) -> list[str]:
+    """One task in words; `task` is a row of `select_tasks`."""
+    seed = "" if task["noise"] == "none" else f"  seed {task['seed']}"
+    head = f"{task['token']}  {task['scenario_type']}  {task['planner']} {task['noise']}{seed}"
+    if task["status"] != "ok":
+        lines = [f"{head}  {task['status']}", f"  {task['error']}"]
+        lines += [f"  hint: {task['hint']}"] if task["hint"] else []
+        return lines + [f"  {line}" for line in (task["traceback"] or "").splitlines()]
+    lines = [f"{head}  CLS {task['cls']:.4f}"]
+    lines.append("  the score is the product of the × rows and the weighted mean of the + rows")
+    scored = [row for row in task["metrics"] if row["metric"] in SHORT_NAMES]
+    scored.sort(key=lambda row: row["metric"] not in MULTIPLIERS)
+    others = [row for row in task["metrics"] if row["metric"] not in SHORT_NAMES]
+    return lines + [f"  {_metric_line(row)}" for row in scored + others]
+
+
+def _metric_line(row: dict[str, Any]) -> str:
+    name = row["metric"]
+    role, weight = " ", ""
+    if name in MULTIPLIERS:
+        role = "×"
+    elif name in WEIGHTS:
+        role, weight = "+", f"weight {WEIGHTS[name]:g}"
+    score = "–" if row["score"] is None else f"{row['score']:.4f}"
+    parts = [f"{role} {SHORT_NAMES.get(name, ''):3} {name:33} {score:>6}", f"{weight:8}"]
+    if row["value"] is not None:
+        parts.append(f"value {row['value']:.4g}{_unit(row)}")
+    if row["threshold"] is not None:
+        parts.append(f"threshold {row['threshold']:.4g}{_unit(row)}")
+    if row["first_violation_iteration"] is not None:
+        partner = f" with {row['partner_token']}" if row["partner_token"] else ""
+        parts.append(
+            f"first violated at {row['first_violation_s']:.1f} s: "
+            f"{row['first_violation_value']:.4g}{_unit(row)}{partner}"
+        )
+    return "  ".join(parts).rstrip()
+
+
+def _unit(row: dict[str, Any]) -> str:
+    unit = row["unit"]
+    return "" if not unit or unit in ("boolean", "ratio", "None") else f" {unit}"

@@ -1,0 +1,167 @@
+"""Score stored rollouts again: another threshold profile or own metrics, no simulation."""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from shiftsim.config import default_workers, make_config
+from shiftsim.errors import DataError
+from shiftsim.executors import map_unordered
+from shiftsim.manifest import make_manifest
+from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.results import Run, RunWriter, TaskResult, check_target, open_run
+from shiftsim.rollouts import Task
+from shiftsim.runner import RUNS, Progress, advanced, ended, run_name
+from shiftsim.tasks import attempt, score_rollout
+
+
+@dataclass
+class Rescorer:
+    """Scores one stored rollout after the other.
+
+    Attributes:
+        run: Folder of the run that holds them.
+        store: Folder of the store it was made with.
+        thresholds: Threshold profile.
+        metrics: Own metrics, by `module:attribute`.
+        traffic: Traffic mode of the run.
+    """
+
+    run: Path
+    store: Path
+    thresholds: str
+    metrics: tuple[str, ...]
+    traffic: str
+    _open: Any = field(default=None, init=False)
+
+    def __call__(self, task: Task) -> TaskResult:
+        """The result of one task."""
+        return attempt(task, partial(self._score, task))
+
+    def _score(self, task: Task, seconds: dict[str, float], result: TaskResult) -> TaskResult:
+        if self._open is None:
+            from shiftsim.data.store import open_store
+
+            self._open = open_run(self.run), open_store(self.store)
+        run, store = self._open
+        scenario = store.read(task.token)
+        log = run.rollout(task, scenario)
+        scores, metrics = score_rollout(
+            scenario,
+            log,
+            thresholds=self.thresholds,
+            traffic=self.traffic,
+            metrics=self.metrics,
+        )
+        kind = scenario.scenario_type
+        return replace(result, scenario_type=kind, scores=scores, metrics=metrics)
+
+
+def rescore(
+    run: Run,
+    *,
+    thresholds: str,
+    metrics: tuple[str, ...] = (),
+    store: str | None = None,
+    out: str | None = None,
+    workers: int = 0,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    argv: Sequence[str] = (),
+) -> Run:
+    """Write a run folder as if the run had been made with other thresholds.
+
+    Args:
+        run: A run with stored rollouts.
+        thresholds: Threshold profile.
+        metrics: Own metrics, by `module:attribute`.
+        store: The store, where it has moved.
+        out: The new folder; by default `runs/<id>`.
+        workers: Worker processes; 0 chooses from the cores.
+        on_progress: Called after every rollout.
+        argv: The command line, for the manifest.
+
+    Raises:
+        DataError: Rollouts are missing, or the store is another one.
+    """
+    for metric in metrics:
+        load_metric(metric)
+    folder = _same_store(run, store)
+    determining = run.manifest["determining"] | {
+        "thresholds": asdict(thresholds_of(thresholds)),
+        "metrics": sorted(metrics),
+        "metric_version": METRIC_VERSION,
+    }
+    values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
+    config = make_config(values, where=str(run.path / "manifest.json"))
+    target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
+    check_target(target, determining)
+    tasks = [Task(*(row[n] for n in Task._fields)) for row in _finished(run)]
+    lacking = [task for task in tasks if run.places[task] is None]
+    if lacking:
+        raise DataError(
+            f"run {run.path.name!r} holds no rollouts for {len(lacking)} of {len(tasks)} tasks",
+            hint="run again with --save-rollouts all",
+        )
+    rescorer = Rescorer(run.path.resolve(), folder, thresholds, metrics, determining["traffic"])
+    writer = RunWriter(target)
+    try:
+        writer.link_rollouts(run)
+        _keep_unfinished(run, writer)
+        progress = Progress(0, len(tasks), 0)
+        count = min(workers or default_workers(), len(tasks))
+        outcomes = map_unordered(partial(_same, rescorer), tasks, workers=count, alone=1)
+        with closing(outcomes):
+            for outcome in outcomes:
+                result = ended(outcome)
+                writer.add(result)
+                progress = advanced(progress, result)
+                on_progress(progress)
+        manifest = make_manifest(
+            target,
+            config=config,
+            split=run.manifest["split"],
+            store=folder,
+            determining=determining,
+            counts=writer.counts(run.manifest["counts"]["expected"]),
+            argv=argv,
+        )
+        return writer.finish(manifest | {"rescored_from": run.path.name})
+    finally:
+        writer.discard()
+
+
+def _same(rescorer: Rescorer) -> Rescorer:
+    return rescorer
+
+
+def _same_store(run: Run, store: str | None) -> Path:
+    from shiftsim.data.store import open_store
+
+    path = Path(store or run.manifest["store"])
+    if not path.exists():
+        raise DataError(
+            f"the store of run {run.path.name!r} is not at {str(path)!r}",
+            hint="say where it is with --store",
+        )
+    if open_store(path).hash != run.manifest["determining"]["store"]:
+        raise DataError(
+            f"store {str(path)!r} is not the one run {run.path.name!r} was made with",
+            hint="name the right one with --store, or run again",
+        )
+    return path.resolve()
+
+
+def _finished(run: Run) -> list[dict[str, Any]]:
+    return [row for row in run.tasks.to_pylist() if row["status"] == "ok"]
+
+
+def _keep_unfinished(run: Run, writer: RunWriter) -> None:
+    """Tasks that failed or are missing stay so."""
+    names = ("status", "scenario_type", "error", "hint", "traceback")
+    for row in run.tasks.to_pylist():
+        if row["status"] != "ok":
+            task = Task(*(row[n] for n in Task._fields))
+            writer.add(TaskResult(task, *(row[name] for name in names)))

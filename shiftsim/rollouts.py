@@ -1,0 +1,147 @@
+"""Rollouts on disk: one row per sample, one row group per rollout.
+
+What the scenario holds already is not stored again: recorded tracks (unless the traffic reacts),
+lights, route and expert come back from the store when a rollout is read.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from shiftsim.errors import DataError
+from shiftsim.log import SimulationLog
+from shiftsim.scenario import Scenario
+from shiftsim.state import Tracks
+
+_EGO_COLUMNS = (
+    "x_m",
+    "y_m",
+    "heading_rad",
+    "vx_mps",
+    "vy_mps",
+    "ax_mps2",
+    "ay_mps2",
+    "steering_angle_rad",
+    "steering_rate_radps",
+    "yaw_rate_radps",
+    "yaw_accel_radps2",
+)
+_COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
+_NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
+_TRACK_COLUMNS = {
+    "track_valid": pa.bool_(),
+    "track_poses": pa.float64(),
+    "track_velocities": pa.float64(),
+    "track_sizes": pa.float64(),
+}
+
+
+class Task(NamedTuple):
+    """One rollout to be made; also its key in every table, and the order of their rows.
+
+    Attributes:
+        planner: Planner name as in tables.
+        noise: Noise name.
+        seed: Seed of the noise; 0 without noise.
+        token: Scenario.
+    """
+
+    planner: str
+    noise: str
+    seed: int
+    token: str
+
+
+def describe(task: Task) -> str:
+    """A task in words."""
+    seed = "" if task.noise == "none" else f" seed {task.seed}"
+    return f"{task.planner} {task.noise}{seed} {task.token}"
+
+
+def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Table:
+    """One rollout as a table with a row per sample, K rows."""
+    count = len(log.time_us)
+    columns: dict[str, Any] = {
+        name: pa.DictionaryArray.from_arrays(pa.array(np.zeros(count, np.int32)), [value])
+        if isinstance(value, str)
+        else pa.array(np.full(count, value, np.int64))
+        for name, value in task._asdict().items()
+    }
+    columns["iteration"] = np.arange(count, dtype=np.int64)
+    columns["time_us"] = log.time_us
+    for names, values in (
+        (_EGO_COLUMNS, log.ego),
+        (_COMMAND_COLUMNS, log.commands),
+        (_NOISE_COLUMNS, log.noise),
+    ):
+        columns |= {name: values[:, i].copy() for i, name in enumerate(names)}
+    columns["planning_seconds"] = log.planning_seconds
+    columns["plan_poses"] = _lists(log.plans, pa.float64())
+    if with_tracks:
+        arrays = (log.tracks.valid, log.tracks.poses, log.tracks.velocities, log.tracks.sizes)
+        for (name, kind), array in zip(_TRACK_COLUMNS.items(), arrays, strict=True):
+            columns[name] = _lists(array, kind)
+    return pa.table({name: pa.array(column) for name, column in columns.items()})
+
+
+def _lists(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """(K, …) as K lists of equal length."""
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
+    offsets = np.arange(len(flat) + 1, dtype=np.int32) * flat.shape[1]
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat.ravel(), type=kind))
+
+
+def _from_lists(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
+    flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return np.array(flat.reshape(len(column), *shape))
+
+
+def complete_rollout(table: pa.Table, scenario: Scenario) -> SimulationLog:
+    """A stored rollout, completed by what its scenario holds already.
+
+    Raises:
+        DataError: The scenario is not the one that was driven.
+    """
+    samples = scenario.iteration_rows[:-1]
+    time_us = table["time_us"].to_numpy()
+    if not np.array_equal(time_us, scenario.time_us[samples]):
+        raise DataError(
+            f"scenario {scenario.token!r} in the store is not the one that was driven",
+            hint="use the store that the manifest names",
+        )
+    tracks = scenario.tracks.rows(samples)
+    if "track_valid" in table.column_names:
+        tracks = _stored_tracks(table, tracks)
+    return SimulationLog(
+        token=scenario.token,
+        time_us=scenario.time_us[samples],
+        ego=_stack(table, _EGO_COLUMNS),
+        tracks=tracks,
+        traffic_lights=scenario.traffic_lights.rows(samples),
+        expert_time_us=scenario.iteration_times,
+        expert_ego=scenario.expert,
+        route=scenario.route,
+        commands=_stack(table, _COMMAND_COLUMNS),
+        noise=_stack(table, _NOISE_COLUMNS),
+        plans=_from_lists(table["plan_poses"], (-1, 3)),
+        planning_seconds=np.array(table["planning_seconds"].to_numpy()),
+    )
+
+
+def _stack(table: pa.Table, names: Iterable[str]) -> np.ndarray:
+    return np.stack([table[name].to_numpy() for name in names], axis=1)
+
+
+def _stored_tracks(table: pa.Table, recorded: Tracks) -> Tracks:
+    count = recorded.num_tracks
+    return Tracks(
+        _from_lists(table["track_valid"], (count,)),
+        _from_lists(table["track_poses"], (count, 3)),
+        _from_lists(table["track_velocities"], (count, 2)),
+        _from_lists(table["track_sizes"], (count, 2)),
+        recorded.kinds,
+        recorded.tokens,
+    )
