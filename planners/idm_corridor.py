@@ -81,14 +81,20 @@ def _is_near(
     limit = circle[2] + reach
     if np.hypot(cx - x, cy - y) <= limit:
         return True
-    xy = path.xy
     for index in range(first, last - 1):
-        distance = point_segment_distance(
-            cx, cy, xy[index, 0], xy[index, 1], xy[index + 1, 0], xy[index + 1, 1]
-        )
-        if distance <= limit:
+        if _is_within(cx, cy, path.xy[index], path.xy[index + 1], limit):
             return True
     return False
+
+
+@kernel
+def _is_within(x: float, y: float, a: FloatArray, b: FloatArray, limit: float) -> bool:
+    """Whether a point is within `limit` [m] of the segment a-b; a cheap test rejects most."""
+    dx, dy = x - a[0], y - a[1]
+    far = limit + abs(b[0] - a[0]) + abs(b[1] - a[1])
+    if dx * dx + dy * dy > far * far:
+        return False
+    return point_segment_distance(x, y, a[0], a[1], b[0], b[1]) <= limit
 
 
 @kernel
@@ -104,14 +110,18 @@ def find_sides(
         occupants: The polygons.
         out: (M,) CLEAR, HIT or OPEN is written where UNKNOWN stands.
     """
+    center_x, center_y = 0.5 * (footprint[0] + footprint[2])
+    reach = np.hypot(footprint[0, 0] - center_x, footprint[0, 1] - center_y) + 1e-6
     for index in range(len(out)):
         if out[index] != UNKNOWN:
             continue
         ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
-        if rings_touch(ring, footprint):
+        circle = occupants.circles[index]
+        near = np.hypot(circle[0] - center_x, circle[1] - center_y) <= circle[2] + reach
+        if near and rings_touch(ring, footprint):
             out[index] = HIT
         else:
-            out[index] = _side_of_corridor(line, half_width, ring, occupants.circles[index])
+            out[index] = _side_of_corridor(line, half_width, ring, circle)
 
 
 @kernel
@@ -122,17 +132,17 @@ def _side_of_corridor(
     nearest = np.inf
     for index in range(len(line) - 1):
         a, b = line[index], line[index + 1]
-        if point_segment_distance(circle[0], circle[1], a[0], a[1], b[0], b[1]) < (
-            circle[2] + outer
-        ):
+        if _is_within(circle[0], circle[1], a, b, circle[2] + outer):
             nearest = min(nearest, _segment_distance(ring, a, b))
             if nearest <= inner:
                 return HIT
     # the square ends: beyond the first and the last point the corridor goes on by half a width
     before = _beyond(line[1], line[0], outer)
     after = _beyond(line[-2], line[-1], outer)
-    nearest = min(nearest, _segment_distance(ring, before, line[0]))
-    nearest = min(nearest, _segment_distance(ring, line[-1], after))
+    if _is_within(circle[0], circle[1], before, line[0], circle[2] + outer):
+        nearest = min(nearest, _segment_distance(ring, before, line[0]))
+    if _is_within(circle[0], circle[1], line[-1], after, circle[2] + outer):
+        nearest = min(nearest, _segment_distance(ring, line[-1], after))
     return OPEN if nearest <= outer else CLEAR
 
 
