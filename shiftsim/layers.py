@@ -6,7 +6,7 @@ exact point-in-polygon tests; results come in the order of the layer, as nuPlan'
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -75,12 +75,19 @@ class Polygons(NamedTuple):
     cell_items: IntArray
 
 
+def _frozen(array: Any) -> Any:
+    """The array, read-only: maps never change, and kernels see one type of array for all maps."""
+    array.flags.writeable = False
+    return array
+
+
 def make_lists(rows: Iterable[Sequence[int]]) -> Lists:
     """Ragged lists from Python lists."""
     kept = [np.asarray(row, np.int64) for row in rows]
     ptr = np.zeros(len(kept) + 1, np.int64)
     np.cumsum([len(row) for row in kept], out=ptr[1:])
-    return Lists(ptr, np.concatenate(kept) if kept else np.zeros(0, np.int64))
+    items = np.concatenate(kept) if kept else np.zeros(0, np.int64)
+    return Lists(_frozen(ptr), _frozen(items))
 
 
 def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
@@ -89,7 +96,7 @@ def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
     np.cumsum([len(line) for line in lines], out=ptr[1:])
     parts = [np.asarray(line, np.float64).reshape(-1, 2) for line in lines]
     xy = np.ascontiguousarray(np.concatenate(parts)) if parts else np.zeros((0, 2))
-    return Polylines(xy, ptr, arc_lengths(xy, ptr))
+    return Polylines(_frozen(xy), _frozen(ptr), _frozen(arc_lengths(xy, ptr)))
 
 
 def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
@@ -122,7 +129,8 @@ def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Po
     last = np.minimum(np.floor((bounds[:, 2:] - low) / cell).astype(np.int64), shape - 1)
     cell_ptr, cell_items = _fill_cells(first, last, shape)
     grid = np.array([low[0], low[1], cell])
-    return Polygons(xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)
+    arrays = (xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)
+    return Polygons(*(_frozen(array) for array in arrays))
 
 
 def _open_ring(ring: FloatArray) -> FloatArray:
