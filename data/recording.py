@@ -122,9 +122,15 @@ def scenario(
 
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
-    seen = np.flatnonzero(tracks.valid.any(axis=0))
-    kept = tracks.select(seen[[tracks.tokens[i] != without for i in seen.tolist()]])
-    return kept.select(order_tracks(*np.nonzero(kept.valid), kept.kinds))
+    seen = tracks.valid.any(axis=0)
+    if without in tracks.tokens:
+        seen[tracks.tokens.index(without)] = False
+    kept = np.flatnonzero(seen)
+    place = np.cumsum(seen) - 1
+    frame, track = np.nonzero(tracks.valid & seen)
+    order = kept[order_tracks(frame, place[track], tracks.kinds[kept])]
+    unchanged = len(order) == tracks.num_tracks and (order == np.arange(len(order))).all()
+    return tracks if unchanged else tracks.select(order)
 
 
 def listed_lights(lights: TrafficLights) -> TrafficLights:

@@ -1,0 +1,83 @@
+"""What the files of a store hold: every column with its type and unit.
+
+    store.json                        format, version, content hash, digest of every file
+    scenarios.parquet                 one row per scenario
+    maps/<city>.parquet               one row: the arrays of the map, flat
+    recordings/<log>/frames.parquet   one row per row of the recording: time, traffic lights
+    recordings/<log>/tracks.parquet   one row per box, in blocks of `BLOCK_ROWS` rows of time
+    recordings/<log>/ego-<name>.parquet  one row per row of the recording: states of one ego
+
+A recording is stored once; a scenario is a window into it. Names of logs and egos are percent
+encoded in file names. Lists that belong to a whole file (tokens and kinds of the tracks, ids of
+the connectors) are JSON in its footer.
+"""
+
+import pyarrow as pa
+
+FORMAT = "shiftsim-store"
+VERSION = 1
+BLOCK_ROWS = 128  # rows of a recording per row group of tracks; a window reads few it does not need
+FRAME_BLOCK = 2048  # rows per row group of frames and ego states
+
+_F64, _I64, _I32 = pa.float64(), pa.int64(), pa.int32()
+
+
+def _schema(**columns: pa.DataType) -> pa.Schema:
+    return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
+
+
+SCENARIOS = _schema(
+    token=pa.string(),  # id, unique in the store
+    type=pa.string(),  # scenario type
+    city=pa.string(),  # map name
+    log=pa.string(),  # log name
+    recording=pa.string(),  # recording it is a window of
+    ego=pa.string(),  # `ego`, or the token of the track that serves as ego
+    first_row=_I64,  # first kept row of the recording
+    last_row=_I64,  # one past the last kept row
+    row_step=_I64,  # rows between iterations
+    iteration_rows=pa.list_(pa.field("item", _I64, nullable=False)),  # rows of the recording
+    route=pa.list_(pa.field("item", pa.string(), nullable=False)),  # roadblock ids, start to goal
+    goal_pose=pa.list_(pa.field("item", _F64, nullable=False)),  # x_m, y_m, heading_rad; or empty
+    duration_s=_F64,  # what it was cut with
+    offset_s=_F64,
+    subsample_ratio=_F64,
+    is_short=pa.bool_(),  # the log ended before the duration did
+    metadata=pa.string(),  # JSON
+)
+
+FRAMES = _schema(
+    time_us=_I64,  # strictly increasing
+    light_status=pa.list_(pa.field("item", pa.int8(), nullable=False)),
+    # … one LightStatus code per connector of the footer, -1 not listed
+)
+
+TRACKS = _schema(
+    row=_I32,  # row of the recording
+    track=_I32,  # index into the footer's tokens and kinds
+    x_m=_F64,  # box centre
+    y_m=_F64,
+    heading_rad=_F64,
+    vx_mps=_F64,  # velocity in the map frame; NaN for static objects
+    vy_mps=_F64,
+    length_m=_F64,
+    width_m=_F64,
+)
+
+EGO_COLUMNS = (
+    "x_m",
+    "y_m",
+    "heading_rad",
+    "vx_mps",
+    "vy_mps",
+    "ax_mps2",
+    "ay_mps2",
+    "steering_angle_rad",
+    "steering_rate_radps",
+    "yaw_rate_radps",
+    "yaw_accel_radps2",
+)
+EGO = _schema(**dict.fromkeys(EGO_COLUMNS, _F64))
+
+# Columns stored as their bytes in planes, which compress much better than floats as they are.
+PLANES = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "ax_mps2", "ay_mps2")
