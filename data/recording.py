@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.track_order import order_tracks
+from shiftsim.data.track_order import order_of_columns
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
 from shiftsim.state import Tracks, TrafficLights
@@ -125,11 +125,10 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     seen = tracks.valid.any(axis=0)
     if without in tracks.tokens:
         seen[tracks.tokens.index(without)] = False
-    kept = np.flatnonzero(seen)
-    place = np.cumsum(seen) - 1
-    frame, track = np.nonzero(tracks.valid & seen)
-    order = kept[order_tracks(frame, place[track], tracks.kinds[kept])]
-    unchanged = len(order) == tracks.num_tracks and (order == np.arange(len(order))).all()
+    if not seen.all():
+        tracks = tracks.select(seen)
+    order = order_of_columns(np.ascontiguousarray(tracks.valid), tracks.kinds)
+    unchanged = (order == np.arange(len(order))).all()
     return tracks if unchanged else tracks.select(order)
 
 

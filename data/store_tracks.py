@@ -135,7 +135,7 @@ class StoredRecording:
         seen = np.flatnonzero(place >= 0)
         shape = (last - first, len(seen))
         valid = np.zeros(shape, np.bool_)
-        poses, velocities, sizes = (np.empty((*shape, n)) for n in (3, 2, 2))
+        poses, velocities, sizes = _dense(shape)
         _scatter(row, track, place, first, tuple(values), valid, poses, velocities, sizes)
         names = tuple(self.tokens[i] for i in seen.tolist())
         return Tracks(valid, poses, velocities, sizes, self.kinds[seen], names)
@@ -198,6 +198,21 @@ def _rows(table: Table, first: int, last: int) -> pa.Table:
         raise DataError(f"{table.path}: row groups are missing", hint=MEND)
     rows = table.read(list(range(low, high + 1)))
     return rows.slice(first - low * schema.FRAME_BLOCK, last - first)
+
+
+def _dense(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), not filled.
+
+    They share one block: the allocator then keeps it for the next scenario instead of returning it
+    to the system, which costs more than reading the file.
+    """
+    num = shape[0] * shape[1]
+    block = np.empty(7 * num)
+    return (
+        block[: 3 * num].reshape(*shape, 3),
+        block[3 * num : 5 * num].reshape(*shape, 2),
+        block[5 * num :].reshape(*shape, 2),
+    )
 
 
 def _views(table: pa.Table, names: Sequence[str]) -> list[Any]:

@@ -28,6 +28,14 @@ def order_tracks(frame: IntArray, track: IntArray, kinds: IntArray) -> IntArray:
     return _sorted(before, kinds, _first_frames(frame, track, num))
 
 
+def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
+    """The same for dense tracks (R, N), each frame listing its tracks by column."""
+    before = np.zeros((len(kinds), len(kinds)), np.bool_)
+    first = np.full(len(kinds), len(valid), np.int64)
+    _link_columns(valid, kinds, before, first)
+    return _sorted(before, kinds, first)
+
+
 @kernel
 def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) -> None:
     """Mark neighbours of one kind in a frame: `before[a, b]` when b directly follows a."""
@@ -39,6 +47,21 @@ def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) 
         if last[kind] >= 0 and last[kind] != track[box]:
             before[last[kind], track[box]] = True
         last[kind] = track[box]
+
+
+@kernel
+def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: IntArray) -> None:
+    last = np.full(16, -1)
+    for frame in range(valid.shape[0]):
+        last[:] = -1
+        for track in range(valid.shape[1]):
+            if not valid[frame, track]:
+                continue
+            kind = kinds[track]
+            if last[kind] >= 0:
+                before[last[kind], track] = True
+            last[kind] = track
+            first[track] = min(first[track], frame)
 
 
 @kernel
