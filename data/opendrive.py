@@ -6,10 +6,7 @@ that names file, road and element.
 """
 
 import io
-import re
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +14,7 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
-from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive_reader import CUBIC, Reader
 from shiftsim.data.opendrive_records import (
     ARC,
     LINE,
@@ -40,78 +37,9 @@ from shiftsim.errors import ConversionError
 
 MAX_BYTES = 200_000_000
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}  # opendrive.md §5
-TINY_LENGTH = 1e-6  # m, shorter geometry records are skipped
-_LEADING_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)")
-_CUBIC = ("a", "b", "c", "d")
+TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
 _TOP_LEVEL = ("OpenDRIVE", "header", "road", "junction")
-
-
-@dataclass
-class Reader:
-    """Reads attributes of one file and keeps count of what was wrong.
-
-    Attributes:
-        source: Name of the file.
-        place: Road or junction at hand, for messages.
-        warnings: Count by kind.
-        counts: Records by kind.
-    """
-
-    source: str
-    place: str = "header"
-    warnings: Counter[str] = field(default_factory=Counter)
-    counts: Counter[str] = field(default_factory=Counter)
-
-    def error(self, what: str, mend: str) -> ConversionError:
-        """An error that names file and place."""
-        return ConversionError(f"{self.source}, {self.place}: {what}", mend)
-
-    def warn(self, kind: str) -> None:
-        """Count one thing that was mended or left out."""
-        self.warnings[kind] += 1
-
-    def number(self, element: Any, name: str, default: float = 0.0) -> float:
-        """An attribute as a number; may be NaN or infinite where the file says so."""
-        text = element.get(name)
-        if text is None:
-            return default
-        try:
-            return float(text)
-        except ValueError:
-            return self._rescue(element, name, text)
-
-    def _rescue(self, element: Any, name: str, text: str) -> float:
-        found = _LEADING_NUMBER.match(text.replace(",", ".", 1))
-        if found is None:
-            raise self.error(
-                f"{element.tag} (line {element.sourceline}) has {name}={text[:40]!r}",
-                "write a number with a decimal point there",
-            )
-        self.warn("badly written number")
-        return float(found[1])
-
-    def integer(self, element: Any, name: str) -> int | None:
-        """An attribute as an integer; None where it is missing or not one."""
-        try:
-            return int(element.get(name))
-        except (TypeError, ValueError):
-            return None
-
-    def cubics(self, elements: list[Any], key: str) -> FloatArray:
-        """(n, 5) rows s, a, b, c, d by s; records with NaN or infinity are left out."""
-        rows = np.array(
-            [[self.number(e, key), *(self.number(e, k) for k in _CUBIC)] for e in elements],
-            np.float64,
-        ).reshape(-1, 5)
-        finite = np.isfinite(rows).all(axis=1)
-        if not finite.all():
-            self.warnings["polynomial record that is not finite, left out"] += int((~finite).sum())
-            rows = rows[finite]
-        if len(rows) > 1 and (np.diff(rows[:, 0]) < 0).any():
-            self.warn("records out of order")
-            rows = rows[np.argsort(rows[:, 0], kind="stable")]
-        return rows
 
 
 def read_opendrive(path: Path) -> OpenDrive:
@@ -309,27 +237,28 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None
     records: list[Geometry] = []
     tiny: list[Geometry] = []
     for child in () if element is None else element.findall("geometry"):
-        shape = next((e for e in child if e.tag in (LINE, ARC, SPIRAL, POLY3, PARAM_POLY3)), None)
+        shape: Any = next(
+            (e for e in child if e.tag in (LINE, ARC, SPIRAL, POLY3, PARAM_POLY3)), None
+        )
         kind = LINE if shape is None else shape.tag
         reader.counts[f"geometry {kind}"] += 1
         length = reader.number(child, "length")
-        pose = [
-            reader.number(child, k, 0.0 if k == "s" else np.nan) for k in ("s", "x", "y", "hdg")
-        ]
+        s = reader.number(child, "s")
+        x, y, heading = (reader.number(child, k, np.nan) for k in ("x", "y", "hdg"))
         if shape is None:
             reader.warn("geometry without a shape taken as a line")
-        if kind == PARAM_POLY3 and not any(k in shape.attrib for k in _PARAM_CUBIC):
+        if kind == PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
             reader.warn("road left out: paramPoly3 without coefficients")
             return None
         coefficients, p_end = _read_shape(shape, length, reader)
-        if not np.isfinite([*pose, length, *coefficients]).all():
+        if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
             reader.warn("road left out: geometry is not finite")
             return None
         if length < TINY_LENGTH:
             reader.warn("geometry without length, skipped")
-            tiny.append(Geometry(*pose, max(length, 0.0), LINE))
+            tiny.append(Geometry(s, x, y, heading, max(length, 0.0), LINE))
         else:
-            records.append(Geometry(*pose, length, kind, coefficients, p_end))
+            records.append(Geometry(s, x, y, heading, length, kind, coefficients, p_end))
     records = records or tiny[:1]  # a road without length still links its neighbours
     if not records:
         reader.warn("road left out: no geometry")
@@ -342,7 +271,7 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None
 def _read_shape(shape: Any, length: float, reader: Reader) -> tuple[tuple[float, ...], float]:
     if shape is None or shape.tag == LINE:
         return (), 0.0
-    names = {ARC: ("curvature",), SPIRAL: ("curvStart", "curvEnd"), POLY3: _CUBIC}
+    names = {ARC: ("curvature",), SPIRAL: ("curvStart", "curvEnd"), POLY3: CUBIC}
     values = tuple(reader.number(shape, k) for k in names.get(shape.tag, _PARAM_CUBIC))
     return values, length if shape.get("pRange") == "arcLength" else 1.0
 
@@ -419,7 +348,7 @@ def _read_lane(element: Any, number: int, reader: Reader) -> Lane:
     reader.counts["width"] += len(widths)
     reader.counts["border"] += len(borders)
     kind = element.get("type", "")
-    reader.counts[f"lane {kind or 'none'}"] += 1
+    reader.counts[f"lane type {kind or 'none'}"] += 1
     if not widths and not borders:
         reader.warn("lane without width and border")
     lane = Lane(
@@ -450,7 +379,7 @@ def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
 
 def _read_junction(element: Any, name: str, reader: Reader) -> Junction:
     kind = element.get("type", "default")
-    reader.counts[f"junction {kind}"] += 1
+    reader.counts[f"junction type {kind}"] += 1
     connections = []
     for child in element.findall("connection"):
         links = []

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.opendrive_geometry import ReferenceLine
 from shiftsim.data.opendrive_graph import DRIVABLE, ConnectorRun
 from shiftsim.data.opendrive_records import OpenDrive, Outline, Repeat, RoadObject, Signal
 from shiftsim.data.opendrive_shapes import Shapes, lane_polygon, largest_part
@@ -164,16 +165,21 @@ def is_stop_line(thing: RoadObject) -> bool:
     return any("stopline" in text.lower() for text in (thing.type, thing.name, thing.subtype))
 
 
-def object_rings(od: OpenDrive, road: str, thing: RoadObject, shapes: Shapes) -> list[FloatArray]:
+def object_rings(line: ReferenceLine, thing: RoadObject) -> list[FloatArray]:
     """Outlines (V, 2) of an object and its copies, as the file draws them [m]."""
     places = [(thing.s, thing.t)]
     for repeat in thing.repeats:
         places = _repeated(repeat)
-    rings = []
-    for s, t in places:
-        for outline in thing.outlines or (_box(thing),):
-            rings.append(_place_ring(od, road, thing, outline, s, t, shapes))
-    return [ring for ring in rings if len(ring)]
+    return [
+        _place_ring(line, thing, outline, s, t)
+        for s, t in places
+        for outline in thing.outlines or (_box(thing),)
+    ]
+
+
+def object_origin(line: ReferenceLine, thing: RoadObject) -> FloatArray:
+    """(2,) where an object stands [m]."""
+    return line.evaluate(np.array([thing.s])).offset(np.array([thing.t]))[0]
 
 
 def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
@@ -191,15 +197,8 @@ def _box(thing: RoadObject) -> Outline:
 
 
 def _place_ring(
-    od: OpenDrive,
-    road: str,
-    thing: RoadObject,
-    outline: Outline,
-    s: float,
-    t: float,
-    shapes: Shapes,
+    line: ReferenceLine, thing: RoadObject, outline: Outline, s: float, t: float
 ) -> FloatArray:
-    line = shapes.line(road)
     if outline.on_road:
         return line.evaluate(outline.corners[:, 0] + (s - thing.s)).offset(outline.corners[:, 1])
     pose = line.evaluate(np.array([s]))
@@ -216,7 +215,7 @@ def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
         for road in od.roads.values()
         for thing in road.objects
         if is_crosswalk(thing)
-        for ring in object_rings(od, road.id, thing, shapes)
+        for ring in object_rings(shapes.line(road.id), thing)
         if len(ring) > 2
     ]
     for road in od.roads.values():
@@ -251,6 +250,6 @@ def parking_spaces(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
         for road in od.roads.values()
         for thing in road.objects
         if thing.type == "parkingSpace"
-        for ring in object_rings(od, road.id, thing, shapes)
+        for ring in object_rings(shapes.line(road.id), thing)
         if len(ring) > 2
     ]

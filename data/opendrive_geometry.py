@@ -40,9 +40,16 @@ class Poses:
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """The reference line of one road, by its records in the order of s."""
+    """The reference line of one road.
+
+    Attributes:
+        geometries: Its records, by s.
+        stretched: Whether a paramPoly3 that is much longer or shorter than it states is run through
+            evenly from end to end; else it is cut off where the stated length is used up.
+    """
 
     geometries: tuple[Geometry, ...]
+    stretched: bool = True
 
     @property
     def starts(self) -> FloatArray:
@@ -60,16 +67,18 @@ class ReferenceLine:
         for number in np.unique(index):
             record = self.geometries[number]
             here = index == number
-            u, v, turn = evaluate_local(record, np.clip(s[here] - record.s, 0.0, record.length))
+            d = np.clip(s[here] - record.s, 0.0, record.length)
+            u, v, turn = evaluate_local(record, d, stretched=self.stretched)
             cos, sin = np.cos(record.heading), np.sin(record.heading)
             out[0, here] = record.x + cos * u - sin * v
             out[1, here] = record.y + sin * u + cos * v
             out[2, here] = record.heading + turn
         return Poses(*out)
 
-    def curvature_bounds(self) -> FloatArray:
-        """(n,) largest absolute curvature of each record [1/m]."""
-        return np.array([_curvature_bound(g) for g in self.geometries])
+    def kinds(self, s: FloatArray) -> list[str]:
+        """Kind of the record at distances `s` (K,) [m]; at a joint the later one."""
+        index = np.maximum(np.searchsorted(self.starts, s, side="right") - 1, 0)
+        return [self.geometries[i].kind for i in index]
 
     def joints(self) -> tuple[FloatArray, FloatArray]:
         """Gap [m] and turn [rad] from the end of each record to the start of the next, (n - 1,)."""
@@ -81,15 +90,17 @@ class ReferenceLine:
         return np.array(gaps), np.array(turns)
 
 
-def evaluate_local(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def evaluate_local(
+    record: Geometry, d: FloatArray, *, stretched: bool = True
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Local u, v [m] and turn [rad] of a record at distances `d` (K,) from its start [m]."""
     if record.kind == ARC:
         return _arc(record.coefficients[0], d)
     if record.kind == SPIRAL:
-        return _clothoid(*record.coefficients, record.length, d)
+        return _clothoid(record, d)
     if len(record.coefficients) == 0:
         return d, np.zeros_like(d), np.zeros_like(d)
-    return _by_arc_length(record, d)
+    return _by_arc_length(record, d, stretched=stretched)
 
 
 def length_error(record: Geometry) -> float:
@@ -105,6 +116,18 @@ def length_error(record: Geometry) -> float:
     return error / record.length if error > allowed else 0.0
 
 
+def arc_length_deviation(record: Geometry) -> float:
+    """How far a paramPoly3 read by arc length lies from one read by its parameter [m].
+
+    The largest distance at the quarters of its length.
+    """
+    d = record.length * np.array([0.25, 0.5, 0.75])
+    u, v, p_end = _cubic_parts(record)
+    p = d * (p_end / record.length)
+    by_arc = evaluate_local(record, d, stretched=False)
+    return float(np.hypot(by_arc[0] - _polynomial(u, p), by_arc[1] - _polynomial(v, p)).max())
+
+
 def _arc(curvature: float, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     if abs(curvature) < _STRAIGHT:
         return d, 0.5 * curvature * d**2, curvature * d
@@ -113,9 +136,9 @@ def _arc(curvature: float, d: FloatArray) -> tuple[FloatArray, FloatArray, Float
     return np.sin(turn) / curvature, 2.0 * half * half / curvature, turn
 
 
-def _clothoid(
-    start: float, end: float, length: float, d: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _clothoid(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    start, end = record.coefficients
+    length = record.length
     rate = (end - start) / length
 
     def turn(tau: FloatArray) -> FloatArray:
@@ -165,11 +188,13 @@ def _arc_table(record: Geometry) -> tuple[FloatArray, FloatArray]:
     return knots, arc
 
 
-def _by_arc_length(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _by_arc_length(
+    record: Geometry, d: FloatArray, *, stretched: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     u, v, _ = _cubic_parts(record)
     du, dv = _derivative(u), _derivative(v)
     knots, arc = _arc_table(record)
-    if length_error(record):
+    if stretched and length_error(record):
         d = d * (arc[-1] / record.length)
     target = np.minimum(d, arc[-1])
     panel = np.clip(np.searchsorted(arc, target, side="right") - 1, 0, _CUBIC_PANELS - 1)
@@ -187,17 +212,3 @@ def _by_arc_length(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatAr
     slope_u, slope_v = _polynomial(du, p), _polynomial(dv, p)
     turn = np.arctan2(slope_v, slope_u)
     return _polynomial(u, p), _polynomial(v, p), turn
-
-
-def _curvature_bound(record: Geometry) -> float:
-    if not record.coefficients:
-        return 0.0
-    if record.kind in (ARC, SPIRAL):
-        return float(np.abs(record.coefficients).max())
-    u, v, p_end = _cubic_parts(record)
-    p = np.linspace(0.0, p_end, 65)
-    du, dv = _polynomial(_derivative(u), p), _polynomial(_derivative(v), p)
-    ddu = 2.0 * u[2] + 6.0 * u[3] * p
-    ddv = 2.0 * v[2] + 6.0 * v[3] * p
-    speed = np.maximum(np.hypot(du, dv), 1e-9)
-    return float(np.abs((du * ddv - dv * ddu) / speed**3).max())

@@ -279,34 +279,34 @@ class _Builder:
         by_first = {lane.pieces[0].key: i for i, lane in enumerate(lanes)}
         links: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for number, lane in enumerate(lanes):
-            for target in sorted(self.after[lane.pieces[-1].key]):
-                if target in by_first:
-                    links[lane.block].append((number, by_first[target]))
+            for onward in sorted(self.after[lane.pieces[-1].key]):
+                if onward in by_first:
+                    links[lane.block].append((number, by_first[onward]))
         lengths = [sum(piece.length for piece in lane.pieces) for lane in lanes]
         for block in sorted(links):
             shortest = min(lengths[i] for pair in links[block] for i in pair)
             cut = min(SEAM_LENGTH, SEAM_SHARE * shortest)
             tails = {}
-            for source in sorted({source for source, _ in links[block]}):
-                lanes[source].pieces, tails[source] = split_pieces(
-                    lanes[source].pieces, lengths[source] - cut
+            for number in sorted({number for number, _ in links[block]}):
+                lanes[number].pieces, tails[number] = split_pieces(
+                    lanes[number].pieces, lengths[number] - cut
                 )
-            for source, target in links[block]:
-                self.graph.connectors.append(ConnectorRun(list(tails[source]), source, target))
+            for number, target in links[block]:
+                self.graph.connectors.append(ConnectorRun(list(tails[number]), number, target))
 
     def _build_connectors(self) -> None:
         by_first = {lane.pieces[0].key: i for i, lane in enumerate(self.graph.lanes)}
         used: set[LaneKey] = set()
-        last_keys = {}
-        for number, lane in enumerate(self.graph.lanes):
-            last_keys[number] = lane.pieces[-1].key
-        for number, key in last_keys.items():
-            stack = [(target,) for target in sorted(self.after[key], reverse=True)]
+        last_keys = [lane.pieces[-1].key for lane in self.graph.lanes]
+        for source, last in enumerate(last_keys):
+            stack: list[tuple[LaneKey, ...]] = [
+                (target,) for target in sorted(self.after[last], reverse=True)
+            ]
             while stack and len(self.graph.connectors) < _MAX_CONNECTORS:
                 path = stack.pop()
                 if not self._in_junction(path[-1]):
                     if len(path) > 1:
-                        self._add_connector(number, by_first[path[-1]], path[:-1])
+                        self._add_connector(source, by_first[path[-1]], path[:-1])
                         used.update(path)
                     continue
                 if len(path) < _MAX_CHAIN:

@@ -65,12 +65,13 @@ def section_borders(
         road: The road.
         section: Number of the section.
         s: Distances from the start of the road [m].
-        mend: Whether negative widths count as 0, and borders of right lanes that were written as
-            positive numbers are put on the right.
+        mend: Whether negative widths count as 0, borders of right lanes that were written as
+            positive numbers are put on the right, and records that begin at the very end of the
+            section are left to the next one.
     """
     s = np.asarray(s, np.float64)
     begin, end = road.sections[section].s, road.section_end(section)
-    look_up = np.minimum(s, max(end - _BEFORE_END, begin))
+    look_up = np.minimum(s, max(end - _BEFORE_END, begin)) if mend else s
     lanes = road.sections[section].lanes
     center = evaluate_cubics(road.offsets, s, look_up)
     borders = SectionBorders({}, {})

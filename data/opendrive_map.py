@@ -108,9 +108,8 @@ class _Maker:
         self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
     ) -> None:
         self.od, self.graph, self.warnings, self.country = od, graph, warnings, country
-        runs = [*graph.lanes, *graph.connectors]
-        dropped = graph.dropped
-        self.shapes = Shapes(od, [*(p for run in runs for p in run.pieces), *dropped])
+        chains = [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+        self.shapes = Shapes(od, [*(p for chain in chains for p in chain), *graph.dropped])
         self._next_id = 0
 
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:

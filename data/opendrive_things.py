@@ -1,28 +1,14 @@
 """Objects and signals of an OpenDRIVE road, from their XML elements."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from shiftsim.data.opendrive_reader import Reader
 from shiftsim.data.opendrive_records import Outline, Repeat, RoadObject, Signal
 
 
-class Numbers(Protocol):
-    """What the reader of a file offers here."""
-
-    counts: Any
-
-    def number(self, element: Any, name: str, default: float = 0.0) -> float:
-        """An attribute as a number."""
-
-    def integer(self, element: Any, name: str) -> int | None:
-        """An attribute as an integer."""
-
-    def warn(self, kind: str) -> None:
-        """Count one thing that was mended or left out."""
-
-
-def read_object(element: Any, reader: Numbers) -> RoadObject:
+def read_object(element: Any, reader: Reader) -> RoadObject:
     """One object; outlines with numbers that are not finite are left out."""
     reader.counts[f"object {element.get('type', '')}"] += 1
     outlines = []
@@ -46,7 +32,7 @@ def read_object(element: Any, reader: Numbers) -> RoadObject:
     )
 
 
-def _read_outline(element: Any, reader: Numbers) -> Outline | None:
+def _read_outline(element: Any, reader: Reader) -> Outline | None:
     on_road = element.find("cornerRoad") is not None
     tag, keys = ("cornerRoad", ("s", "t")) if on_road else ("cornerLocal", ("u", "v"))
     corners = np.array(
@@ -60,7 +46,7 @@ def _read_outline(element: Any, reader: Numbers) -> Outline | None:
     return Outline(on_road, corners)
 
 
-def _read_repeat(element: Any, reader: Numbers) -> Repeat:
+def _read_repeat(element: Any, reader: Reader) -> Repeat:
     t_start = reader.number(element, "tStart")
     return Repeat(
         reader.number(element, "s"),
@@ -71,7 +57,7 @@ def _read_repeat(element: Any, reader: Numbers) -> Repeat:
     )
 
 
-def _read_validity(element: Any, reader: Numbers) -> tuple[tuple[int, int], ...]:
+def _read_validity(element: Any, reader: Reader) -> tuple[tuple[int, int], ...]:
     ranges = []
     for child in element.findall("validity"):
         first, last = reader.integer(child, "fromLane"), reader.integer(child, "toLane")
@@ -80,14 +66,14 @@ def _read_validity(element: Any, reader: Numbers) -> tuple[tuple[int, int], ...]
     return tuple(ranges)
 
 
-def _optional(element: Any, name: str, reader: Numbers) -> float | None:
+def _optional(element: Any, name: str, reader: Reader) -> float | None:
     if element.get(name) is None:
         return None
     value = reader.number(element, name)
     return value if np.isfinite(value) else None
 
 
-def read_signal(element: Any, reader: Numbers) -> Signal:
+def read_signal(element: Any, reader: Reader) -> Signal:
     """One signal, or a reference to one."""
     kind, subtype = element.get("type", ""), element.get("subtype", "")
     subtype = "" if subtype in ("-1", "none") else subtype
