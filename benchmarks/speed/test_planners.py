@@ -1,0 +1,49 @@
+"""Rule-based planners and the check of a plan: figures per call, from Python, warm.
+
+Run with `pytest benchmarks/speed/test_planners.py -s`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shiftsim.plan_check import validate_plan
+from shiftsim.planners import load_planner
+from shiftsim.planners.contract import frozen_inputs
+from shiftsim.state import TrafficLights
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """A generated city with 100 agents around the ego."""
+    from shiftsim.data.synthetic import bench_scene
+
+    return bench_scene(100, 0)
+
+
+@pytest.mark.parametrize("name", ["constant-velocity", "simple", "log-future", "idm"])
+def test_plan(measure, scenario, name):
+    scene, observations = frozen_inputs(scenario)
+    planner = load_planner(name)
+    planner.reset(scene)
+    planner.plan(observations[0])
+    measure(planner.plan, observations[0], calls=10)
+
+
+def test_idm_at_red_lights(measure, scenario):
+    scene, observations = frozen_inputs(scenario)
+    ids = scene.map.edges.ids
+    lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8))
+    planner = load_planner("idm")
+    planner.reset(scene)
+    measure(planner.plan, replace(observations[0], lights=lights), calls=2)
+
+
+def test_validate_plan(measure, scenario):
+    scene, observations = frozen_inputs(scenario)
+    planner = load_planner("constant-velocity")
+    planner.reset(scene)
+    plan = planner.plan(observations[0])
+    now, after = observations[0].time_us, observations[1].time_us
+    measure(validate_plan, plan, now, after)

@@ -1,0 +1,170 @@
+"""Each broken planner breaks one rule; the check must name that rule, and only that one."""
+
+import re
+
+import numpy as np
+import pytest
+from worlds import cruise_scenario
+
+from shiftsim.planners.contract import check_planner
+from shiftsim.state import Command, Trajectory
+
+TIMES = np.arange(41) * 0.1
+
+
+class Straight:
+    def reset(self, scene):
+        self.calls = 0
+
+    def plan(self, observation):
+        x, y, heading = observation.ego.pose
+        return self.poses(x, y, heading, observation.ego.speed)
+
+    def poses(self, x, y, heading, speed):
+        along = TIMES * speed
+        poses = np.c_[x + along * np.cos(heading), y + along * np.sin(heading), 0 * TIMES + heading]
+        return Trajectory.from_poses(TIMES, poses)
+
+
+class NeedsArgument(Straight):
+    def __init__(self, gain):
+        self.gain = gain
+
+
+class NoReset:
+    def plan(self, observation):
+        return Command(0.0, 0.0)
+
+
+class FailsInReset(Straight):
+    def reset(self, scene):
+        raise RuntimeError("no weights")
+
+
+class FailsInPlan(Straight):
+    def plan(self, observation):
+        raise KeyError("lane")
+
+
+class ReturnsPoses(Straight):
+    def plan(self, observation):
+        return np.zeros((3, 3))
+
+
+class WrongShape(Straight):
+    def plan(self, observation):
+        return Trajectory(np.arange(81) * 100_000, np.zeros((81, 3)), relative=True)
+
+
+class RepeatsATime(Straight):
+    def plan(self, observation):
+        return Trajectory.from_poses([0.0, 0.1, 0.1], np.zeros((3, 3)))
+
+
+class NotFinite(Straight):
+    def poses(self, x, y, heading, speed):
+        return Trajectory.from_poses(TIMES, np.full((41, 3), np.nan))
+
+
+class StopsShort(Straight):
+    def plan(self, observation):
+        plan = super().plan(observation)
+        times = observation.time_us - 4_000_000 + plan.time_us
+        return Trajectory(times, plan.states)
+
+
+class TwoPoses(Straight):
+    def plan(self, observation):
+        plan = super().plan(observation)
+        return Trajectory(plan.time_us[:2], plan.states[:2], relative=True)
+
+
+class EgoFrame(Straight):
+    def plan(self, observation):
+        return self.poses(0.0, 0.0, 0.0, observation.ego.speed)
+
+
+class Beside(Straight):
+    def poses(self, x, y, heading, speed):
+        return super().poses(x, y + 3.0, heading, speed)
+
+
+class Backwards(Straight):
+    def poses(self, x, y, heading, speed):
+        return super().poses(x, y, heading + np.pi, speed)
+
+
+class Random(Straight):
+    def poses(self, x, y, heading, speed):
+        return super().poses(x + np.random.default_rng().normal() * 0.01, y, heading, speed)
+
+
+class KeepsState(Straight):
+    calls = 0
+
+    def reset(self, scene): ...
+
+    def poses(self, x, y, heading, speed):
+        self.calls += 1
+        return super().poses(x, y + 0.001 * self.calls, heading, speed)
+
+
+class WritesEgo(Straight):
+    def plan(self, observation):
+        observation.history.ego[-1, 0] += 1.0
+        return super().plan(observation)
+
+
+class ForcesWrites(Straight):
+    def plan(self, observation):
+        observation.history.ego.flags.writeable = True
+        observation.history.ego[0, 10] += 1.0
+        return super().plan(observation)
+
+
+class HoldsALambda(Straight):
+    def __init__(self):
+        self.gain = lambda speed: speed
+
+
+class BadCommand(Straight):
+    def plan(self, observation):
+        return Command(float("inf"), 0.0)
+
+
+BROKEN = [
+    (NeedsArgument, "error", "constructor", "missing 1 required"),
+    (NoReset, "error", "methods", "no method reset"),
+    (FailsInReset, "error", "runs", r"reset\(\) failed: RuntimeError: no weights"),
+    (FailsInPlan, "error", "runs", "at iteration 0 failed: KeyError: 'lane'"),
+    (ReturnsPoses, "error", "type", "returned ndarray"),
+    (WrongShape, "error", "shapes", r"float64 \(81, 3\)"),
+    (RepeatsATime, "error", "times", "not after time 1"),
+    (NotFinite, "error", "finite", "x of state 0 is nan"),
+    (StopsShort, "error", "covers the next step", "ends at time"),
+    (TwoPoses, "error", "three poses", "2 states over 0.1 s"),
+    (EgoFrame, "error", "starts at the ego", "50.0 m away"),
+    (Beside, "warning", "starts at the ego", "3.0 m away"),
+    (Backwards, "warning", "heading", "differs from the ego's by 3.14 rad"),
+    (Random, "error", "deterministic", "differ at iteration 0"),
+    (KeepsState, "error", "survives reset", "differs at iteration 0"),
+    (WritesEgo, "error", "inputs untouched", "read-only"),
+    (ForcesWrites, "error", "inputs untouched", "not what they were"),
+    (HoldsALambda, "error", "pickles", "cannot be sent to a worker"),
+    (BadCommand, "error", "finite", "acceleration inf"),
+]
+
+
+@pytest.mark.parametrize(("planner", "severity", "check", "message"), BROKEN)
+def test_a_broken_rule_is_named_with_a_remedy(planner, severity, check, message):
+    findings = check_planner(planner, cruise_scenario(start=(50.0, 0.0, 0.0)))
+    bad = {f.check: f for f in findings if f.severity != "note"}
+    assert list(bad) == [check]
+    assert bad[check].severity == severity
+    assert bad[check].hint
+    assert re.search(message, bad[check].message), bad
+
+
+def test_a_good_planner_gets_its_run_time_only():
+    findings = check_planner(Straight(), cruise_scenario())
+    assert [(f.severity, f.check) for f in findings] == [("note", "run time")]
