@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from shiftsim.arrays import IntArray
 from shiftsim.data.nuplan import find_maps, load_map, read_scenario
 from shiftsim.data.nuplan_log import open_log, read_boxes
 from shiftsim.data.nuplan_mapping import Mapping
@@ -297,8 +298,16 @@ def _excerpt_rows(kind: str, scene: Scenario) -> Any:
     if kind not in _EXCERPTS:
         return None
     num, horizon, direction, iteration = _EXCERPTS[kind]
+    return excerpt_rows(scene, int(scene.iteration_rows[iteration]), num, horizon, direction)
+
+
+def excerpt_rows(scene: Scenario, row: int, num: int, horizon: int, direction: int) -> IntArray:
+    """Rows that nuPlan reads for `num` samples over `horizon` rows ahead (1) or back (-1).
+
+    Rows are counted, and those outside the log are silently left out (nuplan-simulation.md §1).
+    """
     step = (horizon + 1) // num
-    rows = scene.iteration_rows[iteration] + direction * step * np.arange(1, num + 1)
+    rows = row + direction * step * np.arange(1, num + 1)
     return np.sort(rows[(rows >= 0) & (rows < len(scene.time_us))])
 
 
