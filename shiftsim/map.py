@@ -6,7 +6,7 @@ for roadblocks and roadblock connectors (*blocks*). Ids are strings at the bound
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import shapely
@@ -179,6 +179,12 @@ class VectorMap:
     car_parks: Layer
     drivable_areas: Layer
     flaws: dict[str, int] = field(default_factory=dict, compare=False)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
 
     def edge(self, edge_id: str) -> int:
         """Index of a lane or lane connector.
