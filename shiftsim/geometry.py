@@ -115,16 +115,28 @@ def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
 @kernel
 def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     """Where a point lies relative to one ring (V, 2): INTERIOR, BOUNDARY or EXTERIOR."""
-    parity, on_edge = _ray_crossings(ring, 0, len(ring), x, y)
+    parity, on_edge = ray_crossings(ring, len(ring) - 1, 0, len(ring), x, y)
     if on_edge:
         return BOUNDARY
     return INTERIOR if parity else EXTERIOR
 
 
 @kernel
-def _ray_crossings(xy: FloatArray, start: int, stop: int, x: float, y: float) -> tuple[bool, bool]:
+def ray_crossings(
+    xy: FloatArray, before: int, start: int, stop: int, x: float, y: float
+) -> tuple[bool, bool]:
+    """Whether a ray from (x, y) to +x crosses a chain an odd number of times, or starts on it.
+
+    Args:
+        xy: (V, 2) vertices [m].
+        before: Vertex the chain starts at; for a whole ring its last one.
+        start: Second vertex of the chain.
+        stop: One past its last vertex.
+        x: Point [m].
+        y: Point [m].
+    """
     parity = False
-    px, py = xy[stop - 1, 0], xy[stop - 1, 1]
+    px, py = xy[before, 0], xy[before, 1]
     for index in range(start, stop):
         qx, qy = xy[index, 0], xy[index, 1]
         if qx == x and qy == y:
@@ -161,7 +173,8 @@ def locate_in_polygon(
     """
     inside = False
     for ring in range(first, last):
-        parity, on_edge = _ray_crossings(xy, ring_ptr[ring], ring_ptr[ring + 1], x, y)
+        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
+        parity, on_edge = ray_crossings(xy, stop - 1, start, stop, x, y)
         if on_edge:
             return BOUNDARY
         if parity:
