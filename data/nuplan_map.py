@@ -1,126 +1,24 @@
-"""nuPlan's map.gpkg -> VectorMap, without GDAL (nuplan-formats.md §3).
+"""nuPlan's map.gpkg -> VectorMap (nuplan-formats.md §3)."""
 
-A GeoPackage is an SQLite file whose geometries are a short header followed by WKB. Layers are kept
-in longitude and latitude and projected to the metric system named in the table `meta`.
-"""
-
-import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyproj
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.untrusted_sqlite import Database, open_database
+from shiftsim.data.geopackage import MEND, GeoPackage, LayerTable
+from shiftsim.data.untrusted_sqlite import open_database
 from shiftsim.errors import DataError, MapError
 from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 
-_MEND = "the map is damaged or not a nuPlan map; get it again from its source"
-_ENVELOPE_BYTES = (0, 32, 48, 48, 64)
 _MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
 _BIKE_LANE = 1
 _TURN_UNKNOWN = 4
 
 # Drivable area: the rows of these layers one after the other, nuplan-formats.md §3 rule 4.
 _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
-
-
-@dataclass(frozen=True)
-class _Table:
-    """One layer: ids, projected geometries and the columns asked for."""
-
-    name: str
-    ids: list[str]
-    shapes: list[shapely.Geometry]
-    columns: dict[str, list[object]]
-
-    def text_ids(self, column: str) -> list[str | None]:
-        """A column of references as strings; None where it is empty."""
-        values = self.columns[column]
-        return [None if v is None or v == "" else _id(v, self.name, column) for v in values]
-
-    def integers(self, column: str, default: int) -> list[int]:
-        """A column of codes; `default` where it is empty."""
-        values = self.columns[column]
-        return [default if v is None else int(_id(v, self.name, column)) for v in values]
-
-
-class _Gpkg:
-    """Reads and projects the layers of one file."""
-
-    def __init__(self, database: Database) -> None:
-        self.database = database
-        self.path = database.path
-        meta = database.columns("meta", ["key", "value"])
-        system = dict(zip(meta["key"], meta["value"], strict=True)).get("projectedCoordSystem")
-        self.epsg = self._epsg(system)
-        self._to_metres = _transformer(self.epsg)
-
-    def _epsg(self, system: object) -> int:
-        name, _, code = str(system).lower().partition(":")
-        if name != "epsg" or not code.isdigit():
-            raise DataError(
-                f"{self.path}: table 'meta': projectedCoordSystem is {system!r}, not 'epsg:<code>'",
-                hint=_MEND,
-            )
-        return int(code)
-
-    def table(self, name: str, columns: Sequence[str] = (), extra: Sequence[str] = ()) -> _Table:
-        raw = self.database.columns(name, ["fid", "geom", *columns], extra)
-        bodies = [self._wkb(b, name, f) for f, b in zip(raw["fid"], raw["geom"], strict=True)]
-        try:
-            shapes = shapely.force_2d(shapely.from_wkb(np.array(bodies, object)))
-            xy = shapely.get_coordinates(shapes)
-            x, y = self._to_metres.transform(xy[:, 0], xy[:, 1])
-        except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
-            raise DataError(
-                f"{self.path}: layer {name!r}: broken geometry: {error}", hint=_MEND
-            ) from error
-        if not (np.isfinite(x).all() and np.isfinite(y).all()):
-            raise DataError(
-                f"{self.path}: layer {name!r}: a coordinate is not finite in epsg:{self.epsg}",
-                hint=_MEND,
-            )
-        projected = shapely.set_coordinates(shapes, np.column_stack([x, y]))
-        ids = [_id(v, name, "fid") for v in raw["fid"]]
-        return _Table(name, ids, list(projected), raw)
-
-    def _wkb(self, blob: object, layer: str, fid: object) -> bytes:
-        where = f"{self.path}: layer {layer!r}: geometry of fid {fid!r}"
-        if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
-            raise DataError(f"{where} is not a GeoPackage geometry", hint=_MEND)
-        envelope = (blob[3] >> 1) & 7
-        if envelope >= len(_ENVELOPE_BYTES) or blob[3] & 0x30:
-            raise DataError(f"{where} is empty or of an unknown kind", hint=_MEND)
-        (system,) = struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])
-        if system != 4326:
-            raise DataError(f"{where} has the coordinate system {system}, not 4326", hint=_MEND)
-        return blob[8 + _ENVELOPE_BYTES[envelope] :]
-
-
-@lru_cache(maxsize=8)
-def _transformer(epsg: int) -> pyproj.Transformer:
-    try:
-        return pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
-    except pyproj.exceptions.CRSError as error:
-        raise DataError(f"epsg:{epsg} is not a coordinate system: {error}", hint=_MEND) from error
-
-
-def _id(value: object, layer: str, column: str) -> str:
-    # nuPlan: reference columns are cast to int as a whole (nuplan-formats.md §3 rule 5).
-    try:
-        number = float(value)  # type: ignore[arg-type]  # anything SQLite can hold
-        if number == int(number):
-            return str(int(value)) if not isinstance(value, float) else str(int(number))  # type: ignore[call-overload]
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise DataError(
-        f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", hint=_MEND
-    )
 
 
 def read_map(path: Path, name: str) -> VectorMap:
@@ -137,18 +35,18 @@ def read_map(path: Path, name: str) -> VectorMap:
         DataError: The file is missing or broken, or lacks a layer or column.
     """
     with open_database(Path(path)) as database:
-        gpkg = _Gpkg(database)
+        gpkg = GeoPackage(database)
         try:
             return _assemble(gpkg, name)
         except MapError as error:
-            raise MapError(f"{path}: {error}", hint=_MEND) from error
+            raise MapError(f"{path}: {error}", hint=MEND) from error
         except DataError as error:
             if str(error).startswith(str(path)):
                 raise
             raise DataError(f"{path}: {error}", hint=error.hint) from error
 
 
-def _assemble(gpkg: _Gpkg, name: str) -> VectorMap:
+def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
     flaws: dict[str, int] = {}
     boundaries = _lines(gpkg.table("boundaries"))
     baselines = _baselines(gpkg)
@@ -196,11 +94,11 @@ def _count(flaws: dict[str, int], flaw: str, number: int) -> None:
         flaws[flaw] = flaws.get(flaw, 0) + number
 
 
-def _lines(table: _Table) -> dict[str, FloatArray]:
+def _lines(table: LayerTable) -> dict[str, FloatArray]:
     for fid, shape in zip(table.ids, table.shapes, strict=True):
         if shape.geom_type != "LineString":
             raise DataError(
-                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=_MEND
+                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=MEND
             )
     return {
         fid: shapely.get_coordinates(shape)
@@ -208,7 +106,7 @@ def _lines(table: _Table) -> dict[str, FloatArray]:
     }
 
 
-def _baselines(gpkg: _Gpkg) -> dict[str, FloatArray]:
+def _baselines(gpkg: GeoPackage) -> dict[str, FloatArray]:
     table = gpkg.table("baseline_paths", ["lane_fid", "lane_connector_fid"])
     lines = _lines(table)
     out: dict[str, FloatArray] = {}
@@ -221,10 +119,10 @@ def _baselines(gpkg: _Gpkg) -> dict[str, FloatArray]:
 
 
 def _lanes(
-    gpkg: _Gpkg,
+    gpkg: GeoPackage,
     baselines: dict[str, FloatArray],
     boundaries: dict[str, FloatArray],
-    connectors: _Table,
+    connectors: LayerTable,
     flaws: dict[str, int],
 ) -> list[EdgeSpec]:
     table = gpkg.table(
@@ -273,11 +171,11 @@ def _lanes(
 
 
 def _connectors(
-    gpkg: _Gpkg,
+    gpkg: GeoPackage,
     baselines: dict[str, FloatArray],
     boundaries: dict[str, FloatArray],
-    table: _Table,
-    stops: _Table,
+    table: LayerTable,
+    stops: LayerTable,
     flaws: dict[str, int],
 ) -> list[EdgeSpec]:
     areas = gpkg.table(
@@ -288,7 +186,7 @@ def _connectors(
     owners = areas.text_ids("lane_connector_fid")
     bare = set(table.ids) - set(owners)
     if bare:
-        raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=_MEND)
+        raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=MEND)
     left, right = areas.text_ids("left_boundary_fid"), areas.text_ids("right_boundary_fid")
     start, end = table.text_ids("exit_lane_fid"), table.text_ids("entry_lane_fid")
     groups = table.text_ids("lane_group_connector_fid")
@@ -327,7 +225,7 @@ def _connectors(
     return out
 
 
-def _blocks(gpkg: _Gpkg, flaws: dict[str, int]) -> list[BlockSpec]:
+def _blocks(gpkg: GeoPackage, flaws: dict[str, int]) -> list[BlockSpec]:
     roadblocks = gpkg.table("lane_groups_polygons")
     links = gpkg.table(
         "lane_group_connectors", ["from_lane_group_fid", "to_lane_group_fid", "intersection_fid"]
@@ -389,7 +287,7 @@ def _known(fid: str | None) -> list[str]:
 
 def _find(lines: dict[str, FloatArray], fid: str, owner: str, what: str) -> FloatArray:
     if fid not in lines:
-        raise DataError(f"{owner} {fid!r} has no {what}", hint=_MEND)
+        raise DataError(f"{owner} {fid!r} has no {what}", hint=MEND)
     return lines[fid]
 
 
@@ -401,37 +299,37 @@ def _optional(
     return None if fid is None else lines.get(fid)
 
 
-def _speed(table: _Table, row: int) -> float | None:
+def _speed(table: LayerTable, row: int) -> float | None:
     value = table.columns["speed_limit_mps"][row]
     if value is None:
         return None
     if not isinstance(value, int | float):
         raise DataError(
             f"layer {table.name!r}: speed_limit_mps of fid {table.ids[row]} is {value!r}",
-            hint=_MEND,
+            hint=MEND,
         )
     return float(value)
 
 
-def _one_polygon(table: _Table, row: int, flaws: dict[str, int]) -> shapely.Polygon:
+def _one_polygon(table: LayerTable, row: int, flaws: dict[str, int]) -> shapely.Polygon:
     parts = _polygons(table, row)
     if len(parts) > 1:
         _count(flaws, "lane or roadblock in several pieces: the largest is kept", 1)
     return max(parts, key=lambda part: float(shapely.area(part)))
 
 
-def _polygons(table: _Table, row: int) -> list[shapely.Polygon]:
+def _polygons(table: LayerTable, row: int) -> list[shapely.Polygon]:
     parts = list(shapely.get_parts(table.shapes[row]))
     if not parts or any(p.geom_type != "Polygon" or shapely.is_empty(p) for p in parts):
         kind = table.shapes[row].geom_type
         raise DataError(
             f"layer {table.name!r}: geometry of fid {table.ids[row]} is a {kind} without area",
-            hint=_MEND,
+            hint=MEND,
         )
     return parts
 
 
-def _areas(table: _Table, kinds: Sequence[int] | None = None) -> list[AreaSpec]:
+def _areas(table: LayerTable, kinds: Sequence[int] | None = None) -> list[AreaSpec]:
     return [
         AreaSpec(fid, part, 0 if kinds is None else kinds[row])
         for row, fid in enumerate(table.ids)

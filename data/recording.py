@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.track_order import order_of_columns
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
@@ -122,7 +122,7 @@ def scenario(
 
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
-    seen = tracks.valid.any(axis=0)
+    seen: BoolArray = np.any(tracks.valid, axis=0)
     if without in tracks.tokens:
         seen[tracks.tokens.index(without)] = False
     if not seen.all():

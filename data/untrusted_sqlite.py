@@ -48,7 +48,7 @@ class Database:
             DataError: The file cannot be read.
         """
         try:
-            return self._connection.execute(sql, tuple(parameters)).fetchall()  # type: ignore[arg-type]  # values of ours
+            return self._connection.execute(sql, tuple(parameters)).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise DataError(f"{self.path}: cannot read {what}: {error}", hint=_MEND) from error
 

@@ -24,7 +24,7 @@ _POINT = (30.0, -1.75)  # m, where the map is asked
 _NEAR = 80.0  # m, half width of the square of `proximal`
 _DRIVABLE = ((30.0, 0.0), (100.0, -6.0), (30.0, -8.0), (210.0, -6.0))
 _ORIGINS = {32632: (600000.0, 5300000.0)}  # of the coordinates, by coordinate system
-_TOLERANCES = {
+_TOLERANCES: dict[str, float | tuple[float, ...]] = {
     "interval": 1e-12,
     "ego_t0.rear": (1e-6, 1e-6, 1e-9),
     "ego_t0.center": 1e-6,
