@@ -1,0 +1,42 @@
+# Targets of the project; each needs nothing but Python 3.11 or newer, pip, make and gcc.
+PYTHON ?= python3
+BIN := .venv/bin
+# numba's disk cache does not see an edit of a kernel in another file: one folder per state of them
+KERNELS := $(shell grep -rl --include='*.py' kernel shiftsim planners metrics data | sort | xargs cat | cksum | cut -d' ' -f1)
+export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba-cache/$(KERNELS)
+
+.PHONY: install demo test test-fast lint types bench verify dist clean-cache
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[learned]" --group dev && touch $@
+
+demo: install
+	$(BIN)/shiftsim demo
+
+test: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-fast: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+lint: install
+	$(BIN)/ruff format --check . && $(BIN)/ruff check .
+
+types: install
+	$(BIN)/mypy
+
+bench: install
+	$(BIN)/python -m pytest benchmarks/speed
+
+verify: install
+	for folder in ../shared/reference/*/; do $(BIN)/shiftsim verify $$folder || exit 1; done
+
+dist: install
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+clean-cache:
+	rm -rf .numba-cache .pytest_cache .mypy_cache .ruff_cache .hypothesis

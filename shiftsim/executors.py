@@ -63,8 +63,8 @@ def map_unordered(
             the end.
         tasks: The tasks.
         workers: Number of worker processes; with 1 everything happens in this process.
-        alone: So many leading tasks are done by the first worker before the others get one, so
-            that kernels which are not in the disk cache yet are compiled once.
+        alone: So many leading tasks are done one at a time before the others, so that kernels
+            which are not in the disk cache yet are compiled once.
 
     Yields:
         One outcome per task.
@@ -171,7 +171,7 @@ class _Pool:
                 self.workers.append(_Worker(self.payload))
             ready = self._in("idle")
             if done < alone:
-                ready = ready[: 1 - len(self._in("busy"))]
+                ready = [] if self._in("busy") else ready[:1]
             for worker in ready[: len(waiting)]:
                 worker.give(waiting.popleft())
             watched: dict[Any, _Worker] = {

@@ -8,6 +8,19 @@ from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.results import Run
 from shiftsim.rollouts import Task
 
+_UNITS = {  # nuPlan's names, shortened
+    "meters": "m",
+    "seconds": "s",
+    "meters_per_second": "m/s",
+    "meters_per_second_squared": "m/s²",
+    "meters_per_second_cubed": "m/s³",
+    "radians_per_second": "rad/s",
+    "radians_per_second_squared": "rad/s²",
+    "count": "",
+    "ratio": "",
+    "boolean": "",
+}
+
 
 def select_tasks(
     run: Run,
@@ -116,5 +129,5 @@ def _metric_line(row: dict[str, Any]) -> str:
 
 
 def _unit(row: dict[str, Any]) -> str:
-    unit = row["unit"]
-    return "" if not unit or unit in ("boolean", "ratio", "None") else f" {unit}"
+    unit = _UNITS.get(row["unit"], row["unit"])
+    return f" {unit}" if unit else ""

@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from itertools import pairwise
 
 import pytest
 
@@ -57,10 +58,16 @@ def test_workers_that_cannot_start_are_reported_instead_of_retried_for_ever(capf
     assert "RuntimeError: no" in capfd.readouterr().err
 
 
-def test_the_first_worker_does_the_leading_tasks_alone():
-    outcomes = run(range(6), 2, alone=3)
-    assert len({o.result[0] for o in outcomes if o.task < 3}) == 1
-    assert [o.task for o in outcomes[:3]] == [0, 1, 2]
+class Timed:
+    def __call__(self, number):
+        began = time.monotonic()
+        time.sleep(0.1)
+        return began, time.monotonic()
+
+
+def test_leading_tasks_are_done_one_at_a_time():
+    spans = sorted(o.result for o in run(range(6), 2, alone=3, make=Timed))
+    assert all(before[1] <= after[0] for before, after in pairwise(spans[:4]))
 
 
 class Closing:

@@ -1,0 +1,202 @@
+"""Commands that look at things: report, explain, check, planners, verify, doctor."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+
+_UNFINISHED, _USAGE, _DATA = 3, 1, 2
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
+RunFolders = Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders.")]
+_PLANNERS = typer.Typer(help="Planners: what there is, and does mine obey the contract.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command()(report)
+    app.command()(explain)
+    app.command()(check)
+    app.command()(verify)
+    app.command()(doctor)
+    _PLANNERS.command("list")(list_planners)
+    _PLANNERS.command("check")(check_one_planner)
+    app.add_typer(_PLANNERS, name="planners", no_args_is_help=True)
+
+
+def report(
+    runs: RunFolders,
+    style: Annotated[str, typer.Option("--format", "-f", help="text, md, csv or latex.")] = "text",
+    by: Annotated[
+        str | None, typer.Option(help="One row per scenario_type, or per seed, as well.")
+    ] = None,
+    worst: Annotated[int, typer.Option(help="Name the N worst rollouts.")] = 5,
+    out: Annotated[Path | None, typer.Option(help="Write to this file instead.")] = None,
+    allow_partial: Annotated[
+        bool, typer.Option("--allow-partial", help="Print a labelled mean over what finished.")
+    ] = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Score tables of one or several runs."""
+    from shiftsim.report import score_table, summary, worst_rollouts
+    from shiftsim.results import open_run
+
+    opened = [open_run(path) for path in runs]
+    if as_json:
+        say_json([summary(run) for run in opened])
+        return
+    text = score_table(opened, style=style, by=by, allow_partial=allow_partial)
+    if out is not None:
+        out.write_text(text + "\n")
+        say(f"written: {out}")
+    else:
+        say(text)
+    if style != "text" or out is not None:
+        return
+    for run in opened:
+        rows = worst_rollouts(run, worst)
+        if rows:
+            say(f"\n worst of {run.path.name}")
+        for row in rows:
+            seed = "" if row["noise"] == "none" else f" seed {row['seed']}"
+            where = f"{row['token']}  {row['planner']} {row['noise']}{seed}"
+            say(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
+
+
+def explain(
+    source: RunFolder,
+    token: Annotated[str, typer.Argument(help="Scenario token, or its beginning.")],
+    planner: Annotated[str | None, typer.Option(help="Only this planner.")] = None,
+    noise: Annotated[str | None, typer.Option(help="Only this noise.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Only this seed.")] = None,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Why a rollout has its score, or why a task failed."""
+    from shiftsim.explain import explain_lines, select_tasks
+    from shiftsim.results import open_run
+
+    run = open_run(source)
+    chosen = select_tasks(run, token, planner=planner, noise=noise, seed=seed)
+    if as_json:
+        say_json(chosen)
+        return
+    for number, task in enumerate(chosen):
+        if number:
+            say()
+        for line in explain_lines(task):
+            say(line)
+
+
+def check(
+    store: Annotated[str, typer.Argument(help="Store, by name or folder.")],
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
+    from shiftsim.config import store_path
+    from shiftsim.data.check import check_store
+
+    path = store_path(store)
+    problems = check_store(path)
+    if as_json:
+        say_json([str(problem) for problem in problems])
+    else:
+        for problem in problems:
+            say(f" {problem}")
+        say(f"{path}: {plural(len(problems), 'problem')}")
+    if problems:
+        raise typer.Exit(_DATA)
+
+
+def list_planners(as_json: Json = False, debug: Debug = False) -> None:
+    """The planners that come with shiftsim."""
+    from shiftsim.planners import PLANNERS
+
+    if as_json:
+        names = ("name", "kind", "description", "arguments")
+        say_json([{n: getattr(entry, n) for n in names} for entry in PLANNERS.values()])
+        return
+    for entry in PLANNERS.values():
+        say(f" {entry.name:18} {entry.kind:11} {entry.description}")
+        if entry.arguments:
+            say(f" {'':18} {'':11} --planner-arg {', '.join(entry.arguments)}")
+
+
+def check_one_planner(
+    planner: Annotated[str, typer.Argument(help="Name or package.module:Class.")],
+    planner_arg: Annotated[
+        list[str] | None, typer.Option("--planner-arg", help="key=value; repeatable.")
+    ] = None,
+    store: Annotated[str, typer.Option(help="Store with scenarios to try it on.")] = "demo",
+    token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Does a planner obey the contract? Says what is wrong, and what to do."""
+    from shiftsim.config import parse_argument
+    from shiftsim.planners import load_planner
+    from shiftsim.planners.contract import check_planner
+    from shiftsim.runner import open_named_store
+
+    arguments = {}
+    for text in planner_arg or ():
+        _, name, value = parse_argument(text, (planner,))
+        arguments[name] = value
+    load_planner(planner, arguments)
+    scenes = open_named_store(store)
+    scenario = scenes.read(token or scenes.tokens[0])
+    findings = check_planner(lambda: load_planner(planner, arguments), scenario)
+    if as_json:
+        say_json([str(finding) for finding in findings])
+    else:
+        for finding in findings:
+            say(f" {finding}")
+        say(f"{planner}: {plural(len(findings), 'finding')}")
+    if findings:
+        raise typer.Exit(_USAGE)
+
+
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
+    mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
+    maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
+    require_all: Annotated[
+        bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
+    ] = False,
+    debug: Debug = False,
+) -> None:
+    """Compare with reference outputs of nuPlan's own code.
+
+    Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
+    3 not all covered (with --require-all).
+    """
+    from shiftsim.config import one_of
+    from shiftsim.verify import MODES
+    from shiftsim.verify import verify as compare
+
+    if mode is not None:
+        one_of("mode", mode, MODES)
+    result = compare(folder, mode=mode, scenes=scenes, maps=maps)
+    for line in result.lines():
+        say(line)
+    raise typer.Exit(result.exit_code(require_all=require_all))
+
+
+def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
+    """Versions, cores and memory, and whether the kernels compute what they should."""
+    from shiftsim.doctor import examine
+
+    with progress_bar(quiet=quiet or as_json) as advance:
+        found = examine(advance)
+    if as_json:
+        say_json(found.to_dict())
+    else:
+        for line in found.lines():
+            say(line)
+    if not found.is_well:
+        raise typer.Exit(_DATA)
