@@ -234,8 +234,8 @@ def _roll_on(
     target, min_gap, headway, accel_max, decel_max = model
     footprint = np.empty((4, 2))
     for step in range(first, STEPS):
-        x, y, heading = centers[step]
-        progress, speed = motion[step]
+        x, y, heading = centers[step, 0], centers[step, 1], centers[step, 2]
+        progress, speed = motion[step, 0], motion[step, 1]
         box_corners(x, y, heading, size[0], size[1], footprint)
         line = _look_ahead(path, progress, target)
         find_sides(line, 0.5 * size[1], footprint, occupants, sides[step])
@@ -253,7 +253,8 @@ def _roll_on(
         )
         motion[step + 1, 0] = progress + STEP * speed
         motion[step + 1, 1] = max(0.0, speed + STEP * min(max(accel, -decel_max), accel_max))
-        centers[step + 1] = interpolate(path, motion[step + 1, 0])
+        x, y, heading = interpolate(path, motion[step + 1, 0])
+        centers[step + 1, 0], centers[step + 1, 1], centers[step + 1, 2] = x, y, heading
     return STEPS, -1
 
 

@@ -42,17 +42,21 @@ class Occupants(NamedTuple):
 @kernel
 def sub_path(path: Path, low: float, high: float) -> FloatArray:
     """(K', 2) points of the path between two progresses, the interpolated ends included [m]."""
+    # loops instead of slice assignments, which take numba seconds to compile
     count = len(path.progress)
     first = int(np.searchsorted(path.progress, low, side="right"))
     last = int(np.searchsorted(path.progress, high, side="left"))  # one past the last vertex
-    if first == count:
-        return path.xy[count - 2 :].copy()
-    if last == 0:
-        return path.xy[:2].copy()
+    if first == count or last == 0:
+        out = np.empty((2, 2))
+        for row in range(2):
+            vertex = row if last == 0 else count - 2 + row
+            out[row, 0], out[row, 1] = path.xy[vertex, 0], path.xy[vertex, 1]
+        return out
     inner = max(last - first, 0)
     out = np.empty((inner + 2, 2))
     out[0, 0], out[0, 1], _ = interpolate(path, low)
-    out[1 : inner + 1] = path.xy[first : first + inner]
+    for row in range(inner):
+        out[row + 1, 0], out[row + 1, 1] = path.xy[first + row, 0], path.xy[first + row, 1]
     out[inner + 1, 0], out[inner + 1, 1], _ = interpolate(path, high)
     return out
 
@@ -110,7 +114,8 @@ def find_sides(
         occupants: The polygons.
         out: (M,) CLEAR, HIT or OPEN is written where UNKNOWN stands.
     """
-    center_x, center_y = 0.5 * (footprint[0] + footprint[2])
+    center_x = 0.5 * (footprint[0, 0] + footprint[2, 0])
+    center_y = 0.5 * (footprint[0, 1] + footprint[2, 1])
     reach = np.hypot(footprint[0, 0] - center_x, footprint[0, 1] - center_y) + 1e-6
     for index in range(len(out)):
         if out[index] != UNKNOWN:
@@ -133,16 +138,16 @@ def _side_of_corridor(
     for index in range(len(line) - 1):
         a, b = line[index], line[index + 1]
         if _is_within(circle[0], circle[1], a, b, circle[2] + outer):
-            nearest = min(nearest, _segment_distance(ring, a, b))
+            nearest = min(nearest, segment_distance(ring, a, b))
             if nearest <= inner:
                 return HIT
     # the square ends: beyond the first and the last point the corridor goes on by half a width
     before = _beyond(line[1], line[0], outer)
     after = _beyond(line[-2], line[-1], outer)
     if _is_within(circle[0], circle[1], before, line[0], circle[2] + outer):
-        nearest = min(nearest, _segment_distance(ring, before, line[0]))
+        nearest = min(nearest, segment_distance(ring, before, line[0]))
     if _is_within(circle[0], circle[1], line[-1], after, circle[2] + outer):
-        nearest = min(nearest, _segment_distance(ring, line[-1], after))
+        nearest = min(nearest, segment_distance(ring, line[-1], after))
     return OPEN if nearest <= outer else CLEAR
 
 
@@ -150,11 +155,14 @@ def _side_of_corridor(
 def _beyond(a: FloatArray, b: FloatArray, distance: float) -> FloatArray:
     length = np.hypot(b[0] - a[0], b[1] - a[1])
     share = distance / length if length > 0.0 else 0.0
-    return b + share * (b - a)
+    out = np.empty(2)
+    out[0] = b[0] + share * (b[0] - a[0])
+    out[1] = b[1] + share * (b[1] - a[1])
+    return out
 
 
 @kernel
-def _segment_distance(ring: FloatArray, a: FloatArray, b: FloatArray) -> float:
+def segment_distance(ring: FloatArray, a: FloatArray, b: FloatArray) -> float:
     """Distance between the area of a simple ring (V, 2) and the segment a-b [m]."""
     if locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
         return 0.0

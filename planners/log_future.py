@@ -36,9 +36,9 @@ class LogFuture:
             raise PlannerError("log-future: plan() was called before reset()")
         row = int(scenario.iteration_rows[observation.iteration])
         rows = slice(row, row + POSES * ROWS_BETWEEN + 1, ROWS_BETWEEN)
-        times = scenario.time_us[rows]
+        times = scenario.time_us[rows].copy()
         if len(times) > 1:
-            self._previous = Trajectory(times, scenario.ego[rows])
+            self._previous = Trajectory(times, scenario.ego[rows].copy())
         if self._previous is None:
             raise PlannerError(
                 f"log-future: scenario {scenario.token!r} has no recorded state 0.5 s after "

@@ -1,6 +1,6 @@
 """Whether what a planner returned can be executed from one iteration to the next."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -66,9 +66,7 @@ def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
         )
     if plan.relative:
         now_us, next_us = 0, next_us - now_us
-    code, row, column = _check(
-        np.ascontiguousarray(times), np.ascontiguousarray(states), now_us, next_us
-    )
+    code, row, column = _check(_plain(times), _plain(states), now_us, next_us)
     return None if code == _GOOD else _explain(code, row, column, plan, now_us, next_us)
 
 
@@ -89,6 +87,11 @@ def _command_fault(command: Command) -> Fault | None:
 
 def _is_array(value: object, ndim: int, dtype: type) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == ndim and value.dtype == dtype
+
+
+def _plain(array: Any) -> Any:
+    """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
+    return array if array.flags.carray else array.copy()
 
 
 def _describe(value: object) -> str:
