@@ -143,7 +143,7 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
         route=route,
         mission_goal=goal,
         mapping=chosen,
-        is_short=bool(end - log.time_us[-1] > 1.5e6 * ROW_SECONDS),
+        is_short=bool(end - log.time_us[-1] > 0.9e6 * ROW_SECONDS),  # a row is missing
     )
 
 

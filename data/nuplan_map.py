@@ -35,9 +35,8 @@ def read_map(path: Path, name: str) -> VectorMap:
         DataError: The file is missing or broken, or lacks a layer or column.
     """
     with open_database(Path(path)) as database:
-        gpkg = GeoPackage(database)
         try:
-            return _assemble(gpkg, name)
+            return _assemble(GeoPackage(database), name)
         except MapError as error:
             raise MapError(f"{path}: {error}", hint=MEND) from error
         except DataError as error:
