@@ -36,6 +36,8 @@ from shiftsim.data.opendrive_things import read_object, read_signal
 from shiftsim.errors import ConversionError
 
 MAX_BYTES = 200_000_000
+MAX_COORDINATE = 1e8  # m, beyond any projection of the earth
+MAX_LENGTH = 2e5  # m, of one road
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}  # opendrive.md §5
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
@@ -254,6 +256,9 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None
         if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
             reader.warn("road left out: geometry is not finite")
             return None
+        if max(abs(x), abs(y)) > MAX_COORDINATE or max(abs(s), length) > MAX_LENGTH:
+            reader.warn("road left out: geometry is out of this world")
+            return None
         if length < TINY_LENGTH:
             reader.warn("geometry without length, skipped")
             tiny.append(Geometry(s, x, y, heading, max(length, 0.0), LINE))
@@ -333,8 +338,9 @@ def _read_section(element: Any, reader: Reader) -> LaneSection:
             continue
         lanes[number] = _read_lane(child, number, reader)
     numbers = sorted(lanes)
-    wanted = set(range(min(numbers, default=0), max(numbers, default=0) + 1)) - {0}
-    if wanted != set(numbers):
+    steps = [b - a - (a < 0 < b) for a, b in pairwise(numbers)]
+    nearest = [min((abs(n) for n in numbers if n * sign > 0), default=1) for sign in (-1, 1)]
+    if any(step != 1 for step in steps) or nearest != [1, 1]:
         reader.warn("lane numbers with holes")
     start = reader.number(element, "s")
     if not np.isfinite(start):

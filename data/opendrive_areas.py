@@ -216,13 +216,13 @@ def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
         for thing in road.objects
         if is_crosswalk(thing)
         for ring in object_rings(shapes.line(road.id), thing)
-        if len(ring) > 2
+        if len(ring) > 2 and np.isfinite(ring).all()
     ]
     for road in od.roads.values():
         for signal in road.signals:
             if _is_crosswalk_signal(signal):
                 rings.append(_signal_ring(road.id, signal, shapes))
-    polygons = [largest_part(shapely.Polygon(ring)) for ring in rings]
+    polygons = [largest_part(shapely.Polygon(ring)) for ring in rings if np.isfinite(ring).all()]
     return [polygon for polygon in polygons if polygon.area > 0.1]
 
 
@@ -251,5 +251,5 @@ def parking_spaces(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
         for thing in road.objects
         if thing.type == "parkingSpace"
         for ring in object_rings(shapes.line(road.id), thing)
-        if len(ring) > 2
+        if len(ring) > 2 and np.isfinite(ring).all()
     ]

@@ -14,7 +14,8 @@ from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive_geometry import ReferenceLine
 from shiftsim.data.opendrive_records import Connection, Lane, OpenDrive, Road, RoadLink
 
-_BEFORE_END = 1e-9  # m: the end of a section still belongs to it
+BEFORE_END = 1e-9  # m: the end of a section still belongs to it
+_MAX_OFFSET = 500.0  # m from the reference line, so that absurd polynomials stay harmless
 START, END = "start", "end"
 _Side: TypeAlias = tuple[Road, int, int, str]  # road, section, lane, and the end that touches
 
@@ -57,7 +58,12 @@ def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> 
 
 
 def section_borders(
-    road: Road, section: int, s: FloatArray, *, mend: bool = False
+    road: Road,
+    section: int,
+    s: FloatArray,
+    *,
+    mend: bool = False,
+    look_up: FloatArray | None = None,
 ) -> SectionBorders:
     """Borders of the lanes of a section at road distances `s` (K,) within it [m].
 
@@ -68,24 +74,32 @@ def section_borders(
         mend: Whether negative widths count as 0, borders of right lanes that were written as
             positive numbers are put on the right, and records that begin at the very end of the
             section are left to the next one.
+        look_up: Where to look for the records instead of at `s`: which side of a step counts.
     """
     s = np.asarray(s, np.float64)
     begin, end = road.sections[section].s, road.section_end(section)
-    look_up = np.minimum(s, max(end - _BEFORE_END, begin)) if mend else s
+    if look_up is None:
+        look_up = np.minimum(s, max(end - BEFORE_END, begin)) if mend else s
     lanes = road.sections[section].lanes
     center = evaluate_cubics(road.offsets, s, look_up)
+    if mend:
+        center = np.clip(np.nan_to_num(center), -0.5 * _MAX_OFFSET, 0.5 * _MAX_OFFSET)
     borders = SectionBorders({}, {})
     for sign in (1, -1):
         previous = center
         for number in sorted((i for i in lanes if i * sign > 0), key=abs):
             lane = lanes[number]
             borders.inner[number] = previous
-            if len(lane.widths) or not len(lane.borders):
+            if len(lane.widths) or not len(lane.borders):  # nothing at all is width 0
                 outer = previous + sign * evaluate_cubics(lane.widths, s - begin, look_up - begin)
             else:
                 outer = evaluate_cubics(lane.borders, s - begin, look_up - begin)
                 outer = -outer if mend and border_is_mirrored(lane) else outer
-            previous = sign * np.maximum(sign * outer, sign * previous) if mend else outer
+            if mend:
+                if not np.isfinite(outer).all():
+                    outer = np.nan_to_num(outer, nan=0.0)
+                outer = np.clip(sign * outer, sign * previous, _MAX_OFFSET) * sign
+            previous = outer
             borders.outer[number] = previous
     return borders
 

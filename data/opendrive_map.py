@@ -9,20 +9,27 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data import opendrive_areas as areas
-from shiftsim.data.opendrive_graph import (
-    ConnectorRun,
-    LaneGraph,
-    Piece,
-    build_lane_graph,
-    road_order,
+from shiftsim.data.opendrive_check import check_map
+from shiftsim.data.opendrive_control import (
+    LIGHT,
+    STOP,
+    YIELD,
+    connector_controls,
+    is_lit,
+    stop_lines,
 )
-from shiftsim.data.opendrive_lanes import LaneKey
+from shiftsim.data.opendrive_geometry import ReferenceLine, length_error
+from shiftsim.data.opendrive_graph import DRIVABLE, LaneGraph, Piece, build_lane_graph
+from shiftsim.data.opendrive_lanes import LaneKey, border_is_mirrored
 from shiftsim.data.opendrive_records import OpenDrive
-from shiftsim.data.opendrive_shapes import Shapes, lane_polygon, largest_part, widen
+from shiftsim.data.opendrive_shapes import Shapes, bend_ends, lane_polygon, largest_part, widen
 from shiftsim.data.opendrive_speed import speed_limit
 from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 
-LIGHT, STOP_SIGN, PASS_THROUGH = 1, 2, 5  # intersection kinds, nuplan-formats.md
+LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # intersections, nuplan-formats.md
+STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # stop polygons, nuplan-formats.md
+UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
+GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m, opendrive.md §7
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -74,8 +81,10 @@ def build_road_map(
         The map, without lanes where the file has none that cars may use, and the report.
     """
     warnings = Counter(od.warnings)
-    graph = build_lane_graph(_placed(od), warnings)
-    maker = _Maker(_placed(od), graph, warnings, country)
+    placed = _placed(od)
+    note_flaws(placed, warnings)
+    graph = build_lane_graph(placed, warnings)
+    maker = _Maker(placed, graph, warnings, country)
     return maker.build(name, np.array(offset), epsg)
 
 
@@ -115,6 +124,7 @@ class _Maker:
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
         self._shape_lanes()
         self._shape_connectors()
+        self.controls = connector_controls(self.od, self.graph)
         self._number()
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblock_specs(), *self._block_connector_specs()]
@@ -130,7 +140,8 @@ class _Maker:
                 for layer, specs in layers.items()
             },
         )
-        report = MapReport(dict(self.warnings), tuple(self._origins()))
+        checks, figures = check_map(vector_map, set())
+        report = MapReport(dict(self.warnings), tuple(self._origins()), checks, figures)
         return vector_map, report
 
     def _new_ids(self, count: int) -> list[str]:
@@ -152,13 +163,9 @@ class _Maker:
             left, right = widen(left, right, min(before, after))
             self.connector_borders.append((left, right))
             self.connector_polygons.append(lane_polygon(left, right))
-            self.connector_lines.append(
-                self.shapes.baseline(
-                    connector.pieces,
-                    self.lane_lines[connector.source][-1],
-                    self.lane_lines[connector.target][0],
-                )
-            )
+            source, target = (self.lane_lines[i] for i in (connector.source, connector.target))
+            line = self.shapes.baseline(connector.pieces, source[-1], target[0])
+            self.connector_lines.append(bend_ends(line, source, target))
 
     def _number(self) -> None:
         lanes, connectors = self.graph.lanes, self.graph.connectors
@@ -170,6 +177,10 @@ class _Maker:
         self.pair_ids = dict(zip(pairs, self._new_ids(len(pairs)), strict=True))
         self.groups = areas.group_connectors(connectors, self.connector_polygons, self.pairs)
         self.group_ids = self._new_ids(int(self.groups.max(initial=-1)) + 1)
+        self.stop_lines = stop_lines(
+            self.od, self.graph, self.shapes, self.controls, self.lane_polygons
+        )
+        self.stop_ids = self._new_ids(len(self.stop_lines))
         self.boundary_ids: dict[tuple[int, int], str] = {}
 
     def _boundary(self, block: int, index: int) -> str:
@@ -231,6 +242,12 @@ class _Maker:
                 right_id=right_id,
                 speed_limit=speed_limit(self.od, connector.pieces, self.country),
                 intersection_id=self.group_ids[self.groups[number]],
+                has_traffic_lights=is_lit(connector, self.controls[number]),
+                stop_lines=[
+                    stop_id
+                    for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
+                    if line.lane == connector.source and connector.junctions
+                ],
                 turn_type=turn_type(self.connector_lines[number]),
             )
 
@@ -271,10 +288,21 @@ class _Maker:
         for group, group_id in enumerate(self.group_ids):
             numbers = np.flatnonzero(self.groups == group).tolist()
             polygon = areas.merge_closed([self.connector_polygons[i] for i in numbers], 0.5)
-            is_seam = not any(self.graph.connectors[i].junctions for i in numbers)
-            kind = PASS_THROUGH if is_seam else 0
-            specs.append(AreaSpec(group_id, areas.without_holes(polygon), kind))
+            specs.append(AreaSpec(group_id, areas.without_holes(polygon), self._kind(numbers)))
         return specs
+
+    def _kind(self, numbers: Sequence[int]) -> int:
+        """Kind of the intersection of some connectors."""
+        found = frozenset(control for i in numbers for control in self.controls[i])
+        if not any(self.graph.connectors[i].junctions for i in numbers):
+            return PASS_THROUGH
+        return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
+
+    def _stop_specs(self) -> list[AreaSpec]:
+        return [
+            AreaSpec(stop_id, line.polygon, STOP_KINDS[line.control])
+            for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
+        ]
 
     def _areas(self) -> dict[str, list[AreaSpec]]:
         intersections = self._intersections()
@@ -297,6 +325,7 @@ class _Maker:
         )
         return {
             "intersections": intersections,
+            "stop_polygons": self._stop_specs(),
             "crosswalks": self._specs(areas.crosswalk_polygons(self.od, self.shapes)),
             "walkways": self._specs(areas.merge_areas(other.walked, 0.05)),
             "car_parks": self._specs(car_parks),
@@ -353,6 +382,25 @@ def turn_type(line: FloatArray) -> int:
     return 1 if turn > 0 else 2
 
 
-def connector_junctions(connector: ConnectorRun) -> list[str]:
-    """Junctions a connector lies in, in a stable order."""
-    return sorted(connector.junctions, key=road_order)
+def note_flaws(od: OpenDrive, warnings: Counter[str]) -> None:
+    """Count flaws of the geometry and lane types that the map lives with."""
+    known = DRIVABLE | areas.PAVED | areas.WALKED | areas.SEAMS | UNUSED
+    for road in od.roads.values():
+        gaps, _ = ReferenceLine(road.geometries).joints()
+        small = int(((gaps > GAP_NOTED) & (gaps <= GAP_SERIOUS)).sum())
+        serious = int((gaps > GAP_SERIOUS).sum())
+        if small:
+            warnings[f"gap of more than {GAP_NOTED:g} m between geometries"] += small
+        if serious:
+            warnings[f"gap of more than {GAP_SERIOUS:g} m between geometries"] += serious
+        wrong = sum(length_error(geometry) > 0 for geometry in road.geometries)
+        if wrong:
+            warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
+        for section in road.sections:
+            for lane in section.lanes.values():
+                if lane.type in ("tram", "rail"):
+                    warnings["tram or rail lane left out"] += 1
+                elif lane.type not in known:
+                    warnings["lane of unknown type left out"] += 1
+                if border_is_mirrored(lane):
+                    warnings["border of a right lane given on the left, mirrored"] += 1

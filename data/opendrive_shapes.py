@@ -7,15 +7,16 @@ lanes were joined, evenly in arc length, and small jumps between pieces are spre
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive_geometry import Poses, ReferenceLine
+from shiftsim.data.opendrive_geometry import ReferenceLine
 from shiftsim.data.opendrive_graph import Piece
-from shiftsim.data.opendrive_lanes import section_borders
+from shiftsim.data.opendrive_lanes import BEFORE_END, LaneKey, section_borders
 from shiftsim.data.opendrive_records import OpenDrive, Road
 
 CHORD_ERROR = 0.05  # m, opendrive.md §6
@@ -25,6 +26,9 @@ _TARGET_ERROR = 0.02  # m at the middle of a chord; the largest error may lie be
 _MAX_STEP = 10.0  # m
 _MIN_STEP = 0.01  # m
 _ROUNDS = 12
+_STEP = 0.01  # m, beyond which a jump of the middle of a lane is spread
+_CORNER, _MIN_STRETCH = 0.3, 0.7  # rad, and m between corners, to be kept as vertices
+_KINK, _BEND = 0.1, 5.0  # rad, and m, of ends that are bent into the direction of a neighbour
 _BLEND = 10.0  # m over which a jump between pieces is spread
 _NARROW = 2.5  # m, connectors below it are widened (nuPlan's "scaled width")
 
@@ -89,13 +93,13 @@ class Shapes:
 
     def centers(self, piece: Piece, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
-        road = self._od.roads[piece.key.road]
-        borders = section_borders(road, piece.key.section, s, mend=True)
-        middle = 0.5 * (borders.inner[piece.key.lane] + borders.outer[piece.key.lane])
-        return self._poses(piece, s).offset(middle)
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        return self._middles(piece.key, np.clip(s, low, max(high - BEFORE_END, low)))
 
-    def _poses(self, piece: Piece, s: FloatArray) -> Poses:
-        return self._lines[piece.key.road].evaluate(s)
+    def _middles(self, key: LaneKey, s: FloatArray) -> FloatArray:
+        borders = section_borders(self._od.roads[key.road], key.section, s, mend=True, look_up=s)
+        middle = 0.5 * (borders.inner[key.lane] + borders.outer[key.lane])
+        return self._lines[key.road].evaluate(s).offset(middle)
 
     def ends(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
         """First and last centre point of a chain of pieces [m]."""
@@ -116,6 +120,7 @@ class Shapes:
             start: (2,) point it must begin at, near its own; None for its own [m].
             end: (2,) point it must end at [m].
         """
+        pieces = [part for piece in pieces for part in self._without_steps(piece)]
         firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
         jumps = np.zeros((len(pieces) + 1, 2))
         for number in range(1, len(pieces)):
@@ -135,19 +140,29 @@ class Shapes:
                 for piece, share, shift in zip(pieces, grids, shifts, strict=True)
             ]
         )
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(dense, axis=0).T))])
-        count = max(round(float(arc[-1]) / BASELINE_STEP), 1)
-        at = np.linspace(0.0, arc[-1], count + 1)
-        line = np.stack([np.interp(at, arc, dense[:, 0]), np.interp(at, arc, dense[:, 1])], axis=1)
-        line[0], line[-1] = dense[0], dense[-1]
-        return line
+        return _divide(dense)
+
+    def _without_steps(self, piece: Piece) -> list[Piece]:
+        """The piece, cut where the middle of the lane jumps."""
+        road = self._od.roads[piece.key.road]
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        places = np.array(_breakpoints(road, piece.key.section, low, high))
+        if len(places) == 0:
+            return [piece]
+        jumps = self._middles(piece.key, places) - self._middles(piece.key, places - BEFORE_END)
+        cuts = np.unique(places[np.hypot(*jumps.T) > _STEP]).tolist()
+        stops = [low, *cuts, high]
+        if piece.end < piece.begin:
+            stops.reverse()
+        return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
 
     def _shifted(
         self, piece: Piece, share: FloatArray, shift: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
         """Centre points at shares of a piece, its two ends moved by `shift` (2,), (2,)."""
         points = self.centers(piece, piece.begin + share * (piece.end - piece.begin))
-        reach = min(_BLEND / piece.length, 0.5) if piece.length > 0 else 0.5
+        room = 0.5 if shift[0].any() and shift[1].any() else 1.0
+        reach = min(_BLEND / piece.length, room) if piece.length > 0 else room
         points += _ramp(share / reach)[:, None] * shift[0]
         points += _ramp((1.0 - share) / reach)[:, None] * shift[1]
         return points
@@ -160,6 +175,54 @@ class Shapes:
             borders = section_borders(road, piece.key.section, np.array([s]), mend=True)
             out.append(float(abs(borders.outer[piece.key.lane] - borders.inner[piece.key.lane])[0]))
         return out[0], out[1]
+
+
+def _divide(dense: FloatArray) -> FloatArray:
+    """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
+    steps = np.diff(dense, axis=0)
+    lengths = np.hypot(*steps.T)
+    arc = np.concatenate([[0.0], np.cumsum(lengths)])
+    moving = np.flatnonzero(lengths > 1e-6)
+    headings = np.arctan2(steps[moving, 1], steps[moving, 0])
+    turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
+    stops = [0.0]
+    for corner in arc[moving[1:][turns > _CORNER]]:
+        if min(corner - stops[-1], arc[-1] - corner) > _MIN_STRETCH:
+            stops.append(float(corner))
+    parts = [
+        np.linspace(a, b, max(round((b - a) / BASELINE_STEP), 1), endpoint=False)
+        for a, b in pairwise([*stops, float(arc[-1])])
+    ]
+    at = np.concatenate([*parts, arc[-1:]])
+    line = np.stack([np.interp(at, arc, dense[:, 0]), np.interp(at, arc, dense[:, 1])], axis=1)
+    line[0], line[-1] = dense[0], dense[-1]
+    return line
+
+
+def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """A line (K, 2) whose ends leave and arrive in the directions of its neighbours.
+
+    Only where they differ enough to be a kink; the line moves aside by some centimetres.
+
+    Args:
+        line: The line [m].
+        before: (K, 2) line that ends where it begins [m].
+        after: (K, 2) line that begins where it ends [m].
+    """
+    bent = _bend_start(line, before[-1] - before[-2])
+    return _bend_start(bent[::-1], after[0] - after[1])[::-1]
+
+
+def _bend_start(line: FloatArray, direction: FloatArray) -> FloatArray:
+    own, wanted = (v / max(float(np.hypot(*v)), 1e-9) for v in (line[1] - line[0], direction))
+    if own @ wanted > np.cos(_KINK) or own @ wanted < np.cos(1.0):
+        return line
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    reach = min(_BEND, 0.5 * float(arc[-1]))
+    if reach < 2 * BASELINE_STEP:
+        return line
+    share = np.clip(arc / reach, 0.0, 1.0)
+    return line + (arc * (1.0 - share) ** 2)[:, None] * (wanted - own)
 
 
 def lane_polygon(left: FloatArray, right: FloatArray) -> shapely.Polygon:
@@ -194,7 +257,7 @@ def widen(left: FloatArray, right: FloatArray, width: float) -> tuple[FloatArray
 def _ramp(x: FloatArray) -> FloatArray:
     """1 at 0, 0 from 1 on, flat at both."""
     x = np.clip(x, 0.0, 1.0)
-    return 1.0 - x * x * (3.0 - 2.0 * x)
+    return 1.0 - x**3 * (10.0 + x * (6.0 * x - 15.0))
 
 
 def _join(lines: Sequence[FloatArray]) -> FloatArray:
@@ -251,5 +314,5 @@ def _breakpoints(road: Road, section: int, begin: float, end: float) -> list[flo
     places = [g.s for g in road.geometries] + road.offsets[:, 0].tolist()
     for lane in road.sections[section].lanes.values():
         for records in (lane.widths, lane.borders):
-            places += (begin + records[:, 0]).tolist()
+            places += (road.sections[section].s + records[:, 0]).tolist()
     return [s for s in places if begin + _MIN_STEP < s < end - _MIN_STEP]
