@@ -1,0 +1,245 @@
+"""The agents of one rollout with everything they look at, as the arrays that kernels take."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.layers import Polygons
+from shiftsim.map import VectorMap
+from shiftsim.scenario import Scenario
+from shiftsim.state import (
+    HEADING,
+    LAST_AGENT_KIND,
+    PACIFICA,
+    VX,
+    VY,
+    LightStatus,
+    Tracks,
+    center_poses,
+)
+from shiftsim.traffic.idm_agents import Start, more_room
+from shiftsim.traffic.idm_buffer import curve_room
+from shiftsim.traffic.idm_paths import Fleet, Roads
+from shiftsim.traffic.idm_step import (
+    Driving,
+    Obstacles,
+    Scratch,
+    extend_routes,
+    move_agent,
+    remove_far,
+    set_box,
+    set_boxes,
+    step_agents,
+)
+
+_CURVE_ROOM = 256  # vertices of a footprint to begin with
+_EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the path
+
+
+@dataclass(slots=True)
+class Scene:
+    """State of the reactive traffic of one rollout.
+
+    Attributes:
+        fleet: The agents.
+        agents: (A,) their tracks.
+        replayed: (R,) tracks that are replayed from the log.
+        roads: The map.
+        stops: Its stop polygons.
+        obstacles: Agents, ego, and room for all replayed tracks.
+        scratch: Room for the kernels.
+        light_edges: (C,) edges whose lights are listed.
+        lights: (T, C) LightStatus codes at the iterations.
+        status: (E,) LightStatus codes of the present step.
+        spans: (T - 1,) length of each step [s].
+        moving: Whether agents know the speed of replayed tracks.
+    """
+
+    fleet: Fleet
+    agents: IntArray
+    replayed: IntArray
+    roads: Roads
+    stops: Polygons
+    obstacles: Obstacles
+    scratch: Scratch
+    light_edges: IntArray
+    lights: IntArray
+    status: IntArray
+    spans: FloatArray
+    moving: bool
+
+    def advance(
+        self,
+        iteration: int,
+        ego: FloatArray,
+        tracks: Tracks,
+        row: int,
+        driving: Driving,
+        min_path_length: float,
+        radius: float,
+    ) -> None:
+        """Move the agents from one iteration to the next.
+
+        Args:
+            iteration: The iteration that ends.
+            ego: (11,) ego state at that iteration.
+            tracks: Holds the replayed tracks.
+            row: Row of `tracks` of the next iteration.
+            driving: Parameters of the policy.
+            min_path_length: Path kept ahead at standstill [m].
+            radius: Agents farther from the ego are removed [m].
+        """
+        # nuPlan: the ego is one step old, lights and replayed objects are one step ahead (§12 Q11)
+        count = self._place(ego, tracks, row)
+        center = center_poses(ego[None, : HEADING + 1])[0]
+        remove_far(self.fleet, self.obstacles, center[0], center[1], radius)
+        self.status[self.light_edges] = self.lights[iteration + 1]
+        while needed := extend_routes(
+            self.fleet, self.roads, self.status, min_path_length, driving.headway
+        ):
+            self.fleet = more_room(self.fleet, needed)
+            self.scratch = make_scratch(self.fleet, len(self.obstacles.present))
+        agent = -1
+        while (agent := self._step(agent + 1, count, iteration, driving)) < len(self.agents):
+            while move_agent(self.fleet, agent, self.obstacles, self.scratch, driving.headway) < 0:
+                self.obstacles = _longer_curves(self.obstacles)
+
+    def _step(self, first: int, count: int, iteration: int, driving: Driving) -> int:
+        agent: int = step_agents(
+            self.fleet,
+            self.obstacles,
+            count,
+            self.roads,
+            self.stops,
+            self.status,
+            driving,
+            self.spans[iteration],
+            self.scratch,
+            first,
+        )
+        return agent
+
+    def _place(self, ego: FloatArray, tracks: Tracks, row: int) -> int:
+        """Put ego and replayed tracks among the obstacles; returns how many obstacles count."""
+        obstacles, first = self.obstacles, len(self.agents)
+        center = center_poses(ego[None, : HEADING + 1])[0]
+        set_box(obstacles, first, *center, PACIFICA.length, PACIFICA.width)
+        obstacles.speed[first] = np.hypot(ego[VX], ego[VY])
+        present = self.replayed[tracks.valid[row, self.replayed]]
+        set_boxes(obstacles, first + 1, tracks.poses[row, present], tracks.sizes[row, present])
+        count = first + 1 + len(present)
+        if self.moving:
+            velocity = tracks.velocities[row, present]
+            is_agent = tracks.kinds[present] <= LAST_AGENT_KIND
+            speed = np.hypot(velocity[:, 0], velocity[:, 1])
+            obstacles.speed[first + 1 : count] = np.where(is_agent, speed, 0.0)
+            obstacles.heading[first + 1 : count] = np.where(
+                is_agent, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0
+            )
+        return count
+
+    def write(self, tracks: Tracks, row: int) -> None:
+        """Write the agents into a row; those that are gone are not valid there."""
+        tracks.valid[row, self.agents] = self.fleet.alive
+        speed, heading = self.fleet.speed, self.fleet.pose[:, 2]
+        gone = ~self.fleet.alive
+        velocity = np.stack([speed * np.cos(heading), speed * np.sin(heading)], -1)
+        for target, values in (
+            (tracks.poses, self.fleet.pose),
+            (tracks.velocities, velocity),
+            (tracks.sizes, self.fleet.size),
+        ):
+            target[row, self.agents] = np.where(gone[:, None], np.nan, values)
+
+
+def make_scene(
+    scenario: Scenario,
+    fleet: Fleet,
+    starts: list[Start],
+    agents: IntArray,
+    replayed: IntArray,
+    *,
+    moving: bool,
+) -> Scene:
+    """The scene at iteration 0.
+
+    Args:
+        scenario: The scenario.
+        fleet: A agents.
+        starts: Where they are on the map.
+        agents: (A,) their tracks.
+        replayed: (R,) tracks that are replayed from the log.
+        moving: Whether agents know the speed of replayed tracks.
+    """
+    road, count = scenario.map, len(agents)
+    obstacles = _make_obstacles(count, count + 1 + len(replayed))
+    poses = np.array([start.pose for start in starts]).reshape(-1, 3)
+    # the first gaps are measured between snapped boxes, not footprints (§10.2)
+    set_boxes(obstacles, 0, poses, fleet.size)
+    lights = scenario.traffic_lights
+    known = [i for i, name in enumerate(lights.connector_ids) if name in road.edges.index]
+    edges = [road.edges.index[lights.connector_ids[i]] for i in known]
+    seconds = scenario.iteration_times * 1e-6  # nuPlan: a difference of epoch seconds (§12 Q1)
+    return Scene(
+        fleet=fleet,
+        agents=agents,
+        replayed=replayed,
+        roads=roads_of(road),
+        stops=road.stop_polygons.polygons,
+        obstacles=obstacles,
+        scratch=make_scratch(fleet, len(obstacles.present)),
+        light_edges=np.array(edges, np.int64),
+        lights=lights.status[scenario.iteration_rows][:, known].astype(np.int64),
+        status=np.full(len(road.edges), LightStatus.ABSENT, np.int64),
+        spans=np.diff(seconds),
+        moving=moving,
+    )
+
+
+def roads_of(road: VectorMap) -> Roads:
+    """What reactive agents read of a map."""
+    return Roads(
+        road.baselines,
+        road.outgoing,
+        road.speed_limits,
+        road.has_traffic_lights,
+        road.stop_lines,
+    )
+
+
+def make_scratch(fleet: Fleet, num_obstacles: int) -> Scratch:
+    """Room for the kernels, enough for the longest path of the fleet."""
+    points = fleet.path.shape[1] + _EXTRA_POINTS
+    return Scratch(
+        line=np.zeros((points, 2)),
+        keep=np.zeros(points, np.bool_),
+        corridor=np.zeros((curve_room(points), 2)),
+        hits=np.zeros(num_obstacles, np.int64),
+    )
+
+
+def _make_obstacles(num_agents: int, count: int) -> Obstacles:
+    return Obstacles(
+        present=np.zeros(count, np.bool_),
+        bounds=np.zeros((count, 4)),
+        box=np.zeros((count, 4, 2)),
+        speed=np.zeros(count),
+        heading=np.zeros(count),
+        curve=np.zeros((num_agents, _CURVE_ROOM, 2)),
+        curve_size=np.zeros(num_agents, np.int64),
+    )
+
+
+def _longer_curves(obstacles: Obstacles) -> Obstacles:
+    num_agents, room = obstacles.curve.shape[:2]
+    curve = np.zeros((num_agents, 2 * room, 2))
+    curve[:, :room] = obstacles.curve
+    return obstacles._replace(curve=curve)
+
+
+def forget(tracks: Tracks, row: int, which: BoolArray) -> None:
+    """Remove tracks (a mask) from a row on."""
+    tracks.valid[row:, which] = False
+    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+        values[row:, which] = np.nan
