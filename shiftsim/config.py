@@ -224,11 +224,15 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
 
 
 def store_path(name: str) -> Path:
-    """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`)."""
+    """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`).
+
+    A store in the current directory may be named without `./`, unless the name is taken below.
+    """
     path = Path(name).expanduser()
     if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
         return path
-    return Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
+    below = Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
+    return path if (path / "store.json").is_file() and not below.exists() else below
 
 
 def default_workers() -> int:

@@ -16,11 +16,76 @@ _PARTIAL = 3
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
+    _CONVERT.command("nuplan")(nuplan)
     _CONVERT.command("dsc3d")(dsc3d)
     app.add_typer(_CONVERT, name="convert", no_args_is_help=True)
 
 
 Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
+_MAX_NAMED = 20
+
+
+def nuplan(
+    logs: Annotated[Path, typer.Argument(metavar="LOGS", help="Folder of .db logs, or one log.")],
+    maps: Annotated[Path, typer.Argument(metavar="MAPS", help="Folder of the maps.")],
+    store: Store,
+    tokens: Annotated[
+        str | None, typer.Option(help="Only these scenarios: a,b,c, or a file with one per line.")
+    ] = None,
+    types: Annotated[str | None, typer.Option(help="Only these scenario types: a,b,c.")] = None,
+    filter_file: Annotated[
+        Path | None, typer.Option("--filter", help="nuPlan's scenario filter (.yaml).")
+    ] = None,
+    mapping: Annotated[
+        str | None,
+        typer.Option(help="DURATION,OFFSET,RATIO of all, such as 15,0,0.5. [nuPlan's by type]"),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
+    from shiftsim.config import store_path
+    from shiftsim.data.nuplan_convert import convert_nuplan
+    from shiftsim.data.nuplan_mapping import parse_mapping
+
+    folder = store_path(store)
+    with progress_bar(quiet=quiet or as_json) as advance:
+        report = convert_nuplan(
+            logs,
+            maps,
+            folder,
+            tokens=None if tokens is None else _token_list(tokens),
+            types=None if types is None else [word.strip() for word in types.split(",")],
+            filter_file=filter_file,
+            mapping=None if mapping is None else parse_mapping(mapping),
+            progress=advance,
+        )
+    if as_json:
+        from dataclasses import asdict
+
+        say_json(asdict(report))
+    else:
+        for flaw, count in report.flaws.items():
+            say(f" tolerated: {flaw} ({count})")
+        for token, reason in list(report.failed.items())[:_MAX_NAMED]:
+            say(f" failed: {token}: {reason}")
+        say(
+            f" {plural(len(report.converted), 'scenario')} converted, "
+            f"{len(report.unchanged)} unchanged, {len(report.failed)} failed → {folder}"
+        )
+    if report.failed:
+        raise typer.Exit(_PARTIAL)
+
+
+def _token_list(text: str) -> list[str]:
+    """Tokens from a file, or from the words themselves."""
+    path = Path(text)
+    if path.is_file():
+        from shiftsim.splits import read_split
+
+        return list(read_split(path).tokens)
+    return [word.strip() for word in text.split(",")]
 
 
 def dsc3d(

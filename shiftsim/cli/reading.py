@@ -1,5 +1,6 @@
 """Commands that look at things: report, explain, check, planners, verify, doctor."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,7 @@ import typer
 
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
 
-_UNFINISHED, _USAGE, _DATA = 3, 1, 2
+_USAGE, _DATA = 1, 2
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders.")]
@@ -102,13 +103,18 @@ def check(
 
     path = store_path(store)
     problems = check_store(path)
+    num_errors = sum(problem.is_error for problem in problems)
     if as_json:
-        say_json([str(problem) for problem in problems])
+        from dataclasses import asdict
+
+        say_json([asdict(problem) for problem in problems])
     else:
         for problem in problems:
-            say(f" {problem}")
-        say(f"{path}: {plural(len(problems), 'problem')}")
-    if problems:
+            kind = "error" if problem.is_error else "unusual"
+            say(f" {kind}: {problem.where}: {problem.what}")
+        unusual = len(problems) - num_errors
+        say(f"{path}: {plural(num_errors, 'error')}, {unusual} unusual")
+    if num_errors:
         raise typer.Exit(_DATA)
 
 
@@ -149,14 +155,20 @@ def check_one_planner(
     load_planner(planner, arguments)
     scenes = open_named_store(store)
     scenario = scenes.read(token or scenes.tokens[0])
-    findings = check_planner(lambda: load_planner(planner, arguments), scenario)
+    findings = check_planner(partial(load_planner, planner, arguments), scenario)
+    errors = [finding for finding in findings if finding.severity == "error"]
     if as_json:
-        say_json([str(finding) for finding in findings])
+        from dataclasses import asdict
+
+        say_json([asdict(finding) for finding in findings])
     else:
         for finding in findings:
-            say(f" {finding}")
-        say(f"{planner}: {plural(len(findings), 'finding')}")
-    if findings:
+            say(f" {finding.severity}: {finding.check}: {finding.message}")
+            if finding.hint:
+                say(f"   hint: {finding.hint}")
+        verdict = plural(len(errors), "error") if errors else "obeys the contract"
+        say(f"{planner} on scenario {scenario.token}: {verdict}")
+    if errors:
         raise typer.Exit(_USAGE)
 
 

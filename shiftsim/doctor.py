@@ -1,0 +1,114 @@
+"""Does this installation work: versions, memory, and kernels against values of nuPlan's own code.
+
+The few reference values that come with the package are compared by the code that `shiftsim verify`
+uses for whole folders of them.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from shiftsim.config import default_workers
+
+REFERENCE = Path(__file__).parent / "reference"
+MEMORY_PER_WORKER = 0.4e9  # bytes, without torch
+
+Advance = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    Attributes:
+        versions: Of Python and the packages that matter.
+        torch: What learned planners would run on.
+        cores: Cores this process may use.
+        memory: Memory of the machine [bytes], 0 where unknown.
+        workers: Suggested number of worker processes.
+        kernel_cache: Folder of compiled kernels, empty for the default.
+        seconds: How long the checks took, compilation included [s].
+        cases: Reference values compared.
+        mismatches: Those that differ, in words.
+    """
+
+    versions: dict[str, str]
+    torch: str
+    cores: int
+    memory: int
+    workers: int
+    kernel_cache: str
+    seconds: float
+    cases: int
+    mismatches: tuple[str, ...]
+
+    @property
+    def is_well(self) -> bool:
+        """Whether results can be trusted."""
+        return self.cases > 0 and not self.mismatches
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """As text."""
+        packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
+        memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
+        equal = self.cases - len(self.mismatches)
+        return [
+            f" {packages}",
+            f" torch: {self.torch}",
+            f" {self.cores} cores, {memory}, suggested workers {self.workers}",
+            f" kernel cache: {self.kernel_cache or 'next to the source'}",
+            f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
+            *(f" MISMATCH {line}" for line in self.mismatches[:20]),
+        ]
+
+
+def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
+    """Examine this installation; compiles the kernels that are not in the cache yet."""
+    from shiftsim.manifest import versions
+    from shiftsim.verify import verify
+
+    folders = sorted(path for path in REFERENCE.iterdir() if path.is_dir())
+    began = perf_counter()
+    cases, mismatches = 0, []
+    for done, folder in enumerate(folders):
+        advance(done, len(folders), folder.name)
+        report = verify(folder)
+        cases += report.num_cases
+        mismatches += report.mismatches
+    advance(len(folders), len(folders), "")
+    cores, memory = default_workers(), _memory()
+    fitting = int(memory / 2 / MEMORY_PER_WORKER) if memory else cores
+    return Diagnosis(
+        versions=versions(),
+        torch=_torch(),
+        cores=cores,
+        memory=memory,
+        workers=max(1, min(cores, fitting)),
+        kernel_cache=os.environ.get("NUMBA_CACHE_DIR", ""),
+        seconds=perf_counter() - began,
+        cases=cases,
+        mismatches=tuple(mismatches),
+    )
+
+
+def _memory() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 0
+
+
+def _torch() -> str:
+    try:
+        import torch
+    except ImportError:
+        return "not installed (learned planners: pip install 'shiftsim[learned]')"
+    cuda = f"CUDA {torch.version.cuda}" if torch.cuda.is_available() else "no CUDA device"
+    return f"{torch.__version__}, {cuda}"
