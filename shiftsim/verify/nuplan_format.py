@@ -92,9 +92,9 @@ def _compare(field: str, ours: Any, theirs: Any, report: Report) -> None:
         ours, theirs = [str(i) for i in ours], [str(i) for i in theirs]
     tolerance = _TOLERANCES.get(field, 0.0)
     if isinstance(tolerance, tuple):
-        for index, atol in enumerate(tolerance):
-            report.compare("readback", f"{field} {index}", ours[index], theirs[index], atol=atol)
-        report.compare("readback", f"{field} length", len(ours), len(theirs))
+        if report.compare("readback", f"{field} form", np.shape(ours), np.shape(theirs)):
+            for index, (a, b, atol) in enumerate(zip(ours, theirs, tolerance, strict=True)):
+                report.compare("readback", f"{field} {index}", a, b, atol=atol)
         return
     report.compare("readback", field, ours, theirs, atol=tolerance)
 
