@@ -82,7 +82,7 @@ class ScenarioStore:
         if token not in self._row_of:
             raise DataError(
                 f"store {self.path.name!r} has no scenario {token!r}",
-                hint="list the scenarios with: shiftsim scenarios",
+                hint="its `tokens` are the scenarios it has",
             )
         return _window(self._table.slice(self._row_of[token], 1).to_pylist()[0])
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from shiftsim.arrays import IntArray
 from shiftsim.data.nuplan import find_maps, load_map, read_scenario
@@ -199,9 +198,9 @@ def _verify_manifest(folder: Path, entry: dict[str, Any], scene: Scenario, repor
 
 
 def _script_names(folder: Path, scene: str) -> list[str]:
-    table = pq.read_table(folder / "scripted.parquet", columns=["scene", "planner"])
-    pairs = set(zip(table["scene"].to_pylist(), table["planner"].to_pylist(), strict=True))
-    return sorted(planner.removeprefix("scripted_") for name, planner in pairs if name == scene)
+    path = folder / "scripted.parquet"
+    groups = read_groups(path, ("scene", "planner")) if path.exists() else {}
+    return sorted(planner.removeprefix("scripted_") for name, planner in groups if name == scene)
 
 
 def _compare_pose(
