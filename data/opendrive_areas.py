@@ -1,6 +1,6 @@
 """Areas of the map: intersections, drivable area, walkways, car parks, crosswalks."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,7 @@ def group_connectors(
     connectors: Sequence[ConnectorRun],
     polygons: Sequence[shapely.Polygon],
     blocks: Sequence[tuple[int, int]],
+    are_stacked: Callable[[int, int], bool],
 ) -> IntArray:
     """Number of the intersection of each connector.
 
@@ -46,6 +47,7 @@ def group_connectors(
         connectors: Lane connectors.
         polygons: Their areas.
         blocks: Their (from, to) roadblocks.
+        are_stacked: Whether two of them lie on different levels.
     """
     parent = list(range(len(connectors)))
 
@@ -68,7 +70,8 @@ def group_connectors(
                 continue
             if one.source == two.source or one.target == two.target:
                 continue
-            if shapely.intersection(shapes[i], shapes[j]).area > _MIN_OVERLAP:
+            overlap = shapely.intersection(shapes[i], shapes[j]).area
+            if overlap > _MIN_OVERLAP and not are_stacked(i, j):
                 parent[find(i)] = find(j)
     roots = [find(i) for i in range(len(connectors))]
     order = {root: n for n, root in enumerate(dict.fromkeys(roots))}

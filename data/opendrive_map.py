@@ -21,6 +21,12 @@ from shiftsim.data.opendrive_control import (
 from shiftsim.data.opendrive_geometry import ReferenceLine, length_error
 from shiftsim.data.opendrive_graph import DRIVABLE, LaneGraph, Piece, build_lane_graph
 from shiftsim.data.opendrive_lanes import LaneKey, border_is_mirrored
+from shiftsim.data.opendrive_overlaps import (
+    Levels,
+    cut_crossings,
+    overlapping,
+    subtract_overlaps,
+)
 from shiftsim.data.opendrive_records import OpenDrive
 from shiftsim.data.opendrive_shapes import Shapes, bend_ends, lane_polygon, largest_part, widen
 from shiftsim.data.opendrive_speed import speed_limit
@@ -112,13 +118,20 @@ def _placed(od: OpenDrive) -> OpenDrive:
     return replace(od, roads=roads, offset=None)
 
 
+def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
+    chains = [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+    return Shapes(od, [*(piece for chain in chains for piece in chain), *graph.dropped])
+
+
 class _Maker:
     def __init__(
         self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
     ) -> None:
-        self.od, self.graph, self.warnings, self.country = od, graph, warnings, country
-        chains = [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
-        self.shapes = Shapes(od, [*(p for chain in chains for p in chain), *graph.dropped])
+        self.od, self.warnings, self.country = od, warnings, country
+        self.graph, crossings = cut_crossings(od, graph, _shapes_of(od, graph))
+        if crossings:
+            warnings["lanes that cross without a junction, made an intersection"] += crossings
+        self.shapes = _shapes_of(od, self.graph)
         self._next_id = 0
 
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
@@ -140,9 +153,16 @@ class _Maker:
                 for layer, specs in layers.items()
             },
         )
-        checks, figures = check_map(vector_map, set())
+        checks, figures = check_map(vector_map, self._stacked_ids())
         report = MapReport(dict(self.warnings), tuple(self._origins()), checks, figures)
         return vector_map, report
+
+    def _stacked_ids(self) -> set[tuple[str, str]]:
+        """Pairs of lanes, and of roadblocks, that lie on different levels."""
+        lanes = self.graph.lanes
+        pairs = {(self.lane_ids[i], self.lane_ids[j]) for i, j in self.stacked}
+        blocks = [(lanes[i].block, lanes[j].block) for i, j in self.stacked]
+        return pairs | {(self.block_ids[min(b)], self.block_ids[max(b)]) for b in blocks}
 
     def _new_ids(self, count: int) -> list[str]:
         first = self._next_id
@@ -151,7 +171,13 @@ class _Maker:
 
     def _shape_lanes(self) -> None:
         self.lane_borders = [self.shapes.joined_borders(lane.pieces) for lane in self.graph.lanes]
-        self.lane_polygons = [lane_polygon(*borders) for borders in self.lane_borders]
+        polygons = [lane_polygon(*borders) for borders in self.lane_borders]
+        levels = Levels(self.od, self.shapes, [lane.pieces for lane in self.graph.lanes], polygons)
+        self.stacked = {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
+        lengths = [sum(piece.length for piece in lane.pieces) for lane in self.graph.lanes]
+        self.lane_polygons, overlaps = subtract_overlaps(polygons, lengths, self.stacked)
+        if overlaps:
+            self.warnings["overlap of two lanes, taken from the longer one"] += overlaps
         self.lane_lines = [self.shapes.baseline(lane.pieces) for lane in self.graph.lanes]
 
     def _shape_connectors(self) -> None:
@@ -175,7 +201,12 @@ class _Maker:
         self.pairs = [(lanes[c.source].block, lanes[c.target].block) for c in connectors]
         pairs = sorted(set(self.pairs))
         self.pair_ids = dict(zip(pairs, self._new_ids(len(pairs)), strict=True))
-        self.groups = areas.group_connectors(connectors, self.connector_polygons, self.pairs)
+        levels = Levels(
+            self.od, self.shapes, [c.pieces for c in connectors], self.connector_polygons
+        )
+        self.groups = areas.group_connectors(
+            connectors, self.connector_polygons, self.pairs, levels.are_stacked
+        )
         self.group_ids = self._new_ids(int(self.groups.max(initial=-1)) + 1)
         self.stop_lines = stop_lines(
             self.od, self.graph, self.shapes, self.controls, self.lane_polygons
@@ -255,18 +286,31 @@ class _Maker:
         members = defaultdict(list)
         for number, lane in enumerate(self.graph.lanes):
             members[lane.block].append(number)
-        for block, numbers in sorted(members.items()):
-            union = shapely.union_all([self.lane_polygons[i] for i in numbers])
-            if not isinstance(union, shapely.Polygon):
-                left, right = self.lane_borders[numbers[0]][0], self.lane_borders[numbers[-1]][1]
-                union = shapely.union(union, lane_polygon(left, right))
+        order = sorted(members)
+        polygons = [self._roadblock_polygon(members[block]) for block in order]
+        stacked = {
+            (min(pair), max(pair))
+            for pair in (
+                (self.graph.lanes[i].block, self.graph.lanes[j].block) for i, j in self.stacked
+            )
+        }
+        polygons, _ = subtract_overlaps(polygons, [p.area for p in polygons], stacked)
+        for block, polygon in zip(order, polygons, strict=True):
             yield BlockSpec(
                 id=self.block_ids[block],
                 is_connector=False,
-                polygon=largest_part(union),
+                polygon=polygon,
                 incoming=[i for pair, i in self.pair_ids.items() if pair[1] == block],
                 outgoing=[i for pair, i in self.pair_ids.items() if pair[0] == block],
             )
+
+    def _roadblock_polygon(self, lanes: Sequence[int]) -> shapely.Polygon:
+        """The area of some lanes, with what lies between them where they do not touch."""
+        union = shapely.union_all([self.lane_polygons[i] for i in lanes])
+        if not isinstance(union, shapely.Polygon):
+            left, right = self.lane_borders[lanes[0]][0], self.lane_borders[lanes[-1]][1]
+            union = shapely.union(union, lane_polygon(left, right))
+        return largest_part(union)
 
     def _block_connector_specs(self) -> Iterator[BlockSpec]:
         members = defaultdict(list)
