@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import ConfigError
+from shiftsim.config import one_of
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.results import Run
 
 COLUMNS = {"cls": "CLS"} | {n: short for n, short in SHORT_NAMES.items() if n != "score"}
+GROUPINGS = ("scenario_type", "seed")
 FORMATS = ("text", "md", "csv", "latex")
 _REASONS = {
     "no_ego_at_fault_collisions": "at-fault collision",
@@ -70,7 +71,7 @@ def score_rows(run: Run, *, by: str | None = None) -> list[ScoreRow]:
     scores = {tuple(row[n] for n in _KEY): row for row in run.scores.to_pylist()}
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for task in run.tasks.to_pylist():
-        labels = (task["planner"], task["noise"], *([task[by]] if by else []))
+        labels = (task["planner"], task["noise"], *([str(task[by])] if by else []))
         groups.setdefault(labels, []).append(task)
     config = run.manifest["config"]
 
@@ -131,8 +132,9 @@ def score_table(
     Returns:
         The table; threshold profile, metric version and scenario count stand with it.
     """
-    if style not in FORMATS:
-        raise ConfigError(f"format {style!r} unknown", hint=f"available: {', '.join(FORMATS)}")
+    one_of("format", style, FORMATS)
+    if by is not None:
+        one_of("column", by, GROUPINGS)
     lines: list[list[str]] = []
     captions = []
     for run in runs:

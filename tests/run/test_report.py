@@ -1,0 +1,87 @@
+"""Score tables: plain means, and never a number that looks complete and is not."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from shiftsim.errors import ConfigError
+from shiftsim.report import FORMATS, failures, score_rows, score_table, summary, worst_rollouts
+
+
+def test_the_score_is_the_plain_mean_of_the_scenarios(clean_run):
+    row = score_rows(clean_run)[0]
+    expected = [
+        r["cls"]
+        for r in clean_run.scores.to_pylist()
+        if (r["planner"], r["noise"]) == row.labels == ("constant-velocity", "none")
+    ]
+    assert len(expected) == 4
+    assert row.means["cls"] == pytest.approx(np.mean(expected), abs=1e-15)
+    assert row.deviations == {}
+
+
+def test_the_deviation_is_over_the_means_of_the_seeds(clean_run):
+    row = next(r for r in score_rows(clean_run) if r.labels == ("log-future", "ou-high"))
+    means = [
+        np.mean(
+            [
+                r["cls"]
+                for r in clean_run.scores.to_pylist()
+                if (r["planner"], r["noise"], r["seed"]) == (*row.labels, seed)
+            ]
+        )
+        for seed in (0, 1)
+    ]
+    assert row.means["cls"] == pytest.approx(np.mean(means), abs=1e-12)
+    assert row.deviations["cls"] == pytest.approx(np.std(means, ddof=1), abs=1e-12)
+
+
+def test_rows_stand_in_the_order_of_the_settings(clean_run):
+    assert [row.labels for row in score_rows(clean_run)] == [
+        ("constant-velocity", "none"),
+        ("constant-velocity", "ou-high"),
+        ("log-future", "none"),
+        ("log-future", "ou-high"),
+    ]
+
+
+def test_rows_can_be_split_by_scenario_type(clean_run):
+    rows = score_rows(clean_run, by="scenario_type")
+    assert [row.labels[2] for row in rows[:2]] == ["free", "parked"]
+    assert all(row.num_scenarios == 2 for row in rows)
+
+
+@pytest.mark.parametrize("style", FORMATS)
+def test_profile_version_and_scenario_count_stand_with_every_table(clean_run, style):
+    text = score_table([clean_run], style=style)
+    assert "thresholds nuplan" in text
+    assert "metrics v" in text
+    assert "4 scenarios" in text
+
+
+def test_csv_has_unrounded_numbers(clean_run):
+    rows = list(csv.DictReader(io.StringIO(score_table([clean_run], style="csv"))))
+    assert float(rows[0]["CLS"]) == 100.0 * score_rows(clean_run)[0].means["cls"]
+
+
+def test_an_unknown_format_or_column_is_refused(clean_run):
+    with pytest.raises(ConfigError, match="format 'pdf' unknown"):
+        score_table([clean_run], style="pdf")
+    with pytest.raises(ConfigError, match="colour"):
+        score_table([clean_run], by="colour")
+
+
+def test_the_worst_rollouts_come_with_a_reason(clean_run):
+    worst = worst_rollouts(clean_run, 3)
+    assert [row["cls"] for row in worst] == sorted(clean_run.scores["cls"].to_pylist())[:3]
+    assert all(row["reason"] for row in worst if row["cls"] < 1.0)
+
+
+def test_the_summary_is_json_and_complete(clean_run):
+    found = summary(clean_run)
+    assert found["counts"]["ok"] == 24
+    assert found["failures"] == failures(clean_run) == []
+    assert found["scores"][0]["mean"]["cls"] == score_rows(clean_run)[0].means["cls"]
+    assert found["scores"][0]["partial_mean"] is None
