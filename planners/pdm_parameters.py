@@ -1,0 +1,99 @@
+"""Numbers of PDM-Closed (pdm-closed.md §1). Defaults are those of the official configuration."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.errors import ConfigError
+
+DT = 0.1  # s, between the states of a plan
+STEP_US = 100_000
+STEPS = 80  # of the plan
+SCORED = 40  # of a proposal, as far as proposals are compared
+EGO_STOPPED = TRACK_STOPPED = 5e-2  # m/s
+TTC_STOPPED = 5e-3  # m/s
+
+
+class FollowingModel(NamedTuple):
+    """Parameters of the batch IDM policy.
+
+    Attributes:
+        min_gap: Gap kept at standstill [m].
+        headway: Time gap kept [s].
+        accel_max: Largest acceleration [m/s^2].
+        decel_max: Largest deceleration, positive [m/s^2].
+        exponent: Of the ratio between speed and target speed.
+    """
+
+    min_gap: float = 1.0
+    headway: float = 1.5
+    accel_max: float = 1.5
+    decel_max: float = 3.0
+    exponent: float = 10.0  # nuPlan's own IDM uses 4 (pdm-closed.md §11 Q1)
+
+
+class ComfortBounds(NamedTuple):
+    """Open intervals of the comfort test; the last four are symmetric."""
+
+    lon_accel_min: float = -4.05  # m/s^2
+    lon_accel_max: float = 2.40  # m/s^2
+    lat_accel: float = 4.89  # m/s^2
+    jerk: float = 8.37  # m/s^3
+    lon_jerk: float = 4.13  # m/s^3
+    yaw_accel: float = 1.93  # rad/s^2
+    yaw_rate: float = 0.95  # rad/s
+
+
+@dataclass(frozen=True, slots=True)
+class PdmParameters:
+    """What a user may change.
+
+    Attributes:
+        speed_fractions: Target speeds as shares of the lane's limit, slowest first.
+        fallback_velocity: Stands in for a missing limit [m/s].
+        lateral_offsets: Of the paths beside the centerline, left is positive [m].
+        following: The longitudinal policy.
+        map_radius: Objects nearer than this are seen; half side of the map square [m].
+        max_static: Most static objects that are seen.
+        max_vehicles: Most vehicles that are seen.
+        max_pedestrians: Most pedestrians that are seen.
+        max_bicycles: Most bicycles that are seen.
+        progress_weight: Of the score.
+        ttc_weight: Of the score.
+        comfort_weight: Of the score.
+        comfort: Bounds of the comfort test.
+        direction_limits: Oncoming travel up to which the factor is 1, and 0.5 [m].
+        brake_time: An at-fault collision within this brakes [s], if
+        brake_speed: the ego is not faster than this [m/s].
+    """
+
+    speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    fallback_velocity: float = 15.0
+    lateral_offsets: tuple[float, ...] = (-1.0, 1.0)
+    following: FollowingModel = field(default_factory=FollowingModel)
+    map_radius: float = 50.0
+    max_static: int = 50
+    max_vehicles: int = 50
+    max_pedestrians: int = 25
+    max_bicycles: int = 10
+    progress_weight: float = 5.0
+    ttc_weight: float = 5.0
+    comfort_weight: float = 2.0
+    comfort: ComfortBounds = field(default_factory=ComfortBounds)
+    direction_limits: tuple[float, float] = (2.0, 6.0)
+    brake_time: float = 2.0
+    brake_speed: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.speed_fractions or not np.isfinite(self.speed_fractions).all():
+            raise ConfigError(
+                f"pdm-closed: speed_fractions={self.speed_fractions!r} must be finite numbers",
+                hint="for example (0.2, 0.4, 0.6, 0.8, 1.0)",
+            )
+        for name in ("fallback_velocity", "map_radius"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"pdm-closed: {name}={getattr(self, name)!r} must be positive")
+
+
+DEFAULT = PdmParameters()

@@ -1,0 +1,315 @@
+"""Scores of PDM-Closed's proposals, on their driven states (pdm-closed.md §8).
+
+Array axes: P proposals, T = 41 time indices, M occupants.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, kernel
+from shiftsim.geometry import (
+    EXTERIOR,
+    box_corners,
+    convex_intersect,
+    locate_in_ring,
+    segments_intersect,
+)
+from shiftsim.layers import Polygons, in_any
+from shiftsim.planners.pdm_areas import Areas, ego_areas
+from shiftsim.planners.pdm_comfort import Filters, comfort
+from shiftsim.planners.pdm_forecast import LIGHT, Occupants, centroid, place_ring
+from shiftsim.planners.pdm_parameters import (
+    EGO_STOPPED,
+    TRACK_STOPPED,
+    TTC_STOPPED,
+    PdmParameters,
+)
+from shiftsim.planners.pdm_path import PdmPath, project
+from shiftsim.state import HEADING, LAST_AGENT_KIND, VX, VY, VehicleParameters, X, Y
+
+TTC_STEPS = (0, 3, 6, 9)  # how far ahead a pose is projected
+BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)  # rad, bearings from the rear axle
+NEVER = np.inf
+MIN_PROGRESS = 0.1  # m, of the best proposal; below it progress is not compared
+
+
+class Scores(NamedTuple):
+    """Scores of P proposals.
+
+    Attributes:
+        total: (P,) the score.
+        no_collision: (P,) factor: 0, 0.5 or 1.
+        drivable: (P,) factor: 0 or 1.
+        direction: (P,) factor: 0, 0.5 or 1.
+        progress: (P,) in [0, 1].
+        ttc: (P,) 0 or 1.
+        comfort: (P,) 0 or 1.
+        raw_progress: (P,) along the centerline, before factors [m].
+        collision_index: (P,) first time index of an at-fault collision, inf if none.
+        ttc_index: (P,) first time index of a violation, inf if none.
+        areas: (P, T, 3) on multiple lanes, off the road, on no lane of the route.
+    """
+
+    total: FloatArray
+    no_collision: FloatArray
+    drivable: FloatArray
+    direction: FloatArray
+    progress: FloatArray
+    ttc: FloatArray
+    comfort: FloatArray
+    raw_progress: FloatArray
+    collision_index: FloatArray
+    ttc_index: FloatArray
+    areas: BoolArray
+
+
+class Road(NamedTuple):
+    """The map as the scorer sees it.
+
+    Attributes:
+        areas: Lanes, connectors and car parks.
+        admitted: (M,) those of this step.
+        intersections: Areas where what is beside the ego counts as well.
+        centerline: Progress is measured along it.
+    """
+
+    areas: Areas
+    admitted: BoolArray
+    intersections: Polygons
+    centerline: PdmPath
+
+
+def score(
+    states: FloatArray,
+    road: Road,
+    occupants: Occupants,
+    vehicle: VehicleParameters,
+    params: PdmParameters,
+    filters: Filters,
+) -> Scores:
+    """Score P proposals by their driven states (P, T, 11)."""
+    count, steps = states.shape[:2]
+    corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
+    size = (vehicle.length, vehicle.width, vehicle.rear_axle_to_center)
+    place_ego(states, size, corners, centers)
+    areas = np.empty((count, steps, 3), np.bool_)
+    ego_areas(road.areas, road.admitted, corners, centers, areas)
+    no_collision, collision_index = np.empty(count), np.empty(count)
+    _collisions(states, corners, areas, occupants, no_collision, collision_index)
+    ttc, ttc_index = np.empty(count), np.empty(count)
+    _times_to_collision(states, corners, areas, occupants, road.intersections, ttc, ttc_index)
+    raw, oncoming = np.empty(count), np.empty(count)
+    _travel(centers, areas, road.centerline, raw, oncoming)
+    signals, bounded = np.empty((count, 6, steps)), np.empty((count, 6), np.bool_)
+    comfort(states, filters, params.comfort, signals, bounded)
+    low, high = params.direction_limits
+    direction = np.where(oncoming < low, 1.0, np.where(oncoming < high, 0.5, 0.0))
+    drivable = np.where(areas[:, :, 1].any(axis=1), 0.0, 1.0)
+    factor = no_collision * drivable * direction
+    progress = normalise(raw, factor)
+    comfortable = bounded.all(axis=1).astype(np.float64)
+    weights = (params.progress_weight, params.ttc_weight, params.comfort_weight)
+    weighted = (weights[0] * progress + weights[1] * ttc + weights[2] * comfortable) / sum(weights)
+    return Scores(
+        factor * weighted,
+        no_collision,
+        drivable,
+        direction,
+        progress,
+        ttc,
+        comfortable,
+        raw,
+        collision_index,
+        ttc_index,
+        areas,
+    )
+
+
+def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
+    """(P,) progress in [0, 1] from metres and the product of the factors (§8.5)."""
+    # nuPlan: a factor shortens the progress first and scales the score again (§11 Q12)
+    valid = raw * factor
+    most = float(valid.max())
+    if most > MIN_PROGRESS:
+        return valid / most
+    return np.where(factor > 0.0, 1.0, 0.0)
+
+
+@kernel
+def place_ego(
+    states: FloatArray, size: tuple[float, float, float], corners: FloatArray, centers: FloatArray
+) -> None:
+    """Write corners (P, T, 4, 2) and centres (P, T, 2) of driven states (P, T, 11) [m].
+
+    `size` is length, width, rear axle to centre.
+    """
+    for row in range(states.shape[0]):
+        for step in range(states.shape[1]):
+            heading = states[row, step, HEADING]
+            x = states[row, step, X] + size[2] * np.cos(heading)
+            y = states[row, step, Y] + size[2] * np.sin(heading)
+            centers[row, step, 0], centers[row, step, 1] = x, y
+            box_corners(x, y, heading, size[0], size[1], corners[row, step])
+
+
+@kernel
+def bearing(state: FloatArray, x: float, y: float) -> float:
+    """Angle between the heading and the direction from the rear axle to a point, in [0, pi].
+
+    nuPlan: the cosine is not clamped, so an object exactly ahead or behind may have the bearing NaN,
+    and every comparison with it is false (pdm-closed.md §11 Q23).
+    """
+    dx, dy = x - state[X], y - state[Y]
+    distance = np.sqrt(dx * dx + dy * dy)
+    along = np.cos(state[HEADING]) * (dx / distance) + np.sin(state[HEADING]) * (dy / distance)
+    return np.arccos(along)
+
+
+@kernel
+def _can_touch(occupants: Occupants, index: int, forecast: int, corners: FloatArray) -> bool:
+    """Whether the circle around an occupant reaches the one around a box (4, 2)."""
+    seconds = 0.1 * (2 * forecast)
+    x = occupants.circles[index, 0] + seconds * occupants.motion[index, 0]
+    y = occupants.circles[index, 1] + seconds * occupants.motion[index, 1]
+    dx = x - 0.5 * (corners[0, 0] + corners[2, 0])
+    dy = y - 0.5 * (corners[0, 1] + corners[2, 1])
+    across = abs(corners[0, 0] - corners[2, 0]) + abs(corners[0, 1] - corners[2, 1])
+    reach = occupants.circles[index, 2] + across
+    return dx * dx + dy * dy <= reach * reach
+
+
+@kernel
+def _front_touches(corners: FloatArray, ring: FloatArray) -> bool:
+    """Whether the front bumper of a box (4, 2) touches the area of a convex ring (4, 2)."""
+    if locate_in_ring(ring, corners[0, 0], corners[0, 1]) != EXTERIOR:
+        return True
+    for index in range(4):
+        if segments_intersect(corners[0], corners[3], ring[index - 1], ring[index]):
+            return True
+    return False
+
+
+@kernel
+def _collisions(
+    states: FloatArray,
+    corners: FloatArray,
+    areas: BoolArray,
+    occupants: Occupants,
+    scores: FloatArray,
+    first: FloatArray,
+) -> None:
+    """At-fault collisions (§8.2): factors and first time indices (P,), into the last two."""
+    ring = np.empty((4, 2))
+    count = len(occupants.kinds)
+    forgiven = np.empty(count, np.bool_)
+    for row in range(len(states)):
+        scores[row], first[row] = 1.0, NEVER
+        for index in range(count):
+            forgiven[index] = occupants.ignored[index] or occupants.kinds[index] == LIGHT
+        for step in range(states.shape[1]):
+            box = corners[row, step]
+            for index in range(count):
+                if forgiven[index] or not _can_touch(occupants, index, step // 2, box):
+                    continue
+                place_ring(occupants, index, step // 2, ring)
+                if not convex_intersect(box, ring):
+                    continue
+                state = states[row, step]
+                is_agent = occupants.kinds[index] <= LAST_AGENT_KIND
+                if np.hypot(state[VX], state[VY]) <= EGO_STOPPED:
+                    at_fault = False
+                elif not is_agent or occupants.speeds[index] <= TRACK_STOPPED:
+                    at_fault = True
+                else:
+                    x, y = centroid(ring)
+                    if bearing(state, x, y) > BEHIND:
+                        at_fault = False
+                    elif _front_touches(box, ring):
+                        at_fault = True
+                    else:
+                        at_fault = areas[row, step, 0] or areas[row, step, 1]
+                if at_fault:
+                    scores[row] = min(scores[row], 0.0 if is_agent else 0.5)
+                    first[row] = min(first[row], float(step))
+                else:
+                    forgiven[index] = True
+
+
+@kernel
+def _times_to_collision(
+    states: FloatArray,
+    corners: FloatArray,
+    areas: BoolArray,
+    occupants: Occupants,
+    intersections: Polygons,
+    scores: FloatArray,
+    first: FloatArray,
+) -> None:
+    """Time to collision (§8.6): scores and first time indices (P,), into the last two."""
+    ring, box = np.empty((4, 2)), np.empty((4, 2))
+    count = len(occupants.kinds)
+    forgiven = np.empty(count, np.bool_)
+    for row in range(len(states)):
+        scores[row], first[row] = 1.0, NEVER
+        for index in range(count):
+            forgiven[index] = occupants.ignored[index] or occupants.kinds[index] == LIGHT
+        for step in range(states.shape[1]):
+            state = states[row, step]
+            speed = np.hypot(state[VX], state[VY])
+            if speed < TTC_STOPPED:
+                continue
+            for ahead in TTC_STEPS:
+                travel = 0.1 * ahead * speed
+                for corner in range(4):
+                    box[corner, 0] = corners[row, step, corner, 0] + travel * np.cos(state[HEADING])
+                    box[corner, 1] = corners[row, step, corner, 1] + travel * np.sin(state[HEADING])
+                forecast = (step + ahead) // 2
+                for index in range(count):
+                    if forgiven[index] or not _can_touch(occupants, index, forecast, box):
+                        continue
+                    place_ring(occupants, index, forecast, ring)
+                    if not convex_intersect(box, ring):
+                        continue
+                    x, y = centroid(ring)
+                    angle = bearing(state, x, y)
+                    is_violation = angle < AHEAD
+                    if not is_violation and not angle > BEHIND:
+                        is_violation = (
+                            areas[row, step, 0]
+                            or areas[row, step, 1]
+                            or in_any(intersections, state[X], state[Y])
+                        )
+                    if is_violation:
+                        scores[row] = 0.0
+                        first[row] = min(first[row], float(step))
+                    else:
+                        forgiven[index] = True
+            if scores[row] == 0.0:
+                break
+
+
+@kernel
+def _travel(
+    centers: FloatArray,
+    areas: BoolArray,
+    centerline: PdmPath,
+    progress: FloatArray,
+    oncoming: FloatArray,
+) -> None:
+    """Progress along the centerline (§8.5) and longest way off the route (§8.3), both (P,) [m]."""
+    last = centers.shape[1] - 1
+    for row in range(len(centers)):
+        start = project(centerline, centers[row, 0, 0], centers[row, 0, 1], 0)
+        end = project(centerline, centers[row, last, 0], centers[row, last, 1], start[2])
+        progress[row] = max(0.0, end[0] - start[0])
+        longest = stretch = 0.0
+        for step in range(last + 1):
+            if not areas[row, step, 2]:
+                stretch = 0.0
+            elif step > 0:
+                dx = centers[row, step, 0] - centers[row, step - 1, 0]
+                dy = centers[row, step, 1] - centers[row, step - 1, 1]
+                stretch += np.hypot(dx, dy)
+            longest = max(longest, stretch)
+        oncoming[row] = longest
