@@ -20,6 +20,9 @@ def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float
     left = (ax - cx) * (by - cy)
     right = (ay - cy) * (bx - cx)
     det = left - right
+    if left == 0.0 or right == 0.0:
+        # a product is zero only where a difference is, and differences have the right sign
+        return 0 if det == 0.0 else (1 if det > 0.0 else -1)
     if abs(det) > _ERROR_BOUND * (abs(left) + abs(right)):
         return 1 if det > 0.0 else -1
     return _exact_orientation(ax, ay, bx, by, cx, cy)
