@@ -16,6 +16,7 @@ from shiftsim.map import VectorMap
 
 _MAX_AT_POINT = 16  # blocks looked at per point
 _MAX_GAP_BLOCKS = 3  # blocks that a repair may add in one gap
+_MIN_BLOCKS = 2  # that nuPlan's own route planners ask for; a longer road ahead does not replace it
 _MAX_POINTS = 2000  # moving vehicles looked at for the placement of the map
 _MAX_CELLS = 1_000_000  # of the raster that finds a better placement
 
@@ -179,7 +180,9 @@ def _extend(
     edge = _edge_on(road, driven[-1], last_pose)
     ahead = road.baselines.length(edge) - road.progress_on(edge, last_pose[0], last_pose[1])
     added: list[int] = []
-    while ahead < config.route_extension and len(added) < config.route_extension_blocks:
+    while len(added) < config.route_extension_blocks and (
+        ahead < config.route_extension or len(driven) + len(added) < _MIN_BLOCKS
+    ):
         following = [
             e
             for e in road.outgoing.at(edge).tolist()

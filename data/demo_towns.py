@@ -118,11 +118,19 @@ class _Arm:
     width: float  # m
     limit: float  # km/h
     is_main: bool
+    crosswalk: tuple[float, float] = (3.0, 7.0)  # m along the arm
+    parking: float = 0.0  # m, width of a parking lane on both sides
+    radius: float = 16.0  # m from the centre of the junction
+    has_stop_sign: bool = True
+
+    @property
+    def half(self) -> float:
+        """Half the carriageway, parking included [m]."""
+        return self.lanes * self.width + self.parking
 
 
-_RADIUS = 16.0  # m from the centre of the junction to its arms
-_CROSSWALK = (3.0, 7.0)  # m along an arm
-_STOP = 9.0  # m along an arm, where vehicles wait
+_STOP = 9.0  # m along an arm, where vehicles wait at a junction
+_PARKING_STEP = 6.6  # m between parked cars
 
 
 def junction_town() -> Town:
@@ -153,7 +161,57 @@ def junction_town() -> Town:
             False,
         ),
     )
-    town = Town(RoadNetwork("junction"))
+    return _make_town("junction", arms)
+
+
+def street_town() -> Town:
+    """A winding street with cars parked on both sides, and a side street."""
+    width, parking, radius = 3.4, 2.3, 12.0
+    street = {"parking": parking, "radius": radius, "has_stop_sign": False}
+    arms = (
+        _Arm(
+            "east",
+            1,
+            0.0,
+            (
+                line(22.0),
+                *bend(1.1, 1 / 50, 18.0),
+                line(38.0),
+                *bend(-0.8, -1 / 55, 18.0),
+                line(20.0),
+            ),
+            1,
+            width,
+            30.0,
+            True,
+            crosswalk=(84.0, 88.0),
+            **street,
+        ),
+        _Arm("side", 2, np.pi / 2, (line(45.0),), 1, 3.2, 20.0, False, radius=radius + 2.0),
+        _Arm(
+            "west",
+            3,
+            np.pi,
+            (
+                line(18.0),
+                *bend(-0.9, -1 / 52, 18.0),
+                line(30.0),
+                *bend(0.7, 1 / 60, 16.0),
+                line(25.0),
+            ),
+            1,
+            width,
+            30.0,
+            True,
+            crosswalk=(9.0, 13.0),
+            **street,
+        ),
+    )
+    return _make_town("street", arms)
+
+
+def _make_town(name: str, arms: tuple[_Arm, ...]) -> Town:
+    town = Town(RoadNetwork(name))
     for arm in arms:
         town.network.roads[arm.id] = _arm_road(arm, town.network.junction)
     lines: dict[int, FloatArray] = {}
@@ -165,80 +223,42 @@ def junction_town() -> Town:
         for b, line_b in lines.items():
             if a != b and _closest(line_a, line_b) < 2.9 and not _same_lane(town.network, a, b):
                 town.conflicts.add((a, b))
+    parked = [_parking(town.network.roads[arm.id], arm) for arm in arms if arm.parking > 0.0]
+    town.parking = np.concatenate([town.parking, *parked])
     for arm in arms:
-        _add_walks(town, town.network.roads[arm.id], arm.lanes * arm.width, _CROSSWALK)
+        _add_walks(town, town.network.roads[arm.id], arm)
     return town
 
 
-def street_town() -> Town:
-    """A winding street: one lane per direction, parking on both sides, a crosswalk."""
-    walk = (128.0, 132.0)
-    width, parking = 3.2, 2.3
-    side = width + parking
-    road = RoadSpec(
-        1,
-        (0.0, 0.0, 0.2),
-        (
-            line(35.0),
-            *bend(1.3, 1 / 32, 16.0),
-            line(65.0),
-            *bend(-1.5, -1 / 36, 16.0),
-            line(50.0),
-            *bend(0.7, 1 / 45, 14.0),
-            line(20.0),
-        ),
-        tuple(
-            LaneSpec(sign * number, kind, wide)
-            for sign in (1, -1)
-            for number, kind, wide in (
-                (1, "driving", width),
-                (2, "parking", parking),
-                (3, "sidewalk", _SIDEWALK),
-            )
-        ),
-        30.0,
-        crosswalks=(CrosswalkSpec("crosswalk_1", *walk, side),),
-    )
-    town = Town(RoadNetwork("street", {1: road}))
-    s = np.arange(0.0, road.length, STEP)
-    ahead, back = road.center_of(-1, s), road.center_of(1, s)[::-1]
-    for name, lane, points in (("ahead", -1, ahead), ("back", 1, back)):
-        path = _make_path([points[:, :2]], [30.0])
-        first, last = sorted(
-            _arc_at(path.points, road.center_of(lane, np.array([end]))[0, :2]) for end in walk
-        )
-        town.paths[name] = replace(path, crosswalks=(("crosswalk_1", first, last),))
-    for name in ("ahead", "back"):
-        town.paths[f"{name}-bicycle"] = _shifted(town.paths[name], -0.9)
-    _add_walks(town, road, side, walk)
-    places = np.array(
-        [s for s in np.arange(12.0, road.length - 12.0, 6.6) if not 118.0 < s < 142.0]
-    )
-    right, left = road.center_of(-2, places), road.center_of(2, places)
+def _parking(road: RoadSpec, arm: _Arm) -> FloatArray:
+    """(n, 3) poses of parked cars, away from crosswalk and junction."""
+    first, last = arm.crosswalk
+    places = np.arange(14.0, road.length - 8.0, _PARKING_STEP)
+    places = places[(places < first - 9.0) | (places > last + 9.0)]
+    lane = arm.lanes + 1
+    right, left = road.center_of(-lane, places), road.center_of(lane, places)
     left[:, 2] += np.pi
-    town.parking = np.concatenate([right, left])
-    return town
+    return np.concatenate([right, left])
 
 
 def _arm_road(arm: _Arm, junction: int) -> RoadSpec:
     cos, sin = np.cos(arm.angle), np.sin(arm.angle)
-    half = arm.lanes * arm.width
+    lanes = [("driving", arm.width)] * arm.lanes
+    lanes += [("parking", arm.parking)] if arm.parking > 0.0 else []
+    lanes += [("sidewalk", _SIDEWALK)]
     return RoadSpec(
         arm.id,
-        (float(_RADIUS * cos), float(_RADIUS * sin), float(arm.angle)),
+        (float(arm.radius * cos), float(arm.radius * sin), float(arm.angle)),
         arm.pieces,
         tuple(
             LaneSpec(sign * number, kind, width)
             for sign in (1, -1)
-            for number, kind, width in (
-                *((n + 1, "driving", arm.width) for n in range(arm.lanes)),
-                (arm.lanes + 1, "sidewalk", _SIDEWALK),
-            )
+            for number, (kind, width) in enumerate(lanes, start=1)
         ),
         arm.limit,
         predecessor=("junction", junction, ""),
-        crosswalks=(CrosswalkSpec(f"crosswalk_{arm.id}", *_CROSSWALK, half),),
-        stop_sign=None if arm.is_main else _STOP,
+        crosswalks=(CrosswalkSpec(f"crosswalk_{arm.id}", *arm.crosswalk, arm.half),),
+        stop_sign=_STOP if arm.has_stop_sign and not arm.is_main else None,
     )
 
 
@@ -270,7 +290,6 @@ def _connect_arms(town: Town, source: _Arm, target: _Arm, lines: dict[int, Float
             [source.limit, min(source.limit, target.limit), target.limit],
         )
         entry, exit = _arc_at(path.points, inner[0]), _arc_at(path.points, inner[-1])
-        first, last = _CROSSWALK
         path = replace(
             path,
             entry=entry,
@@ -279,15 +298,22 @@ def _connect_arms(town: Town, source: _Arm, target: _Arm, lines: dict[int, Float
             connector=number,
             rank=rank,
             crosswalks=(
-                (f"crosswalk_{source.id}", entry - last, entry - first),
-                (f"crosswalk_{target.id}", exit + first, exit + last),
+                _crossing(path, into, source, from_lane),
+                _crossing(path, out, target, -to_lane),
             ),
             origin=f"{source.name}{from_lane}",
         )
         name = f"{source.name}{from_lane}-{target.name}"
         town.paths[name] = path
         if from_lane == source.lanes:
-            town.paths[f"{name}-bicycle"] = _shifted(path, -1.0)
+            town.paths[f"{name}-bicycle"] = _shifted(path, -0.9)
+
+
+def _crossing(path: Path, road: RoadSpec, arm: _Arm, lane: int) -> tuple[str, float, float]:
+    """Name of an arm's crosswalk, and where a path along one of its lanes meets it."""
+    ends = road.center_of(lane, np.array(arm.crosswalk))
+    first, last = sorted(_arc_at(path.points, end[:2]) for end in ends)
+    return f"crosswalk_{arm.id}", first, last
 
 
 def _connecting_road(
@@ -311,9 +337,9 @@ def _connecting_road(
     )
 
 
-def _add_walks(town: Town, road: RoadSpec, half: float, walk: tuple[float, float]) -> None:
+def _add_walks(town: Town, road: RoadSpec, arm: _Arm) -> None:
     """Ways over the crosswalk of a road, and along its sidewalks."""
-    middle = 0.5 * (walk[0] + walk[1])
+    half, middle = arm.half, 0.5 * sum(arm.crosswalk)
     far = min(middle + 30.0, road.length - 3.0)
     for name, sign in ((f"{road.id}-cross-right", 1.0), (f"{road.id}-cross-left", -1.0)):
         aside = half + 1.2 + 0.4 * sign  # opposite ways never meet

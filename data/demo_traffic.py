@@ -52,6 +52,7 @@ class Driver:
         a: Acceleration [m/s^2].
         holds: Whether it has been admitted to the junction.
         waiting: Places it has begun to brake for.
+        patience: How long it will stand before others let it in [s].
     """
 
     category: str
@@ -63,7 +64,13 @@ class Driver:
     a: float = 0.0
     holds: bool = False
     waiting: set[str] = field(default_factory=set)
+    patience: float = 6.0
     token: int = 0
+
+    @property
+    def rank(self) -> int:
+        """Order of priority at the junction now, smallest first."""
+        return self.path.rank if self.patience > 0.0 else -1
 
     @property
     def length(self) -> float:
@@ -190,28 +197,25 @@ class Traffic:
             if driver.holds and (driver.rear > driver.path.exit or _is_yielding(driver)):
                 driver.holds = False
         asking = [d for d in drivers if d.path.connector >= 0 and not d.holds and _is_before(d)]
-        asking.sort(key=lambda d: (d.path.rank, _arrival(d), d.token))
+        asking.sort(key=lambda d: (d.rank, _arrival(d), d.token))
+        refused: list[Driver] = []
         for driver in asking:
-            if _arrival(driver) > _REQUEST or _is_yielding(driver) or _must_queue(driver, drivers):
+            if driver.v < 0.3 and "junction" in driver.waiting:
+                driver.patience -= DT
+            if (
+                _arrival(driver) > _REQUEST
+                or _is_yielding(driver)
+                or _must_queue(driver, drivers)
+                or any(self._conflict(driver, d) for d in refused)
+            ):
                 continue
-            rivals = [
-                d
-                for d in drivers
-                if d is not driver
-                and (driver.path.connector, d.path.connector) in self.town.conflicts
-            ]
-            clear = _arrival(driver) + (driver.path.exit - driver.path.stop + driver.length) / 4.5
-            blocked = any(
-                d.holds
-                or (
-                    d.path.rank < driver.path.rank
-                    and _is_before(d)
-                    and d.v > 0.5
-                    and _arrival(d) < clear + 1.0
-                )
-                for d in rivals
-            )
-            driver.holds = not blocked
+            rivals = [d for d in drivers if self._conflict(driver, d)]
+            driver.holds = not any(d.holds or _goes_first(d, driver) for d in rivals)
+            if not driver.holds and driver.patience <= 0.0:
+                refused.append(driver)
+
+    def _conflict(self, a: Driver, b: Driver) -> bool:
+        return (a.path.connector, b.path.connector) in self.town.conflicts
 
     def _acceleration(
         self, driver: Driver, drivers: list[Driver], walkers: list[Walker], bodies: FloatArray
@@ -239,7 +243,8 @@ class Traffic:
             driver.waiting.discard("junction")
         for name, first, _ in path.crosswalks:
             place = first - 1.5
-            if driver.front <= place + 1.0 and self._is_claimed(driver, name, place, walkers):
+            before = driver.front <= first - 0.3
+            if before and self._is_claimed(driver, name, place, walkers):
                 places.append((name, place))
             else:
                 driver.waiting.discard(name)
@@ -274,11 +279,10 @@ class Traffic:
             for name, first, last in driver.path.crosswalks:
                 if name != walker.walk.crosswalk or driver.rear > last + 0.5:
                     continue
-                ahead = first - 1.5 - driver.front
-                if ahead < -1.0:
-                    return False
                 stands = driver.v < 0.3
-                far = ahead / max(driver.v, 1.0) > needed
+                if driver.front > first - (0.4 if stands else 1.6):
+                    return False
+                far = (first - 1.5 - driver.front) / max(driver.v, 1.0) > needed
                 gentle = _YIELDING + 0.1 if name in driver.waiting else _EVEN
                 if not (stands or far or _needed(driver, first - 1.5) < gentle):
                     return False
@@ -318,6 +322,17 @@ def _must_queue(driver: Driver, drivers: list[Driver]) -> bool:
         if other.v < 2.0 and hypot(ox - x, oy - y) < 8.0 and other.s > other.path.exit - 4.0:
             return True
     return False
+
+
+def _goes_first(driver: Driver, other: Driver) -> bool:
+    """Whether a driver with priority is too near for another one to enter before it."""
+    clear = _arrival(other) + (other.path.exit - other.path.stop + other.length) / 4.5
+    return (
+        driver.rank < other.rank
+        and _is_before(driver)
+        and driver.v > 0.5
+        and _arrival(driver) < clear + 1.0
+    )
 
 
 def _is_yielding(driver: Driver) -> bool:
