@@ -62,9 +62,7 @@ def _run(words: list[str], debug: bool) -> int:
     command = typer.main.get_command(app)
     try:
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
-    except KeyboardInterrupt as error:
-        return _complain("interrupted", str(error), _INTERRUPTED)
-    except typer.Abort:
+    except (KeyboardInterrupt, typer.Abort):
         return _complain("interrupted", "", _INTERRUPTED)
     except ShiftsimError as error:
         if debug:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from shiftsim.results import Run
     from shiftsim.runner import Prepared, Progress
 
-_UNFINISHED = 3
+_UNFINISHED, _INTERRUPTED = 3, 130
 _DEMO_PLANNERS = ("log-future", "idm", "constant-velocity")
 _DEMO_NOISE = ("none", "ou-high")
 _MAX_NAMED_FAILURES = 5
@@ -156,7 +156,9 @@ def _run(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
         except KeyboardInterrupt:
             kept = prepared.folder if prepared.folder.exists() else "nothing"
             again = shlex.join(["shiftsim", *sys.argv[1:]])
-            raise KeyboardInterrupt(f"kept: {kept}; start again with: {again}") from None
+            typer.echo("error: interrupted", err=True)
+            typer.echo(f"hint: kept: {kept}; start again with: {again}", err=True)
+            raise typer.Exit(_INTERRUPTED) from None
     _show(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
     if not finished.is_complete:
         raise typer.Exit(_UNFINISHED)
