@@ -5,6 +5,7 @@ right connectors. Coordinates are UTM-like.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import shapely
@@ -25,8 +26,21 @@ _LIMIT = 13.9  # m/s
 _HEADINGS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # east, north, west, south
 _SPAN = (3.0, 15.0, 8.0)  # s of history, scenario and future
 _RADIUS = 50.0  # m around the ego in which agents start
-_ROUTE = ("straight", "right", "straight", "left", "straight")
+_ROUTE = ("right", "straight", "left", "right", "straight")
 _TURNS = {"right": -1, "straight": 0, "left": 1}
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A baseline and its borders, relative to the middle of a junction. K points."""
+
+    line: FloatArray
+    left: FloatArray
+    right: FloatArray
+
+    def area(self, middle: FloatArray) -> shapely.Polygon:
+        """The area between the borders."""
+        return shapely.Polygon(np.concatenate([self.left, self.right[::-1]]) + middle)
 
 
 @dataclass(frozen=True)
@@ -97,7 +111,7 @@ def _city(
     junctions: list[AreaSpec] = []
     for street in streets.values():
         for index, lane in enumerate(street.lanes):
-            lines[lane] = _street_line(street, (index + 0.5) * _WIDTH)
+            lines[lane] = _lane_shape(street.direction, index).line + _middle(street.node)
     turns = [
         (street, turn)
         for street in streets.values()
@@ -111,22 +125,24 @@ def _city(
         block = str(20_000 + number)
         node = _end_node(street)
         junction = str(1_000 + node[0] * _NODES + node[1])
+        middle = _middle(node)
         for name, index in zip(names, indices, strict=True):
             source, goal = street.lanes[index], target.lanes[index]
-            lines[name] = _connect(lines[source], lines[goal])
+            shape = _turn_shape(street.direction, turn, index)
+            lines[name] = shape.line + middle
             into.setdefault(goal, []).append(name)
             out_of.setdefault(source, []).append(name)
             edges.append(
                 EdgeSpec(
                     id=name,
                     is_connector=True,
-                    polygon=_band(lines[name]),
+                    polygon=shape.area(middle),
                     baseline=lines[name],
                     block_id=block,
                     incoming=[source],
                     outgoing=[goal],
-                    left=_beside(lines[name], 0.5 * _WIDTH),
-                    right=_beside(lines[name], -0.5 * _WIDTH),
+                    left=shape.left + middle,
+                    right=shape.right + middle,
                     speed_limit=_LIMIT,
                     intersection_id=junction,
                     turn_type={"straight": 0, "left": 1, "right": 2}[turn],
@@ -136,7 +152,7 @@ def _city(
             BlockSpec(
                 block,
                 True,
-                _band(np.mean([lines[n] for n in names], axis=0), len(names)),
+                _block_shape(street.direction, turn).area(middle),
                 [street.block],
                 [target.block],
                 junction,
@@ -146,12 +162,11 @@ def _city(
         out_of.setdefault(street.block, []).append(block)
     for street in streets.values():
         edges += _lane_specs(street, lines, into, out_of)
-        middle = 0.5 * (lines[street.lanes[0]] + lines[street.lanes[1]])
         blocks.append(
             BlockSpec(
                 street.block,
                 False,
-                _band(middle, 2),
+                _lane_shape(street.direction, None).area(_middle(street.node)),
                 into.get(street.block, []),
                 out_of.get(street.block, []),
             )
@@ -181,17 +196,19 @@ def _lane_specs(
     out_of: dict[str, list[str]],
 ) -> list[EdgeSpec]:
     left, right = street.lanes
+    middle = _middle(street.node)
+    shapes = [_lane_shape(street.direction, index) for index in (0, 1)]
     return [
         EdgeSpec(
             id=lane,
             is_connector=False,
-            polygon=_band(lines[lane][[0, -1]]),
+            polygon=shapes[index].area(middle),
             baseline=lines[lane],
             block_id=street.block,
             incoming=into.get(lane, []),
             outgoing=out_of.get(lane, []),
-            left=_beside(lines[lane], 0.5 * _WIDTH),
-            right=_beside(lines[lane], -0.5 * _WIDTH),
+            left=shapes[index].left + middle,
+            right=shapes[index].right + middle,
             speed_limit=_LIMIT,
             lane_index=index,
             left_lane=left if index else None,
@@ -206,40 +223,53 @@ def _end_node(street: _Street) -> tuple[int, int]:
     return street.node[0] + dx, street.node[1] + dy
 
 
-def _street_line(street: _Street, to_right: float) -> FloatArray:
-    along = _HEADINGS[street.direction].astype(np.float64)
-    right = np.array([along[1], -along[0]])
-    start = _ORIGIN + _SPACING * np.array(street.node) + to_right * right
+def _middle(node: tuple[int, int]) -> FloatArray:
+    return _ORIGIN + _SPACING * np.array(node, np.float64)
+
+
+def _to_right(direction: int) -> FloatArray:
+    along = _HEADINGS[direction]
+    return np.array([along[1], -along[0]], np.float64)
+
+
+@cache
+def _lane_shape(direction: int, index: int | None) -> _Shape:
+    """A lane of a street that leaves a junction; without an index, the whole roadblock."""
+    along, right = _HEADINGS[direction].astype(np.float64), _to_right(direction)
     at = np.linspace(_HALF, _SPACING - _HALF, round((_SPACING - 2 * _HALF) / _STEP) + 1)
-    return start + at[:, None] * along
+    ends = at[[0, -1], None] * along
+    inner, outer = (0.0, 2 * _WIDTH) if index is None else (index * _WIDTH, (index + 1) * _WIDTH)
+    line = at[:, None] * along + 0.5 * (inner + outer) * right
+    return _Shape(line, ends + inner * right, ends + outer * right)
 
 
-def _connect(source: FloatArray, goal: FloatArray) -> FloatArray:
-    """A quadratic Bezier curve from the end of one line to the start of another."""
-    a, b = source[-1], goal[0]
-    u, v = source[-1] - source[-2], goal[1] - goal[0]
-    cross = u[0] * v[1] - u[1] * v[0]
-    if abs(cross) < 1e-9:
-        corner = 0.5 * (a + b)
-    else:
-        corner = a + u * ((b[0] - a[0]) * v[1] - (b[1] - a[1]) * v[0]) / cross
+@cache
+def _turn_shape(direction: int, turn: str, index: int) -> _Shape:
+    """A connector through a junction from a street of some direction."""
+    return _between(direction, turn, (index + 0.5) * _WIDTH, 0.5 * _WIDTH)
+
+
+@cache
+def _block_shape(direction: int, turn: str) -> _Shape:
+    """All connectors of one turn from a street of some direction."""
+    center, half = {"straight": (1.0, 1.0), "left": (0.5, 0.5), "right": (1.5, 0.5)}[turn]
+    return _between(direction, turn, center * _WIDTH, half * _WIDTH)
+
+
+def _between(direction: int, turn: str, offset: float, half: float) -> _Shape:
+    """A quadratic Bezier curve through a junction, `offset` to the right of both streets."""
+    target = (direction + _TURNS[turn]) % 4
+    u, v = _HEADINGS[direction].astype(np.float64), _HEADINGS[target].astype(np.float64)
+    a = -_HALF * u + offset * _to_right(direction)
+    b = _HALF * v + offset * _to_right(target)
+    corner = 0.5 * (a + b) if turn == "straight" else a + u * ((b - a) @ u)
     t = np.linspace(0.0, 1.0, 41)[:, None]
-    return (1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b
-
-
-def _normals(line: FloatArray) -> FloatArray:
-    step = np.gradient(line, axis=0)
-    step /= np.linalg.norm(step, axis=1, keepdims=True)
-    return np.column_stack([-step[:, 1], step[:, 0]])
-
-
-def _beside(line: FloatArray, to_left: float) -> FloatArray:
-    return line + to_left * _normals(line)
-
-
-def _band(line: FloatArray, lanes: int = 1) -> shapely.Polygon:
-    half = 0.5 * lanes * _WIDTH
-    return shapely.Polygon(np.concatenate([_beside(line, half), _beside(line, -half)[::-1]]))
+    line = (1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b
+    tangent = 2 * (1 - t) * (corner - a) + 2 * t * (b - corner)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    every = slice(None, None, 4)
+    return _Shape(line, (line + half * normal)[every], (line - half * normal)[every])
 
 
 def _crosswalk(junction: shapely.Polygon) -> shapely.Polygon:
@@ -257,10 +287,8 @@ def _ego_path(
         index = 0 if turn == "left" else 1
         direction = (street.direction + _TURNS[turn]) % 4
         following = streets[_end_node(street), direction]
-        parts += [
-            _connect(lines[street.lanes[index]], lines[following.lanes[index]]),
-            lines[following.lanes[index]],
-        ]
+        shape = _turn_shape(street.direction, turn, index)
+        parts += [shape.line + _middle(_end_node(street)), lines[following.lanes[index]]]
         route += [_block_between(streets, street, following), following.block]
         street = following
     return np.concatenate(parts), tuple(route)

@@ -1,8 +1,6 @@
 """Compares DSC3D conversion with known answers: a real sample, and scripted recordings."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +8,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pyproj
-import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan import convert_recording
 from shiftsim.data.deepplan_states import sample_runs
 from shiftsim.data.deepplan_windows import EGO, ConversionConfig, find_runs, judge_windows
 from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site, read_recording
-from shiftsim.data.opendrive import read_opendrive
-from shiftsim.data.opendrive_geometry import ReferenceLine
-from shiftsim.data.opendrive_lanes import LaneKey, section_borders
-from shiftsim.data.opendrive_map import Origin, build_road_map
-from shiftsim.data.opendrive_records import OpenDrive
+from shiftsim.data.opendrive_lanes import LaneKey
 from shiftsim.errors import DataError
 from shiftsim.geometry import wrap_angles
-from shiftsim.map import VectorMap
 from shiftsim.state import center_poses
+from shiftsim.verify.dsc3d_lanes import LocalMap, keys_at, lane_sequences, load_map, placed_map
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import Group, read_groups
 
@@ -33,18 +26,7 @@ _EXACT = 1e-9  # rad, m in the local frame, degrees: the same formula on both si
 _UTM = 1e-8  # m, spacing of floats at UTM coordinates
 _POSITION, _ANGLE = 2e-2, 2e-3  # m, rad: README of the scripted recordings
 _SINGLE = 5e-7  # rad, two units in the last place of single-precision headings
-_MIN_PIECE_S = 0.5  # shorter pieces at the ends of a lane sequence may be missing (expected.json)
 _STEP_S = 0.05
-_SWITCH, _JUMP = 1.0, 10.0  # costs of a lane sequence: to a linked edge, to any other
-
-
-@dataclass(frozen=True)
-class _Map:
-    """A map in the local frame, with the OpenDRIVE lanes behind its edges."""
-
-    drive: OpenDrive
-    road: VectorMap
-    pieces: dict[int, list[tuple[LaneKey, shapely.Polygon]]]
 
 
 def verify_dsc3d_sample(folder: Path, report: Report) -> None:
@@ -60,8 +42,8 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     if len(site.recordings) != 1:
         report.skip("recordings beyond the first", len(site.recordings) - 1)
     recording = read_recording(site, site.recordings[0])
-    local = _load_map(find_map(site))
-    keys = _keys_at(local, recording.bottom[:, :2])
+    local = load_map(find_map(site))
+    keys = keys_at(local, recording.bottom[:, :2])
     _compare_rows(folder, site, recording, keys, report)
     _compare_20hz(folder, recording, report)
     _compare_summary(folder, site, recording, keys, report)
@@ -128,20 +110,22 @@ def _verify_scripted(folder: Path, report: Report, maps: Path | None) -> None:
     if path is None:
         report.skip(f"lane sequences and poses: map {map_name} not found (--maps)", len(poses))
         return
-    _compare_scenarios(name, site, recording, _load_map(path), wanted, poses, report)
+    _compare_scenarios(name, site, recording, load_map(path), wanted, poses, report)
 
 
 def _compare_scenarios(
     name: str,
     site: Site,
     recording: Annotations,
-    local: _Map,
+    local: LocalMap,
     wanted: list[dict[str, Any]],
     poses: dict[tuple[str, ...], Group],
     report: Report,
 ) -> None:
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
-    made = convert_recording(recording, _placed(local, site), site.offset[:2], ConversionConfig())
+    made = convert_recording(
+        recording, placed_map(local, site), site.offset[:2], ConversionConfig()
+    )
     egos = {ego.name: ego for ego in made.egos}
     lanes_wanted = {
         (f"{float(window['start_s'])}", str(int(track))): lanes
@@ -175,7 +159,7 @@ def _compare_scenarios(
         _name_columns(table, {"x_local", "y_local", "yaw", "window_start_s", "track_id"}, report)
         start = int(window.iteration_rows[0]) - window.first_row
         given = json.dumps(lanes_wanted.get(key))
-        ways = [json.dumps(way) for way in _lane_sequences(local, centers[start:])]
+        ways = [json.dumps(way) for way in lane_sequences(local, centers[start:])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
     for key in sorted(set(poses) - seen):
         report.fail("20 Hz pose", f"{name} window {key[0]} track {key[1]}", "no such scenario")
@@ -358,106 +342,6 @@ def _compare_column(
     if kind.kind == "U":
         expected = expected.astype(str)
     report.compare(quantity, where, values, expected, atol=tolerance)
-
-
-def _load_map(path: Path) -> _Map:
-    drive = read_opendrive(path)
-    road, made = build_road_map(drive, name=path.stem)
-    return _Map(drive, road, _pieces(drive, road, made.origins))
-
-
-def _placed(local: _Map, site: Site) -> VectorMap:
-    offset = float(site.offset[0]), float(site.offset[1])
-    road, _ = build_road_map(local.drive, name=local.road.name, offset=offset, epsg=site.epsg)
-    return road
-
-
-def _pieces(
-    drive: OpenDrive, road: VectorMap, origins: tuple[Origin, ...]
-) -> dict[int, list[tuple[LaneKey, shapely.Polygon]]]:
-    """OpenDRIVE lanes behind every edge, with their areas."""
-    out: dict[int, list[tuple[LaneKey, shapely.Polygon]]] = {}
-    for origin in origins:
-        edge = road.edges.index.get(origin.id)
-        if edge is None:
-            continue
-        source = drive.roads[origin.key.road]
-        low, high = sorted((origin.begin, origin.end))
-        s = np.linspace(low, high, max(2, round((high - low) / 0.5) + 1))
-        borders = section_borders(source, origin.key.section, s, mend=True)
-        poses = ReferenceLine(source.geometries).evaluate(s)
-        inner = poses.offset(borders.inner[origin.key.lane])
-        outer = poses.offset(borders.outer[origin.key.lane])
-        area = shapely.Polygon(np.concatenate([inner, outer[::-1]]))
-        out.setdefault(edge, []).append((origin.key, area))
-    return out
-
-
-def _keys_at(local: _Map, points: FloatArray) -> list[list[LaneKey]]:
-    """OpenDRIVE lanes of the edges that hold each point (n, 2)."""
-    return [
-        [
-            _key_on(local, edge, x, y)
-            for edge in local.road.edges.containing(x, y).tolist()
-            if edge in local.pieces
-        ]
-        for x, y in points.tolist()
-    ]
-
-
-def _key_on(local: _Map, edge: int, x: float, y: float) -> LaneKey:
-    """The piece of an edge nearest to a point."""
-    point = shapely.Point(x, y)
-    return min(local.pieces[edge], key=lambda piece: shapely.distance(piece[1], point))[0]
-
-
-def _lane_sequences(local: _Map, centers: FloatArray) -> list[list[LaneKey]]:
-    """OpenDRIVE lanes passed by box centres (n, 3) at 20 Hz, without and with short end pieces."""
-    points = centers[:, :2].tolist()
-    candidates = [
-        [e for e in local.road.edges.containing(x, y).tolist() if e in local.pieces]
-        for x, y in points
-    ]
-    keys = [
-        _key_on(local, edge, x, y)
-        for edge, (x, y) in zip(_likeliest(local.road, candidates), points, strict=True)
-        if edge >= 0
-    ]
-    starts = [i for i in range(len(keys)) if i == 0 or keys[i] != keys[i - 1]]
-    lengths = np.diff([*starts, len(keys)]) * _STEP_S
-    lanes = [keys[start] for start in starts]
-    long = np.flatnonzero(lengths >= _MIN_PIECE_S - 1e-9)
-    if not len(long):
-        return [lanes]
-    return [
-        lanes[first : last + 1]
-        for first in range(long[0], -1, -1)
-        for last in range(long[-1], len(lanes))
-    ]
-
-
-def _likeliest(road: VectorMap, candidates: list[list[int]]) -> Iterator[int]:
-    """One edge per sample with the fewest changes, -1 where there is none."""
-    best: dict[int, tuple[float, list[int]]] = {}
-    for here in candidates:
-        if not here:
-            best = {e: (cost, [*path, -1]) for e, (cost, path) in best.items()} or {-1: (0.0, [-1])}
-            continue
-        options = {}
-        for edge in here:
-            ways = [
-                (cost + _change(road, before, edge), path) for before, (cost, path) in best.items()
-            ] or [(0.0, [])]
-            cost, path = min(ways, key=lambda way: way[0])
-            options[edge] = (cost, [*path, edge])
-        best = options
-    return iter(min(best.values(), key=lambda way: way[0])[1])
-
-
-def _change(road: VectorMap, before: int, after: int) -> float:
-    if before in (after, -1):
-        return 0.0
-    return _SWITCH if after in road.outgoing.at(before) else _JUMP
 
 
 def _sample_bottoms(recording: Annotations, first: int, last: int, time: FloatArray) -> FloatArray:
