@@ -33,7 +33,8 @@ def check_map(
     low, high = _spacing(lines)
     lane_overlap = _largest_overlap(polygons[: road.num_lanes], road.edges.ids, stacked)
     block_overlap = _largest_overlap(blocks[: road.num_roadblocks], road.blocks.ids, stacked)
-    lane_area = float(sum(p.area for p in polygons[: road.num_lanes]))
+    lanes = polygons[: road.num_lanes]
+    lane_area = float(shapely.union_all(lanes).area if stacked else sum(p.area for p in lanes))
     drivable = shapely.union_all(
         [road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))]
     ).area

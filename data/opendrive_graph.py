@@ -27,7 +27,7 @@ MIN_WIDTH = 0.5  # m, lanes never wider are linked through
 SEAM_LENGTH, SEAM_SHARE = 3.0, 0.25  # m, and share of the shorter lane
 MAX_GAP, INFER_GAP, SNAP_GAP = 2.0, 0.1, 0.05  # m
 _MAX_CHAIN = 64  # lanes along one connector
-_MAX_STEPS = 200_000  # in the search for ways through junctions
+_MAX_STEPS = 2_000  # in the search for ways from one lane through junctions
 _CARS = frozenset(("all", "car", "autonomousTraffic", "motorVehicle"))
 
 
@@ -297,12 +297,12 @@ class _Builder:
     def _build_connectors(self) -> None:
         by_first = {lane.pieces[0].key: i for i, lane in enumerate(self.graph.lanes)}
         used: set[LaneKey] = set()
-        steps = 0
         last_keys = [lane.pieces[-1].key for lane in self.graph.lanes]
         for source, last in enumerate(last_keys):
             stack: list[tuple[LaneKey, ...]] = [
                 (target,) for target in sorted(self.after[last], reverse=True)
             ]
+            steps = 0
             while stack:
                 path = stack.pop()
                 steps += 1

@@ -54,7 +54,8 @@ def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> 
     index = np.searchsorted(records[:, 0], look_up, side="right") - 1
     start, a, b, c, d = records[np.maximum(index, 0)].T
     x = s - start
-    return np.where(index < 0, 0.0, a + x * (b + x * (c + x * d)))
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd polynomials are cut off later
+        return np.where(index < 0, 0.0, a + x * (b + x * (c + x * d)))
 
 
 def section_borders(
