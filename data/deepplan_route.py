@@ -222,8 +222,8 @@ def _direction_at(road: VectorMap, edge: int, x: float, y: float) -> float:
     """Heading of a baseline where it is nearest to a point [rad]."""
     line = road.baselines.at(edge)
     arc = road.baselines.arc[road.baselines.ptr[edge] : road.baselines.ptr[edge + 1]]
-    segment = np.searchsorted(arc, road.progress_on(edge, x, y), side="right") - 1
-    segment = min(max(int(segment), 0), len(line) - 2)
+    following = int(np.searchsorted(arc, road.progress_on(edge, x, y), side="right"))
+    segment = min(max(following - 1, 0), len(line) - 2)
     dx, dy = line[segment + 1] - line[segment]
     return float(np.arctan2(dy, dx))
 

@@ -171,7 +171,10 @@ def ego_trace(
     high = max(int(end[run]) + 1 + padding, last_row)
     rows = np.arange(low, high)
     samples = sample_runs(
-        recording, runs, np.full(len(rows), run, np.int64), (rows - padding) * ROW_S
+        recording,
+        runs,
+        np.full(len(rows), run, np.int64),
+        (rows - padding).astype(np.float64) * ROW_S,
     )
     states = ego_states(samples.poses, samples.velocities)
     states[:, :2] += offset

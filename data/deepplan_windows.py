@@ -139,7 +139,7 @@ def window_starts(duration: float, config: ConversionConfig) -> FloatArray:
     """Start of every window that fits into a recording [s]."""
     stride = config.window_s - config.overlap_s
     count = int(np.floor((duration - config.window_s) / stride + _EPS)) + 1
-    return np.arange(max(count, 0)) * stride
+    return np.arange(max(count, 0), dtype=np.float64) * stride
 
 
 def judge_windows(

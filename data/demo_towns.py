@@ -121,7 +121,6 @@ class _Arm:
     crosswalk: tuple[float, float] = (3.0, 7.0)  # m along the arm
     parking: float = 0.0  # m, width of a parking lane on both sides
     radius: float = 16.0  # m from the centre of the junction
-    has_stop_sign: bool = True
 
     @property
     def half(self) -> float:
@@ -167,7 +166,6 @@ def junction_town() -> Town:
 def street_town() -> Town:
     """A winding street with cars parked on both sides, and a side street."""
     width, parking, radius = 3.4, 2.3, 12.0
-    street = {"parking": parking, "radius": radius, "has_stop_sign": False}
     arms = (
         _Arm(
             "east",
@@ -185,7 +183,8 @@ def street_town() -> Town:
             30.0,
             True,
             crosswalk=(84.0, 88.0),
-            **street,
+            parking=parking,
+            radius=radius,
         ),
         _Arm("side", 2, np.pi / 2, (line(45.0),), 1, 3.2, 20.0, False, radius=radius + 2.0),
         _Arm(
@@ -204,7 +203,8 @@ def street_town() -> Town:
             30.0,
             True,
             crosswalk=(9.0, 13.0),
-            **street,
+            parking=parking,
+            radius=radius,
         ),
     )
     return _make_town("street", arms)
@@ -258,7 +258,7 @@ def _arm_road(arm: _Arm, junction: int) -> RoadSpec:
         arm.limit,
         predecessor=("junction", junction, ""),
         crosswalks=(CrosswalkSpec(f"crosswalk_{arm.id}", *arm.crosswalk, arm.half),),
-        stop_sign=_STOP if arm.has_stop_sign and not arm.is_main else None,
+        stop_sign=None if arm.is_main else _STOP,
     )
 
 

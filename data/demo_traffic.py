@@ -132,8 +132,10 @@ class Traffic:
 
     def record(self, duration: float) -> list[Box]:
         """Simulate from time 0 and return the boxes of all frames."""
-        for number, someone in enumerate([*self.drivers, *self.walkers], start=1):
-            someone.token = number
+        for number, driver in enumerate(self.drivers, start=1):
+            driver.token = number
+        for number, walker in enumerate(self.walkers, start=len(self.drivers) + 1):
+            walker.token = number
         waiting = list(self.drivers)
         active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):

@@ -127,17 +127,17 @@ def _compare_scenarios(
         recording, placed_map(local, site), site.offset[:2], ConversionConfig()
     )
     egos = {ego.name: ego for ego in made.egos}
-    lanes_wanted = {
+    lanes_wanted: dict[tuple[str, ...], Any] = {
         (f"{float(window['start_s'])}", str(int(track))): lanes
         for window in wanted
         for track, lanes in window.pop("lanes_from_t0").items()
     }
-    for window in wanted:
-        for key in set(window) - {"start_s"}:
-            report.skip(f"unknown key {key!r} of a window")
-    seen = set()
+    for rest in wanted:
+        for name_of in set(rest) - {"start_s"}:
+            report.skip(f"unknown key {name_of!r} of a window")
+    seen: set[tuple[str, ...]] = set()
     for window in made.windows:
-        key = f"{float(str(window.metadata['window_start_s']))}", str(window.metadata["track_id"])
+        key = (f"{float(str(window.metadata['window_start_s']))}", str(window.metadata["track_id"]))
         where = f"{name} window {key[0]} track {key[1]}"
         ego = egos[window.ego]
         rows = slice(window.first_row - ego.first_row, window.last_row - ego.first_row)
