@@ -59,6 +59,22 @@ _ENTRIES = (
         "drives the recorded future",
     ),
     PlannerEntry(
+        "pdm-closed",
+        "rule-based",
+        "shiftsim.planners.pdm_closed:PdmClosed",
+        "drives 15 proposals along the route in its head and takes the best one",
+        (
+            "speed_fractions",
+            "lateral_offsets",
+            "fallback_velocity",
+            "min_gap",
+            "headway",
+            "accel_max",
+            "decel_max",
+            "map_radius",
+        ),
+    ),
+    PlannerEntry(
         "scripted",
         "replay",
         "shiftsim.planners.scripted:Scripted",

@@ -23,7 +23,6 @@ from shiftsim.layers import Lists, Polygons, index_polygons
 from shiftsim.map import VectorMap
 
 RUN = 8  # edges of a ring per bound
-MAX_HOLDERS = 16  # areas over one point; more are not told apart
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
@@ -43,18 +42,6 @@ class Areas(NamedTuple):
     runs: FloatArray
     on_route: BoolArray
     edge: IntArray
-
-
-class Admitted(NamedTuple):
-    """The areas of one step.
-
-    Attributes:
-        mask: (M,) whether an area belongs to the step.
-        order: Their indices in nuPlan's order.
-    """
-
-    mask: BoolArray
-    order: IntArray
 
 
 def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
@@ -95,13 +82,15 @@ def _bound_runs(xy: FloatArray, ring_ptr: IntArray) -> tuple[IntArray, FloatArra
     return run_ptr, runs
 
 
-def admit(road: VectorMap, areas: Areas, x: float, y: float, half_width: float) -> Admitted:
-    """Areas of the blocks and the car parks that touch a square around (x, y) [m]."""
-    mask = np.zeros(len(areas.edge), np.bool_)
-    order = np.empty(len(areas.edge), np.int64)
+def admit(road: VectorMap, areas: Areas, x: float, y: float, half_width: float) -> IntArray:
+    """Areas of the blocks and the car parks that touch a square around (x, y) [m], in their order.
+
+    Edges come by block, in the order of the blocks.
+    """
+    out = np.empty(len(areas.edge), np.int64)
     blocks, members = road.blocks.polygons, road.block_edges
-    count = _admit(blocks, members, areas.polygons, len(road.edges), x, y, half_width, mask, order)
-    return Admitted(mask, order[:count])
+    count = _admit(blocks, members, areas.polygons, len(road.edges), x, y, half_width, out)
+    return out[:count]
 
 
 @kernel
@@ -113,35 +102,37 @@ def _admit(
     x: float,
     y: float,
     half_width: float,
-    mask: BoolArray,
-    order: IntArray,
+    out: IntArray,
 ) -> int:
     count = 0
-    for block in range(len(blocks.bounds)):
-        if touches_square(blocks, block, x, y, half_width):
-            for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
-                mask[block_edges.items[entry]] = True
-                order[count] = block_edges.items[entry]
+    for layer in range(2):
+        layer_polygons = blocks if layer == 0 else polygons
+        bounds = layer_polygons.bounds
+        for index in range(0 if layer == 0 else num_edges, len(bounds)):
+            if (
+                bounds[index, 0] > x + half_width
+                or bounds[index, 2] < x - half_width
+                or bounds[index, 1] > y + half_width
+                or bounds[index, 3] < y - half_width
+                or not touches_square(layer_polygons, index, x, y, half_width)
+            ):
+                continue
+            if layer == 1:
+                out[count] = index
                 count += 1
-    for area in range(num_edges, len(mask)):
-        if touches_square(polygons, area, x, y, half_width):
-            mask[area] = True
-            order[count] = area
-            count += 1
+                continue
+            for entry in range(block_edges.ptr[index], block_edges.ptr[index + 1]):
+                out[count] = block_edges.items[entry]
+                count += 1
     return count
 
 
 @kernel
 def touches_square(polygons: Polygons, poly: int, x: float, y: float, half_width: float) -> bool:
-    """Whether a polygon shares a point with the axis-parallel square around (x, y)."""
-    west, south, east, north = polygons.bounds[poly]
-    if (
-        west > x + half_width
-        or east < x - half_width
-        or south > y + half_width
-        or north < y - half_width
-    ):
-        return False
+    """Whether a polygon shares a point with the axis-parallel square around (x, y).
+
+    Their bounds must overlap.
+    """
     square = np.empty((4, 2))
     for corner in range(4):
         square[corner, 0] = x + half_width if corner == 0 or corner == 3 else x - half_width
@@ -166,25 +157,22 @@ def touches_square(polygons: Polygons, poly: int, x: float, y: float, half_width
 
 
 @kernel
-def locate(areas: Areas, area: int, x: float, y: float) -> int:
-    """Where a point lies relative to an area: INTERIOR, BOUNDARY or EXTERIOR."""
-    polygons = areas.polygons
-    if (
-        x < polygons.bounds[area, 0]
-        or y < polygons.bounds[area, 1]
-        or x > polygons.bounds[area, 2]
-        or y > polygons.bounds[area, 3]
-    ):
-        return EXTERIOR
+def _locate(
+    xy: FloatArray, ring_ptr: IntArray, run_ptr: IntArray, runs: FloatArray, x: float, y: float
+) -> int:
+    """Where a point lies relative to one area: INTERIOR, BOUNDARY or EXTERIOR.
+
+    `ring_ptr` and `run_ptr` are the parts that belong to the area.
+    """
     inside = False
-    for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
-        start, stop = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
-        for run in range(areas.run_ptr[ring], areas.run_ptr[ring + 1]):
-            if y < areas.runs[run, 0] or y > areas.runs[run, 1] or x > areas.runs[run, 2]:
+    for ring in range(len(ring_ptr) - 1):
+        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
+        for run in range(run_ptr[ring], run_ptr[ring + 1]):
+            if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
                 continue
-            first = start + (run - areas.run_ptr[ring]) * RUN
+            first = start + (run - run_ptr[ring]) * RUN
             before = first - 1 if first > start else stop - 1
-            odd, on_edge = ray_crossings(polygons.xy, before, first, min(first + RUN, stop), x, y)
+            odd, on_edge = ray_crossings(xy, before, first, min(first + RUN, stop), x, y)
             if on_edge:
                 return BOUNDARY
             if odd:
@@ -193,26 +181,26 @@ def locate(areas: Areas, area: int, x: float, y: float) -> int:
 
 
 @kernel
-def holders(
-    areas: Areas, mask: BoolArray, x: float, y: float, with_boundary: bool, out: IntArray
-) -> int:
-    """Write the areas of `mask` that hold a point into `out`, ascending, and return their number.
+def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray) -> int:
+    """Write the admitted areas that hold a point, boundary included, into `out`; their number.
 
-    At most `len(out)` are found.
+    They are in the order of `admitted`; at most `len(out)` are found.
     """
     polygons = areas.polygons
-    fx = np.floor((x - polygons.grid[0]) / polygons.grid[2])
-    fy = np.floor((y - polygons.grid[1]) / polygons.grid[2])
-    if not (0.0 <= fx < polygons.shape[0] and 0.0 <= fy < polygons.shape[1]):
-        return 0
-    cell = int(fx) * polygons.shape[1] + int(fy)
+    bounds = polygons.bounds
     found = 0
-    for entry in range(polygons.cell_ptr[cell], polygons.cell_ptr[cell + 1]):
-        area = polygons.cell_items[entry]
-        if not mask[area] or found == len(out):
+    for area in admitted:
+        if (
+            x < bounds[area, 0]
+            or y < bounds[area, 1]
+            or x > bounds[area, 2]
+            or y > bounds[area, 3]
+            or found == len(out)
+        ):
             continue
-        side = locate(areas, area, x, y)
-        if side == INTERIOR or (with_boundary and side == BOUNDARY):
+        first, last = polygons.poly_ptr[area], polygons.poly_ptr[area + 1]
+        rings, runs = polygons.ring_ptr[first : last + 1], areas.run_ptr[first : last + 1]
+        if _locate(polygons.xy, rings, runs, areas.runs, x, y) != EXTERIOR:
             out[found] = area
             found += 1
     return found
@@ -220,44 +208,97 @@ def holders(
 
 @kernel
 def ego_areas(
-    areas: Areas, mask: BoolArray, corners: FloatArray, centers: FloatArray, out: BoolArray
+    areas: Areas, admitted: IntArray, corners: FloatArray, centers: FloatArray, out: BoolArray
 ) -> None:
     """How every pose of every proposal lies on the road (§8.1).
 
     Args:
         areas: The areas.
-        mask: (M,) those that count.
+        admitted: Those that count.
         corners: (P, T, 4, 2) corners of the ego [m].
         centers: (P, T, 2) its centres [m].
         out: (P, T, 3) receives: on multiple lanes, off the road, on no lane of the route.
     """
-    found = np.empty(MAX_HOLDERS, np.int64)
-    seen, corners_on = np.empty(4 * MAX_HOLDERS, np.int64), np.empty(4 * MAX_HOLDERS, np.int64)
-    for proposal in range(corners.shape[0]):
-        for step in range(corners.shape[1]):
-            num_seen, most, off_road = 0, 0, False
+    points = np.empty((centers.shape[0] * centers.shape[1], 10))  # corners, centre
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    row = 0
+    for proposal in range(centers.shape[0]):
+        for step in range(centers.shape[1]):
             for corner in range(4):
-                x, y = corners[proposal, step, corner]
-                count = holders(areas, mask, x, y, False, found)
-                off_road = off_road or count == 0
-                for area in found[:count]:
-                    at = 0
-                    while at < num_seen and seen[at] != area:
-                        at += 1
-                    if at == num_seen:
-                        seen[at], corners_on[at] = area, 0
-                        num_seen += 1
-                    corners_on[at] += 1
-                    most = max(most, corners_on[at])
-            out[proposal, step, 0] = num_seen > 1 and most < 4
-            out[proposal, step, 1] = off_road
-            x, y = centers[proposal, step]
-            count = holders(areas, mask, x, y, False, found)
-            oncoming = True
-            for area in found[:count]:
-                if areas.on_route[area]:
-                    oncoming = False
-            out[proposal, step, 2] = oncoming
+                points[row, 2 * corner] = corners[proposal, step, corner, 0]
+                points[row, 2 * corner + 1] = corners[proposal, step, corner, 1]
+            points[row, 8] = centers[proposal, step, 0]
+            points[row, 9] = centers[proposal, step, 1]
+            for point in range(4):
+                low_x = min(low_x, points[row, 2 * point])
+                high_x = max(high_x, points[row, 2 * point])
+                low_y = min(low_y, points[row, 2 * point + 1])
+                high_y = max(high_y, points[row, 2 * point + 1])
+            row += 1
+    # per pose: corners on any area, areas with a corner, whether one has all, whether on the route
+    tally = np.zeros((row, 4), np.int64)
+    polygons = areas.polygons
+    bounds = polygons.bounds
+    for area in admitted:
+        if (
+            bounds[area, 0] > high_x
+            or bounds[area, 2] < low_x
+            or bounds[area, 1] > high_y
+            or bounds[area, 3] < low_y
+        ):
+            continue
+        first, last = polygons.poly_ptr[area], polygons.poly_ptr[area + 1]
+        _tally_area(
+            polygons.xy,
+            polygons.ring_ptr[first : last + 1],
+            areas.run_ptr[first : last + 1],
+            areas.runs,
+            bounds[area],
+            areas.on_route[area],
+            points,
+            tally,
+        )
+    row = 0
+    for proposal in range(centers.shape[0]):
+        for step in range(centers.shape[1]):
+            out[proposal, step, 0] = tally[row, 1] > 1 and tally[row, 2] == 0
+            out[proposal, step, 1] = tally[row, 0] != 15
+            out[proposal, step, 2] = tally[row, 3] == 0
+            row += 1
+
+
+@kernel
+def _tally_area(
+    xy: FloatArray,
+    ring_ptr: IntArray,
+    run_ptr: IntArray,
+    runs: FloatArray,
+    bounds: FloatArray,
+    on_route: bool,
+    points: FloatArray,
+    tally: IntArray,
+) -> None:
+    """Add one area to the tally of every pose (see `ego_areas`)."""
+    west, south, east, north = bounds[0], bounds[1], bounds[2], bounds[3]
+    for row in range(len(points)):
+        held = 0
+        for point in range(5):
+            x, y = points[row, 2 * point], points[row, 2 * point + 1]
+            if x < west or x > east or y < south or y > north:
+                continue
+            if point == 4 and not on_route:
+                continue
+            if _locate(xy, ring_ptr, run_ptr, runs, x, y) == INTERIOR:
+                held |= 1 << point
+        corners = held & 15
+        tally[row, 0] |= corners
+        if corners != 0:
+            tally[row, 1] += 1
+        if corners == 15:
+            tally[row, 2] = 1
+        if held >= 16:
+            tally[row, 3] = 1
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

@@ -99,7 +99,8 @@ def comfort(
 @kernel
 def _filter(samples: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
     """Write samples @ matrix into `out`, rounded to 8 decimals as nuPlan does."""
-    out[:] = 0.0
+    for column in range(len(out)):
+        out[column] = 0.0
     for row in range(len(samples)):
         value = samples[row]
         if value != 0.0:

@@ -1,8 +1,8 @@
 """Which occupants stand in the corridor of a path, on every forecast map (pdm-closed.md §6.1).
 
-nuPlan buffers a stretch of the path by half the ego's width: square ends, round joins of 16 segments
-per quarter circle. Distances to the path decide nearly everything; what lies in the thin band in
-which that polygon and the true buffer may differ is compared with the polygon itself.
+nuPlan buffers a stretch of the path by half the ego's width: square ends, round joins of 16
+segments per quarter circle. Distances to the path decide nearly everything; what lies in the thin
+band in which that polygon and the true buffer may differ is compared with the polygon itself.
 """
 
 from typing import NamedTuple
@@ -13,15 +13,7 @@ from shapely.ops import substring
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.planners.idm_corridor import BAND, CLEAR, HIT, OPEN, segment_distance
-from shiftsim.planners.pdm_forecast import (
-    LIGHT,
-    NUM_FORECASTS,
-    Occupants,
-    centroid,
-    place_ring,
-    ring_of,
-    widest,
-)
+from shiftsim.planners.pdm_forecast import NUM_FORECASTS, Occupants, centroid, ring_of
 from shiftsim.planners.pdm_path import RUN, PdmPath, project, window
 
 QUARTER_SEGMENTS = 16  # of the round joins
@@ -79,55 +71,66 @@ def corridor_polygon(path: PdmPath, corridor: Corridor) -> shapely.Polygon:
 @kernel
 def _fill(path: PdmPath, corridor: Corridor, occupants: Occupants, first: int, last: int) -> bool:
     """Fill in what distances decide; whether something stays OPEN."""
+    xy, runs, half_width = path.xy, path.runs, corridor.half_width
+    sides, progress = corridor.sides, corridor.progress
+    centers, radii, moves, boxes = (
+        occupants.centers,
+        occupants.radii,
+        occupants.moves,
+        occupants.boxes,
+    )
     begin, end = window(path, corridor.low, corridor.high)
-    begin, end = _drop_repeats(path.xy, begin, end)
-    outer = (1.0 + BAND) * corridor.half_width
-    reach = 1.5 * outer  # covers the corners of the square ends
-    bounds = _bounds(path.xy, begin, end, reach)
-    ring_room = np.empty((widest(occupants), 2))
-    is_open = False
-    for index in range(len(occupants.kinds)):
-        guess = 0
-        moves = occupants.motion[index, 0] != 0.0 or occupants.motion[index, 1] != 0.0
-        circle = occupants.circles[index].copy()
+    begin, end = _drop_repeats(xy, begin, end)
+    reach = 1.5 * (1.0 + BAND) * half_width  # covers the corners of the square ends
+    bounds = _bounds(xy, begin, end, reach)
+    num_boxes, is_open = len(radii), False
+    for index in range(num_boxes):
+        guess, radius = 0, radii[index]
         for forecast in range(first, last):
-            if forecast > first and not moves:
-                corridor.sides[forecast, index] = corridor.sides[forecast - 1, index]
-                corridor.progress[forecast, index] = corridor.progress[forecast - 1, index]
+            if forecast > first and not moves[index]:
+                sides[forecast, index] = sides[forecast - 1, index]
+                progress[forecast, index] = progress[forecast - 1, index]
                 continue
-            seconds = 0.1 * (2 * forecast)
-            circle[0] = occupants.circles[index, 0] + seconds * occupants.motion[index, 0]
-            circle[1] = occupants.circles[index, 1] + seconds * occupants.motion[index, 1]
+            x, y = centers[forecast, index, 0], centers[forecast, index, 1]
             if end - begin > 1 and not (
-                bounds[0] - circle[2] <= circle[0] <= bounds[2] + circle[2]
-                and bounds[1] - circle[2] <= circle[1] <= bounds[3] + circle[2]
+                bounds[0] - radius <= x <= bounds[2] + radius
+                and bounds[1] - radius <= y <= bounds[3] + radius
             ):
                 continue
-            ring = ring_room[: place_ring(occupants, index, forecast, ring_room)]
-            x, y = centroid(ring)
-            progress, distance, guess = project(path, x, y, guess)
+            ring = boxes[forecast, index]
+            center_x, center_y = centroid(ring)
+            along, distance, guess = project(path, center_x, center_y, guess)
             side = OPEN
             if end - begin > 1:
-                is_box = occupants.kinds[index] != LIGHT
-                if is_box and distance > reach + circle[2]:
-                    side = CLEAR
-                elif (
-                    distance <= (1.0 - BAND) * corridor.half_width
-                    and path.progress[begin] <= progress <= path.progress[end - 1]
-                    and is_box
-                ):
+                if distance > reach + radius:
+                    continue
+                is_inside = path.progress[begin] <= along <= path.progress[end - 1]
+                if is_inside and distance <= (1.0 - BAND) * half_width:
                     side = HIT
                 else:
-                    side = _side(path, begin, end, corridor.half_width, ring, circle)
-            corridor.sides[forecast, index] = side
-            corridor.progress[forecast, index] = progress
+                    side = _side(xy, runs, begin, end, half_width, ring, x, y, radius)
+            sides[forecast, index], progress[forecast, index] = side, along
             is_open = is_open or side == OPEN
+    for light in range(len(occupants.light_ptr) - 1):
+        ring = occupants.light_xy[occupants.light_ptr[light] : occupants.light_ptr[light + 1]]
+        center_x, center_y = centroid(ring)
+        along, _, _ = project(path, center_x, center_y, 0)
+        side, radius = OPEN, 0.0
+        for vertex in range(len(ring)):
+            away = np.hypot(ring[vertex, 0] - center_x, ring[vertex, 1] - center_y)
+            radius = max(radius, away)
+        if end - begin > 1:
+            side = _side(xy, runs, begin, end, half_width, ring, center_x, center_y, radius)
+        is_open = is_open or side == OPEN
+        for forecast in range(first, last):
+            sides[forecast, num_boxes + light] = side
+            progress[forecast, num_boxes + light] = along
     return is_open
 
 
 @kernel
 def _drop_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
-    """A stretch of vertices whose first and last segments have a length; 1 vertex if there is none."""
+    """The stretch without repeated vertices at its ends; 1 vertex if all are the same."""
     while end - begin > 1 and xy[begin, 0] == xy[begin + 1, 0] and xy[begin, 1] == xy[begin + 1, 1]:
         begin += 1
     while end - begin > 1 and xy[end - 1, 0] == xy[end - 2, 0] and xy[end - 1, 1] == xy[end - 2, 1]:
@@ -146,34 +149,40 @@ def _bounds(xy: FloatArray, begin: int, end: int, reach: float) -> FloatArray:
 
 @kernel
 def _side(
-    path: PdmPath, begin: int, end: int, half_width: float, ring: FloatArray, circle: FloatArray
+    xy: FloatArray,
+    runs: FloatArray,
+    begin: int,
+    end: int,
+    half_width: float,
+    ring: FloatArray,
+    x: float,
+    y: float,
+    radius: float,
 ) -> int:
+    """Side of a ring within a circle, relative to the vertices `begin` … `end` - 1 of a path."""
     inner, outer = (1.0 - BAND) * half_width, (1.0 + BAND) * half_width
-    limit = circle[2] + outer
+    limit = radius + outer
     nearest = np.inf
     for run in range(begin // RUN, (end - 2) // RUN + 1):
-        dx = max(path.runs[run, 0] - circle[0], 0.0, circle[0] - path.runs[run, 2])
-        dy = max(path.runs[run, 1] - circle[1], 0.0, circle[1] - path.runs[run, 3])
+        dx = max(runs[run, 0] - x, 0.0, x - runs[run, 2])
+        dy = max(runs[run, 1] - y, 0.0, y - runs[run, 3])
         if dx * dx + dy * dy > limit * limit:
             continue
         for index in range(max(begin, run * RUN), min(end - 1, (run + 1) * RUN)):
-            nearest = min(nearest, segment_distance(ring, path.xy[index], path.xy[index + 1]))
+            nearest = min(nearest, segment_distance(ring, xy[index], xy[index + 1]))
             if nearest <= inner:
                 return HIT
     # beyond the first and the last vertex the corridor goes on straight by half a width
-    nearest = min(nearest, _cap_distance(path.xy[begin + 1], path.xy[begin], outer, ring, circle))
-    nearest = min(nearest, _cap_distance(path.xy[end - 2], path.xy[end - 1], outer, ring, circle))
+    for last, before in ((begin, begin + 1), (end - 1, end - 2)):
+        if np.hypot(x - xy[last, 0], y - xy[last, 1]) <= radius + 2.0 * outer:
+            nearest = min(nearest, _cap_distance(xy[before], xy[last], outer, ring))
     return OPEN if nearest <= outer else CLEAR
 
 
 @kernel
-def _cap_distance(
-    a: FloatArray, b: FloatArray, outer: float, ring: FloatArray, circle: FloatArray
-) -> float:
-    """Distance from a ring to the extension of the segment a-b beyond b; inf if it is far."""
+def _cap_distance(a: FloatArray, b: FloatArray, outer: float, ring: FloatArray) -> float:
+    """Distance from a ring to the extension of the segment a-b beyond b [m]."""
     length = np.hypot(b[0] - a[0], b[1] - a[1])
-    if np.hypot(circle[0] - b[0], circle[1] - b[1]) > circle[2] + 2.0 * outer:
-        return np.inf
     tip = np.empty(2)
     tip[0] = b[0] + outer / length * (b[0] - a[0])
     tip[1] = b[1] + outer / length * (b[1] - a[1])

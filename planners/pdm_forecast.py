@@ -12,33 +12,36 @@ from shiftsim.planners.pdm_areas import index_ranks
 from shiftsim.planners.pdm_parameters import DT, STEPS, PdmParameters
 from shiftsim.state import LAST_AGENT_KIND, AgentKind, Tracks
 
-LIGHT = -1  # kind of a red light
 LIGHT_TOKEN = "red_light_"
 NUM_FORECASTS = STEPS // 2 + 1  # nuPlan: every other time index has its own map (§11 Q4)
 
 
 class Occupants(NamedTuple):
-    """Polygons around the ego at the present, and how they move. M polygons.
+    """Boxes around the ego on every forecast map, and red lights. B boxes, M = B + lights.
 
     Attributes:
-        xy: (V, 2) vertices of all rings, not closed [m].
-        ptr: (M + 1,) first vertex of each ring.
-        circles: (M, 3) x, y, radius of a circle around each ring [m].
-        motion: (M, 2) displacement per second [m/s].
-        headings: (M,) of the box; 0 for a red light [rad].
-        speeds: (M,) 0 for static objects and red lights [m/s].
-        kinds: (M,) AgentKind codes, or LIGHT.
+        boxes: (41, B, 4, 2) corners [m].
+        centers: (41, B, 2) centres of the boxes [m].
+        radii: (B,) half diagonals [m].
+        moves: (B,) whether a box changes from map to map.
+        headings: (B,) of the box [rad].
+        speeds: (B,) 0 for static objects [m/s].
+        kinds: (B,) AgentKind codes.
         ignored: (M,) whether the ego has touched it before.
+        light_xy: (V, 2) vertices of the red connectors, not closed [m].
+        light_ptr: (lights + 1,) first vertex of each.
     """
 
-    xy: FloatArray
-    ptr: IntArray
-    circles: FloatArray
-    motion: FloatArray
+    boxes: FloatArray
+    centers: FloatArray
+    radii: FloatArray
+    moves: BoolArray
     headings: FloatArray
     speeds: FloatArray
     kinds: IntArray
     ignored: BoolArray
+    light_xy: FloatArray
+    light_ptr: IntArray
 
 
 def select_tracks(
@@ -79,26 +82,20 @@ def make_occupants(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray
     is_forward = np.abs(wrap_angles(poses[:, 2] - course)) < np.pi / 2.0
     heading = np.where(is_forward, poses[:, 2], poses[:, 2] + np.pi)
     motion = speeds[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
-    radii = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
-    boxes = boxes_to_corners(poses, sizes).reshape(-1, 2)
-    nothing = np.zeros(len(lights))
-    lengths = np.concatenate([[0], np.full(len(chosen), 4), [len(ring) for ring in lights]])
+    boxes = boxes_to_corners(poses, sizes)
+    shift = (2.0 * DT * np.arange(NUM_FORECASTS))[:, None, None] * motion
     return Occupants(
-        np.concatenate([boxes, *lights]),
-        np.cumsum(lengths.astype(np.int64)),
-        np.concatenate([np.column_stack([poses[:, :2], radii]), *map(_circle, lights)]),
-        np.concatenate([motion, np.zeros((len(lights), 2))]),
-        np.concatenate([poses[:, 2], nothing]),
-        np.concatenate([speeds, nothing]),
-        np.concatenate([kinds, np.full(len(lights), LIGHT)]),
+        np.ascontiguousarray(boxes + shift[:, :, None]),
+        np.ascontiguousarray(poses[:, :2] + shift),
+        0.5 * np.hypot(sizes[:, 0], sizes[:, 1]),
+        motion.any(axis=1),
+        np.ascontiguousarray(poses[:, 2]),
+        speeds,
+        kinds,
         np.zeros(len(chosen) + len(lights), np.bool_),
+        np.concatenate([np.zeros((0, 2)), *lights]),
+        np.cumsum([0, *(len(ring) for ring in lights)]),
     )
-
-
-def _circle(ring: FloatArray) -> FloatArray:
-    middle = 0.5 * (ring.min(axis=0) + ring.max(axis=0))
-    radius = np.hypot(ring[:, 0] - middle[0], ring[:, 1] - middle[1]).max()
-    return np.array([[middle[0], middle[1], radius]])
 
 
 def touched(occupants: Occupants, footprint: FloatArray) -> list[int]:
@@ -106,9 +103,9 @@ def touched(occupants: Occupants, footprint: FloatArray) -> list[int]:
 
     A red light counts only once the ego is entirely on its connector.
     """
-    found = np.empty(len(occupants.kinds), np.int64)
-    chosen = found[: _touching(occupants, footprint, found)].tolist()
-    lights = np.flatnonzero(occupants.kinds == LIGHT).tolist()
+    chosen = np.flatnonzero(touches_boxes(footprint, occupants.boxes[0])).tolist()
+    count = len(occupants.kinds)
+    lights = range(count, len(occupants.ignored))
     if lights:
         ego = shapely.Polygon(footprint)
         chosen += [i for i in lights if ego.within(shapely.Polygon(ring_of(occupants, i)))]
@@ -119,48 +116,41 @@ def touched(occupants: Occupants, footprint: FloatArray) -> list[int]:
 
 
 @kernel
-def _touching(occupants: Occupants, footprint: FloatArray, out: IntArray) -> int:
-    count = 0
-    for index in range(len(occupants.kinds)):
-        if occupants.kinds[index] == LIGHT:
-            continue
-        dx = occupants.circles[index, 0] - footprint[0, 0]
-        dy = occupants.circles[index, 1] - footprint[0, 1]
-        across = np.hypot(footprint[0, 0] - footprint[2, 0], footprint[0, 1] - footprint[2, 1])
-        if np.hypot(dx, dy) > 1.001 * (occupants.circles[index, 2] + across):
-            continue
-        if convex_intersect(
-            occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]], footprint
-        ):
-            out[count] = index
-            count += 1
-    return count
+def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
+    """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
+    out = np.zeros(len(boxes), np.bool_)
+    for index in range(len(boxes)):
+        dx = boxes[index, 0, 0] + boxes[index, 2, 0] - footprint[0, 0] - footprint[2, 0]
+        dy = boxes[index, 0, 1] + boxes[index, 2, 1] - footprint[0, 1] - footprint[2, 1]
+        reach = _diagonal(footprint) + _diagonal(boxes[index])
+        if dx * dx + dy * dy <= 1.001 * reach * reach:
+            out[index] = convex_intersect(boxes[index], footprint)
+    return out
+
+
+@kernel
+def _diagonal(box: FloatArray) -> float:
+    return np.hypot(box[0, 0] - box[2, 0], box[0, 1] - box[2, 1])
 
 
 def ring_of(occupants: Occupants, index: int, forecast: int = 0) -> FloatArray:
     """(V, 2) ring of one occupant on a forecast map [m]."""
-    ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
-    return ring + 2.0 * DT * forecast * occupants.motion[index]
+    count = len(occupants.kinds)
+    if index < count:
+        return occupants.boxes[forecast, index]
+    light = index - count
+    return occupants.light_xy[occupants.light_ptr[light] : occupants.light_ptr[light + 1]]
 
 
 def forecast_ranks(occupants: Occupants, forecast: int) -> IntArray:
     """(M,) place of each occupant among the results of nuPlan's index of one forecast map."""
-    starts = occupants.ptr[:-1]
-    shift = 2.0 * DT * forecast * occupants.motion
-    low = np.minimum.reduceat(occupants.xy, starts) + shift
-    high = np.maximum.reduceat(occupants.xy, starts) + shift
-    return index_ranks(np.hstack([low, high]))
-
-
-@kernel
-def place_ring(occupants: Occupants, index: int, forecast: int, out: FloatArray) -> int:
-    """Write the ring of one occupant on a forecast map into `out`; the number of its vertices."""
-    start, stop = occupants.ptr[index], occupants.ptr[index + 1]
-    seconds = 0.1 * (2 * forecast)
-    for vertex in range(start, stop):
-        out[vertex - start, 0] = occupants.xy[vertex, 0] + seconds * occupants.motion[index, 0]
-        out[vertex - start, 1] = occupants.xy[vertex, 1] + seconds * occupants.motion[index, 1]
-    return stop - start
+    boxes = occupants.boxes[forecast]
+    bounds = np.hstack([boxes.min(axis=1), boxes.max(axis=1)])
+    if len(occupants.light_ptr) > 1:
+        starts, xy = occupants.light_ptr[:-1], occupants.light_xy
+        lights = np.hstack([np.minimum.reduceat(xy, starts), np.maximum.reduceat(xy, starts)])
+        bounds = np.concatenate([bounds, lights])
+    return index_ranks(bounds)
 
 
 @kernel
@@ -171,21 +161,12 @@ def centroid(ring: FloatArray) -> tuple[float, float]:
     origin the last bits are those of its geometry library (pdm-closed.md §11 Q23).
     """
     area = x = y = 0.0
-    ox, oy = ring[0]
+    ox, oy = ring[0, 0], ring[0, 1]
     for index in range(len(ring)):
-        ax, ay = ring[index]
-        bx, by = ring[index + 1] if index + 1 < len(ring) else ring[0]
+        after = index + 1 if index + 1 < len(ring) else 0
+        ax, ay, bx, by = ring[index, 0], ring[index, 1], ring[after, 0], ring[after, 1]
         double = (ax - ox) * (by - oy) - (bx - ox) * (ay - oy)
         x += double * (ox + ax + bx)
         y += double * (oy + ay + by)
         area += double
     return x / 3.0 / area, y / 3.0 / area
-
-
-@kernel
-def widest(occupants: Occupants) -> int:
-    """Most vertices of any ring, at least 4."""
-    most = 4
-    for index in range(len(occupants.kinds)):
-        most = max(most, occupants.ptr[index + 1] - occupants.ptr[index])
-    return most

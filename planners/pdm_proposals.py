@@ -13,14 +13,7 @@ from shiftsim.geometry import box_corners, ring_distance, wrap_angle
 from shiftsim.planners.idm_corridor import HIT
 from shiftsim.planners.pdm_centerline import box_to_ring
 from shiftsim.planners.pdm_corridor import Corridor, fill_corridor, make_corridor
-from shiftsim.planners.pdm_forecast import (
-    LIGHT,
-    NUM_FORECASTS,
-    Occupants,
-    forecast_ranks,
-    place_ring,
-    widest,
-)
+from shiftsim.planners.pdm_forecast import NUM_FORECASTS, Occupants, forecast_ranks
 from shiftsim.planners.pdm_parameters import DT, SCORED, STEPS, FollowingModel
 from shiftsim.planners.pdm_path import PdmPath, interpolate, project
 from shiftsim.state import VX, VehicleParameters
@@ -115,7 +108,7 @@ def _roll_path(
 ) -> None:
     corridor = proposals.corridors[index]
     fill_corridor(path, corridor, occupants, (first + 1) // 2, last // 2 + 1)
-    ranks = np.full((NUM_FORECASTS, len(occupants.kinds)), -1)
+    ranks = np.full((NUM_FORECASTS, len(occupants.ignored)), -1)
     step = first
     while True:
         step = _roll(
@@ -171,68 +164,112 @@ def _roll(
     Returns:
         DONE, or the time index whose ranks are needed to break a tie.
     """
-    footprint, ring_room = np.empty((4, 2)), np.empty((widest(occupants), 2))
-    hits = np.empty(len(occupants.kinds), np.int64)
-    end = path.progress[-1]
+    footprint = np.empty((4, 2))
+    sides, centroids = corridor.sides, corridor.progress
+    ignored, headings, speeds = occupants.ignored, occupants.headings, occupants.speeds
+    hits = np.empty(len(ignored), np.int64)
+    num_boxes = len(speeds)
     for step in range(first, last + 1):
         forecast = step // 2
         num_hits = 0
-        for index in range(len(occupants.kinds)):
-            if corridor.sides[forecast, index] == HIT and not occupants.ignored[index]:
+        for index in range(len(ignored)):
+            if sides[forecast, index] == HIT and not ignored[index]:
                 hits[num_hits] = index
                 num_hits += 1
         # nuPlan: one lead for all policies of a path, cleared once per time index; what a policy
         # does not overwrite it inherits from the one before (pdm-closed.md §11 Q2)
         lead_speed, rear = 0.0, 0.0
         for policy in range(len(targets)):
-            progress, speed = motion[policy, step - 1]
+            progress, speed = motion[policy, step - 1, 0], motion[policy, step - 1, 1]
+            pose, lead = poses[policy, step - 1], leads[policy, step]
             if step % 2 == 1:
-                leads[policy, step] = leads[policy, step - 1]  # nuPlan: at 1 these are zeros (Q3)
+                for column in range(3):  # nuPlan: at index 1 these are zeros (§11 Q3)
+                    lead[column] = leads[policy, step - 1, column]
             else:
-                pose = poses[policy, step - 1]
-                center_x = pose[0] + size[2] * np.cos(pose[2])
-                center_y = pose[1] + size[2] * np.sin(pose[2])
-                box_corners(center_x, center_y, pose[2], size[0], size[1], footprint)
-                best, found, is_tied = np.inf, -1, False
-                for index in hits[:num_hits]:
-                    if not corridor.progress[forecast, index] > progress:
-                        continue
-                    seconds = 0.1 * (2 * forecast)
-                    dx = occupants.circles[index, 0] + seconds * occupants.motion[index, 0]
-                    dy = occupants.circles[index, 1] + seconds * occupants.motion[index, 1]
-                    around = occupants.circles[index, 2] + 0.5 * (size[0] + size[1])
-                    if np.hypot(dx - center_x, dy - center_y) - around > best:
-                        continue
-                    ring = ring_room[: place_ring(occupants, index, forecast, ring_room)]
-                    if occupants.kinds[index] == LIGHT:
-                        distance = box_to_ring(footprint, ring)
-                    else:
-                        distance = ring_distance(footprint, ring)
-                    if distance < best:
-                        best, found, is_tied = distance, index, False
-                    elif distance == best:
-                        if ranks[forecast, index] < 0:
-                            is_tied = True
-                        elif ranks[forecast, index] < ranks[forecast, found]:
-                            found = index
-                if is_tied:
-                    return step
-                lead_progress = end
-                if found < 0:
-                    rear = 0.5 * size[0]
+                x = pose[0] + size[2] * np.cos(pose[2])
+                y = pose[1] + size[2] * np.sin(pose[2])
+                lead[0] = path.progress[-1]
+                if _any_ahead(hits[:num_hits], centroids[forecast], progress):
+                    box_corners(x, y, pose[2], size[0], size[1], footprint)
+                    found, distance = _nearest(
+                        hits[:num_hits],
+                        centroids[forecast],
+                        progress,
+                        footprint,
+                        occupants.boxes[forecast],
+                        occupants.centers[forecast],
+                        occupants.radii,
+                        occupants.light_xy,
+                        occupants.light_ptr,
+                        ranks[forecast],
+                    )
+                    if found < 0:
+                        return step
+                    lead[0] = progress + distance
+                    if found < num_boxes:
+                        turn = wrap_angle(headings[found] - pose[2])
+                        lead_speed = speeds[found] * np.cos(turn)
                 else:
-                    lead_progress = progress + best
-                    if occupants.kinds[found] != LIGHT:
-                        turn = wrap_angle(occupants.headings[found] - pose[2])
-                        lead_speed = occupants.speeds[found] * np.cos(turn)
-                leads[policy, step, 0] = lead_progress
-                leads[policy, step, 1] = lead_speed
-                leads[policy, step, 2] = rear
-            accel = acceleration(progress, speed, leads[policy, step], targets[policy], model)
+                    rear = 0.5 * size[0]
+                lead[1], lead[2] = lead_speed, rear
+            accel = acceleration(progress, speed, lead, targets[policy], model)
             motion[policy, step, 0] = progress + 0.1 * speed
             motion[policy, step, 1] = speed + 0.1 * accel
             interpolate(path, motion[policy, step, 0], poses[policy, step])
     return DONE
+
+
+@kernel
+def _any_ahead(hits: IntArray, centroids: FloatArray, progress: float) -> bool:
+    for index in hits:
+        if centroids[index] > progress:
+            return True
+    return False
+
+
+@kernel
+def _nearest(
+    hits: IntArray,
+    centroids: FloatArray,
+    progress: float,
+    footprint: FloatArray,
+    boxes: FloatArray,
+    centers: FloatArray,
+    radii: FloatArray,
+    light_xy: FloatArray,
+    light_ptr: IntArray,
+    ranks: IntArray,
+) -> tuple[int, float]:
+    """The occupant ahead nearest to the footprint, by rank on ties, and its distance [m].
+
+    The occupant is -1 where ranks are needed and not known.
+    """
+    x = 0.5 * (footprint[0, 0] + footprint[2, 0])
+    y = 0.5 * (footprint[0, 1] + footprint[2, 1])
+    radius = np.hypot(footprint[0, 0] - x, footprint[0, 1] - y) + 1e-6
+    best, found, is_tied = np.inf, -1, False
+    for index in hits:
+        if not centroids[index] > progress:
+            continue
+        light = index - len(radii)
+        if light >= 0:
+            ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
+            distance = box_to_ring(footprint, ring)
+        else:
+            away = np.hypot(centers[index, 0] - x, centers[index, 1] - y)
+            if away - radius - radii[index] > best:
+                continue
+            distance = ring_distance(footprint, boxes[index])
+        if distance < best:
+            best, found, is_tied = distance, index, False
+        elif distance == best:
+            if ranks[index] < 0:
+                is_tied = True
+            elif ranks[index] < ranks[found]:
+                found = index
+    if is_tied:
+        return -1, best
+    return found, best
 
 
 @kernel
@@ -259,7 +296,7 @@ def follow_many(
     """(K, 2) progress and speed after one step, for K unrelated rows as in `Proposals`."""
     out = np.empty((len(motion), 2))
     for row in range(len(motion)):
-        progress, speed = motion[row]
+        progress, speed = motion[row, 0], motion[row, 1]
         out[row, 0] = progress + 0.1 * speed
         accel = acceleration(progress, speed, leads[row], targets[row], model)
         out[row, 1] = speed + 0.1 * accel

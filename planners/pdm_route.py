@@ -7,6 +7,7 @@ appearance, which decides the same things at linear cost.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -119,7 +120,7 @@ def _lead_in(road: VectorMap, blocks: list[int], start: Start) -> list[int]:
 def _fill_gaps(road: VectorMap, blocks: list[int]) -> list[int]:
     """Blocks between consecutive ones that are not connected (§3.3)."""
     out = blocks[:1]
-    for before, after in zip(blocks[:-1], blocks[1:], strict=True):
+    for before, after in pairwise(blocks):
         if before not in road.block_incoming.at(after):
             bridge = search(road.block_outgoing.at, before, {after}, FORWARD_DEPTH)
             if bridge.found:

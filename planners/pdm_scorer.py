@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry import (
     EXTERIOR,
     box_corners,
@@ -18,7 +18,7 @@ from shiftsim.geometry import (
 from shiftsim.layers import Polygons, in_any
 from shiftsim.planners.pdm_areas import Areas, ego_areas
 from shiftsim.planners.pdm_comfort import Filters, comfort
-from shiftsim.planners.pdm_forecast import LIGHT, Occupants, centroid, place_ring
+from shiftsim.planners.pdm_forecast import Occupants, centroid
 from shiftsim.planners.pdm_parameters import (
     EGO_STOPPED,
     TRACK_STOPPED,
@@ -69,13 +69,13 @@ class Road(NamedTuple):
 
     Attributes:
         areas: Lanes, connectors and car parks.
-        admitted: (M,) those of this step.
+        admitted: Those of this step.
         intersections: Areas where what is beside the ego counts as well.
         centerline: Progress is measured along it.
     """
 
     areas: Areas
-    admitted: BoolArray
+    admitted: IntArray
     intersections: Polygons
     centerline: PdmPath
 
@@ -95,10 +95,11 @@ def score(
     place_ego(states, size, corners, centers)
     areas = np.empty((count, steps, 3), np.bool_)
     ego_areas(road.areas, road.admitted, corners, centers, areas)
+    near = _near(states, centers, occupants, size)
     no_collision, collision_index = np.empty(count), np.empty(count)
-    _collisions(states, corners, areas, occupants, no_collision, collision_index)
+    _collisions(states, corners, areas, occupants, near, no_collision, collision_index)
     ttc, ttc_index = np.empty(count), np.empty(count)
-    _times_to_collision(states, corners, areas, occupants, road.intersections, ttc, ttc_index)
+    _times_to_collision(states, corners, areas, occupants, near, road.intersections, ttc, ttc_index)
     raw, oncoming = np.empty(count), np.empty(count)
     _travel(centers, areas, road.centerline, raw, oncoming)
     signals, bounded = np.empty((count, 6, steps)), np.empty((count, 6), np.bool_)
@@ -157,8 +158,8 @@ def place_ego(
 def bearing(state: FloatArray, x: float, y: float) -> float:
     """Angle between the heading and the direction from the rear axle to a point, in [0, pi].
 
-    nuPlan: the cosine is not clamped, so an object exactly ahead or behind may have the bearing NaN,
-    and every comparison with it is false (pdm-closed.md §11 Q23).
+    nuPlan: the cosine is not clamped, so an object exactly ahead or behind may have the bearing
+    NaN, and every comparison with it is false (pdm-closed.md §11 Q23).
     """
     dx, dy = x - state[X], y - state[Y]
     distance = np.sqrt(dx * dx + dy * dy)
@@ -167,16 +168,35 @@ def bearing(state: FloatArray, x: float, y: float) -> float:
 
 
 @kernel
-def _can_touch(occupants: Occupants, index: int, forecast: int, corners: FloatArray) -> bool:
-    """Whether the circle around an occupant reaches the one around a box (4, 2)."""
-    seconds = 0.1 * (2 * forecast)
-    x = occupants.circles[index, 0] + seconds * occupants.motion[index, 0]
-    y = occupants.circles[index, 1] + seconds * occupants.motion[index, 1]
-    dx = x - 0.5 * (corners[0, 0] + corners[2, 0])
-    dy = y - 0.5 * (corners[0, 1] + corners[2, 1])
-    across = abs(corners[0, 0] - corners[2, 0]) + abs(corners[0, 1] - corners[2, 1])
-    reach = occupants.circles[index, 2] + across
-    return dx * dx + dy * dy <= reach * reach
+def _near(
+    states: FloatArray, centers: FloatArray, occupants: Occupants, size: tuple[float, float, float]
+) -> IntArray:
+    """Boxes that can touch any ego box, or its projection, at any time index."""
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for row in range(centers.shape[0]):
+        for step in range(centers.shape[1]):
+            reach = 0.5 * (size[0] + size[1])
+            reach += 0.1 * TTC_STEPS[-1] * np.hypot(states[row, step, VX], states[row, step, VY])
+            x, y = centers[row, step, 0], centers[row, step, 1]
+            low_x, high_x = min(low_x, x - reach), max(high_x, x + reach)
+            low_y, high_y = min(low_y, y - reach), max(high_y, y + reach)
+    last = (centers.shape[1] - 1 + TTC_STEPS[-1]) // 2
+    out = np.empty(len(occupants.radii), np.int64)
+    count = 0
+    for index in range(len(out)):
+        start, end = occupants.centers[0, index], occupants.centers[last, index]
+        radius = occupants.radii[index]
+        if (
+            not occupants.ignored[index]
+            and min(start[0], end[0]) - radius <= high_x
+            and max(start[0], end[0]) + radius >= low_x
+            and min(start[1], end[1]) - radius <= high_y
+            and max(start[1], end[1]) + radius >= low_y
+        ):
+            out[count] = index
+            count += 1
+    return out[:count]
 
 
 @kernel
@@ -196,44 +216,60 @@ def _collisions(
     corners: FloatArray,
     areas: BoolArray,
     occupants: Occupants,
+    near: IntArray,
     scores: FloatArray,
     first: FloatArray,
 ) -> None:
     """At-fault collisions (§8.2): factors and first time indices (P,), into the last two."""
-    ring = np.empty((4, 2))
-    count = len(occupants.kinds)
-    forgiven = np.empty(count, np.bool_)
-    for row in range(len(states)):
+    boxes, centers, radii = occupants.boxes, occupants.centers, occupants.radii
+    kinds, speeds = occupants.kinds, occupants.speeds
+    forgiven = np.empty(len(near), np.bool_)
+    for row in range(states.shape[0]):
         scores[row], first[row] = 1.0, NEVER
-        for index in range(count):
-            forgiven[index] = occupants.ignored[index] or occupants.kinds[index] == LIGHT
+        for entry in range(len(near)):
+            forgiven[entry] = False
         for step in range(states.shape[1]):
-            box = corners[row, step]
-            for index in range(count):
-                if forgiven[index] or not _can_touch(occupants, index, step // 2, box):
+            box, state, forecast = corners[row, step], states[row, step], step // 2
+            x, y, radius = _circle_of(box)
+            for entry in range(len(near)):
+                index = near[entry]
+                dx, dy = centers[forecast, index, 0] - x, centers[forecast, index, 1] - y
+                reach = radius + radii[index]
+                if forgiven[entry] or dx * dx + dy * dy > reach * reach:
                     continue
-                place_ring(occupants, index, step // 2, ring)
+                ring = boxes[forecast, index]
                 if not convex_intersect(box, ring):
                     continue
-                state = states[row, step]
-                is_agent = occupants.kinds[index] <= LAST_AGENT_KIND
-                if np.hypot(state[VX], state[VY]) <= EGO_STOPPED:
-                    at_fault = False
-                elif not is_agent or occupants.speeds[index] <= TRACK_STOPPED:
-                    at_fault = True
-                else:
-                    x, y = centroid(ring)
-                    if bearing(state, x, y) > BEHIND:
-                        at_fault = False
-                    elif _front_touches(box, ring):
-                        at_fault = True
-                    else:
-                        at_fault = areas[row, step, 0] or areas[row, step, 1]
-                if at_fault:
+                is_agent = kinds[index] <= LAST_AGENT_KIND
+                is_stopped = not is_agent or speeds[index] <= TRACK_STOPPED
+                on_edge = areas[row, step, 0] or areas[row, step, 1]
+                if _is_at_fault(state, box, ring, is_stopped, on_edge):
                     scores[row] = min(scores[row], 0.0 if is_agent else 0.5)
                     first[row] = min(first[row], float(step))
                 else:
-                    forgiven[index] = True
+                    forgiven[entry] = True
+
+
+@kernel
+def _circle_of(box: FloatArray) -> tuple[float, float, float]:
+    """Centre and radius of a circle around a box (4, 2), a little larger than it [m]."""
+    x, y = 0.5 * (box[0, 0] + box[2, 0]), 0.5 * (box[0, 1] + box[2, 1])
+    return x, y, np.hypot(box[0, 0] - x, box[0, 1] - y) + 1e-6
+
+
+@kernel
+def _is_at_fault(
+    state: FloatArray, box: FloatArray, ring: FloatArray, is_stopped: bool, on_edge: bool
+) -> bool:
+    """Whether the ego causes a collision; `on_edge`: on several lanes, or off the road."""
+    if np.hypot(state[VX], state[VY]) <= EGO_STOPPED:
+        return False
+    if is_stopped:
+        return True
+    x, y = centroid(ring)
+    if bearing(state, x, y) > BEHIND:
+        return False
+    return on_edge or _front_touches(box, ring)
 
 
 @kernel
@@ -242,51 +278,63 @@ def _times_to_collision(
     corners: FloatArray,
     areas: BoolArray,
     occupants: Occupants,
+    near: IntArray,
     intersections: Polygons,
     scores: FloatArray,
     first: FloatArray,
 ) -> None:
     """Time to collision (§8.6): scores and first time indices (P,), into the last two."""
-    ring, box = np.empty((4, 2)), np.empty((4, 2))
-    count = len(occupants.kinds)
-    forgiven = np.empty(count, np.bool_)
-    for row in range(len(states)):
+    boxes, centers, radii = occupants.boxes, occupants.centers, occupants.radii
+    box = np.empty((4, 2))
+    forgiven = np.empty(len(near), np.bool_)
+    for row in range(states.shape[0]):
         scores[row], first[row] = 1.0, NEVER
-        for index in range(count):
-            forgiven[index] = occupants.ignored[index] or occupants.kinds[index] == LIGHT
+        for entry in range(len(near)):
+            forgiven[entry] = False
         for step in range(states.shape[1]):
             state = states[row, step]
             speed = np.hypot(state[VX], state[VY])
             if speed < TTC_STOPPED:
                 continue
+            cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
+            on_edge = areas[row, step, 0] or areas[row, step, 1]
             for ahead in TTC_STEPS:
                 travel = 0.1 * ahead * speed
                 for corner in range(4):
-                    box[corner, 0] = corners[row, step, corner, 0] + travel * np.cos(state[HEADING])
-                    box[corner, 1] = corners[row, step, corner, 1] + travel * np.sin(state[HEADING])
+                    box[corner, 0] = corners[row, step, corner, 0] + travel * cos
+                    box[corner, 1] = corners[row, step, corner, 1] + travel * sin
                 forecast = (step + ahead) // 2
-                for index in range(count):
-                    if forgiven[index] or not _can_touch(occupants, index, forecast, box):
+                x, y, radius = _circle_of(box)
+                for entry in range(len(near)):
+                    index = near[entry]
+                    dx, dy = centers[forecast, index, 0] - x, centers[forecast, index, 1] - y
+                    reach = radius + radii[index]
+                    if forgiven[entry] or dx * dx + dy * dy > reach * reach:
                         continue
-                    place_ring(occupants, index, forecast, ring)
+                    ring = boxes[forecast, index]
                     if not convex_intersect(box, ring):
                         continue
-                    x, y = centroid(ring)
-                    angle = bearing(state, x, y)
-                    is_violation = angle < AHEAD
-                    if not is_violation and not angle > BEHIND:
-                        is_violation = (
-                            areas[row, step, 0]
-                            or areas[row, step, 1]
-                            or in_any(intersections, state[X], state[Y])
-                        )
-                    if is_violation:
+                    if _is_violation(state, ring, on_edge, intersections):
                         scores[row] = 0.0
                         first[row] = min(first[row], float(step))
                     else:
-                        forgiven[index] = True
+                        forgiven[entry] = True
             if scores[row] == 0.0:
                 break
+
+
+@kernel
+def _is_violation(
+    state: FloatArray, ring: FloatArray, on_edge: bool, intersections: Polygons
+) -> bool:
+    """Whether an object in the ego's way counts: it is ahead, or beside it where lanes meet."""
+    x, y = centroid(ring)
+    angle = bearing(state, x, y)
+    if angle < AHEAD:
+        return True
+    if angle > BEHIND:
+        return False
+    return on_edge or in_any(intersections, state[X], state[Y])
 
 
 @kernel

@@ -63,7 +63,7 @@ def plan_step(
         vehicle: Dimensions of the ego.
         params: The planner's numbers.
     """
-    proposals = start_proposals(paths, ego, targets, vehicle, len(occupants.kinds))
+    proposals = start_proposals(paths, ego, targets, vehicle, len(occupants.ignored))
     roll_out(proposals, paths, occupants, vehicle, params.following)
     poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)
     speeds, curvatures = np.empty((len(poses), SCORED)), np.empty((len(poses), SCORED))

@@ -88,7 +88,8 @@ def simulate_proposals(
     for row in range(len(poses)):
         fit_speed(poses[row], dt, params.jerk_penalty, speeds[row])
         fit_curvature(poses[row], speeds[row], dt, params.curvature_rate_penalty, curvatures[row])
-        states[row, 0] = ego
+        for column in range(len(ego)):
+            states[row, 0, column] = ego[column]
         for step in range(last + 1):
             state, pose = states[row, step], poses[row, step]
             for index in range(params.horizon):
