@@ -16,6 +16,7 @@ from shiftsim.state import Tracks
 _MODELS = {
     "nonreactive": "shiftsim.traffic.log_replay:LogReplay",
     "reactive": "shiftsim.traffic.idm:IdmTraffic",
+    "reactive-fixed": "shiftsim.traffic.idm:FixedIdmTraffic",  # not nuPlan's, never for benchmarks
 }
 _SHORT = {"nr": "nonreactive", "r": "reactive"}
 

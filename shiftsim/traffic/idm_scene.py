@@ -10,7 +10,6 @@ from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
 from shiftsim.state import (
     HEADING,
-    LAST_AGENT_KIND,
     PACIFICA,
     VX,
     VY,
@@ -21,16 +20,19 @@ from shiftsim.state import (
 from shiftsim.traffic.idm_agents import Start, more_room
 from shiftsim.traffic.idm_buffer import curve_room
 from shiftsim.traffic.idm_paths import Fleet, Roads
+from shiftsim.traffic.idm_shapes import PIECE
 from shiftsim.traffic.idm_step import (
     Driving,
     Obstacles,
     Scratch,
     extend_routes,
     move_agent,
+    place_replayed,
     remove_far,
     set_box,
-    set_boxes,
+    set_speeds,
     step_agents,
+    write_agents,
 )
 
 _CURVE_ROOM = 256  # vertices of a footprint to begin with
@@ -91,8 +93,8 @@ class Scene:
             radius: Agents farther from the ego are removed [m].
         """
         # nuPlan: the ego is one step old, lights and replayed objects are one step ahead (§12 Q11)
-        count = self._place(ego, tracks, row)
         center = center_poses(ego[None, : HEADING + 1])[0]
+        count = self._place(ego, center, tracks, row)
         remove_far(self.fleet, self.obstacles, center[0], center[1], radius)
         self.status[self.light_edges] = self.lights[iteration + 1]
         while needed := extend_routes(
@@ -120,37 +122,29 @@ class Scene:
         )
         return agent
 
-    def _place(self, ego: FloatArray, tracks: Tracks, row: int) -> int:
+    def _place(self, ego: FloatArray, center: FloatArray, tracks: Tracks, row: int) -> int:
         """Put ego and replayed tracks among the obstacles; returns how many obstacles count."""
-        obstacles, first = self.obstacles, len(self.agents)
-        center = center_poses(ego[None, : HEADING + 1])[0]
-        set_box(obstacles, first, *center, PACIFICA.length, PACIFICA.width)
-        obstacles.speed[first] = np.hypot(ego[VX], ego[VY])
-        present = self.replayed[tracks.valid[row, self.replayed]]
-        set_boxes(obstacles, first + 1, tracks.poses[row, present], tracks.sizes[row, present])
-        count = first + 1 + len(present)
+        obstacles, first = self.obstacles, len(self.agents) + 1
+        set_box(obstacles, first - 1, *center, PACIFICA.length, PACIFICA.width)
+        obstacles.speed[first - 1] = np.hypot(ego[VX], ego[VY])
+        valid, velocities = tracks.valid[row], tracks.velocities[row]
+        count: int = place_replayed(
+            obstacles, first, self.replayed, valid, tracks.poses[row], tracks.sizes[row]
+        )
         if self.moving:
-            velocity = tracks.velocities[row, present]
-            is_agent = tracks.kinds[present] <= LAST_AGENT_KIND
-            speed = np.hypot(velocity[:, 0], velocity[:, 1])
-            obstacles.speed[first + 1 : count] = np.where(is_agent, speed, 0.0)
-            obstacles.heading[first + 1 : count] = np.where(
-                is_agent, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0
-            )
+            set_speeds(obstacles, first, self.replayed, valid, velocities)
         return count
 
     def write(self, tracks: Tracks, row: int) -> None:
         """Write the agents into a row; those that are gone are not valid there."""
-        tracks.valid[row, self.agents] = self.fleet.alive
-        speed, heading = self.fleet.speed, self.fleet.pose[:, 2]
-        gone = ~self.fleet.alive
-        velocity = np.stack([speed * np.cos(heading), speed * np.sin(heading)], -1)
-        for target, values in (
-            (tracks.poses, self.fleet.pose),
-            (tracks.velocities, velocity),
-            (tracks.sizes, self.fleet.size),
-        ):
-            target[row, self.agents] = np.where(gone[:, None], np.nan, values)
+        write_agents(
+            self.fleet,
+            self.agents,
+            tracks.valid[row],
+            tracks.poses[row],
+            tracks.velocities[row],
+            tracks.sizes[row],
+        )
 
 
 def make_scene(
@@ -174,9 +168,10 @@ def make_scene(
     """
     road, count = scenario.map, len(agents)
     obstacles = _make_obstacles(count, count + 1 + len(replayed))
-    poses = np.array([start.pose for start in starts]).reshape(-1, 3)
+    poses = [start.pose for start in starts]
     # the first gaps are measured between snapped boxes, not footprints (§10.2)
-    set_boxes(obstacles, 0, poses, fleet.size)
+    for agent, pose in enumerate(poses):
+        set_box(obstacles, agent, *pose, *fleet.size[agent])
     lights = scenario.traffic_lights
     known = [i for i, name in enumerate(lights.connector_ids) if name in road.edges.index]
     edges = [road.edges.index[lights.connector_ids[i]] for i in known]
@@ -214,6 +209,7 @@ def make_scratch(fleet: Fleet, num_obstacles: int) -> Scratch:
     return Scratch(
         line=np.zeros((points, 2)),
         keep=np.zeros(points, np.bool_),
+        pieces=np.zeros((points // PIECE + 1, 4)),
         corridor=np.zeros((curve_room(points), 2)),
         hits=np.zeros(num_obstacles, np.int64),
     )

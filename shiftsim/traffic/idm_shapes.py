@@ -12,6 +12,7 @@ from shiftsim.geometry import point_segment_distance
 from shiftsim.predicates import orientation
 
 APART, MEETING, UNSURE = 0, 1, 2
+PIECE = 12  # segments of a corridor that are searched together
 
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
 # bound), and shallow concave vertices are left out (outer bound; see idm_buffer).
@@ -76,6 +77,8 @@ def ring_gap(a: FloatArray, a_size: int, b: FloatArray, b_size: int, limit: floa
     for vertex in range(b_size):
         low_x, high_x = min(low_x, b[vertex, 0]), max(high_x, b[vertex, 0])
         low_y, high_y = min(low_y, b[vertex, 1]), max(high_y, b[vertex, 1])
+    if _box_apart(a, a_size, low_x, low_y, high_x, high_y) >= limit:
+        return limit
     best = min(limit, _vertex_distance(a, a_size, b, b_size) * (1.0 + 1e-12))
     px, py = a[a_size - 1, 0], a[a_size - 1, 1]
     for vertex in range(a_size):
@@ -90,6 +93,18 @@ def ring_gap(a: FloatArray, a_size: int, b: FloatArray, b_size: int, limit: floa
     if winds_around(b, b_size, a[0, 0], a[0, 1]) or winds_around(a, a_size, b[0, 0], b[0, 1]):
         return 0.0
     return best
+
+
+@kernel
+def _box_apart(
+    ring: FloatArray, size: int, low_x: float, low_y: float, high_x: float, high_y: float
+) -> float:
+    """Lower bound of the distance from a ring to what lies in an axis-parallel box [m]."""
+    x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
+    for vertex in range(size):
+        x0, x1 = min(x0, ring[vertex, 0]), max(x1, ring[vertex, 0])
+        y0, y1 = min(y0, ring[vertex, 1]), max(y1, ring[vertex, 1])
+    return max(low_x - x1, x0 - high_x, low_y - y1, y0 - high_y)
 
 
 @kernel
@@ -142,9 +157,47 @@ def _edge_gap(
 
 
 @kernel
+def bound_pieces(line: FloatArray, size: int, pieces: FloatArray) -> None:
+    """Write the bounding boxes of consecutive pieces of a polyline.
+
+    Args:
+        line: (K, 2) vertices [m].
+        size: How many of them count, at least 2.
+        pieces: (C, 4) min x, min y, max x, max y of `PIECE` segments each [m].
+    """
+    for piece in range(num_pieces(size)):
+        bounds = pieces[piece]
+        bounds[0], bounds[1], bounds[2], bounds[3] = np.inf, np.inf, -np.inf, -np.inf
+        first = piece * PIECE
+        ring_bounds(line[first:], min(PIECE + 1, size - first), bounds)
+
+
+@kernel
+def num_pieces(size: int) -> int:
+    """How many pieces a polyline of `size` vertices has."""
+    return (size - 2) // PIECE + 1
+
+
+@kernel
+def last_near_piece(pieces: FloatArray, size: int, half_width: float, bounds: FloatArray) -> int:
+    """The last piece of a corridor of `size` vertices that may reach into a bounding box, or 0."""
+    reach = half_width * _OUTER
+    for piece in range(num_pieces(size) - 1, 0, -1):
+        if (
+            pieces[piece, 0] <= bounds[2] + reach
+            and pieces[piece, 1] <= bounds[3] + reach
+            and pieces[piece, 2] >= bounds[0] - reach
+            and pieces[piece, 3] >= bounds[1] - reach
+        ):
+            return piece
+    return 0
+
+
+@kernel
 def touches_corridor(
     line: FloatArray,
     size: int,
+    pieces: FloatArray,
     half_width: float,
     ring: FloatArray,
     ring_size: int,
@@ -155,8 +208,9 @@ def touches_corridor(
     UNSURE where the answer hangs on the exact shape of the buffer, or on its caps.
 
     Args:
-        line: (K, 2) or wider, vertices in the first two columns [m].
-        size: How many of them count.
+        line: (K, 2) vertices [m].
+        size: How many of them count, at least 2.
+        pieces: Bounding boxes of its pieces, see `bound_pieces` [m].
         half_width: Distance of the buffer [m].
         ring: (V, 2) the ring [m].
         ring_size: How many of its vertices count.
@@ -166,21 +220,29 @@ def touches_corridor(
     low_x, low_y = bounds[0] - reach, bounds[1] - reach
     high_x, high_y = bounds[2] + reach, bounds[3] + reach
     answer = APART
-    for vertex in range(1, size):
-        px, py = line[vertex - 1, 0], line[vertex - 1, 1]
-        qx, qy = line[vertex, 0], line[vertex, 1]
+    for piece in range(num_pieces(size)):
         if (
-            (px < low_x and qx < low_x)
-            or (px > high_x and qx > high_x)
-            or (py < low_y and qy < low_y)
-            or (py > high_y and qy > high_y)
+            pieces[piece, 0] > high_x
+            or pieces[piece, 1] > high_y
+            or pieces[piece, 2] < low_x
+            or pieces[piece, 3] < low_y
         ):
             continue
-        found = _touches_segment(px, py, qx, qy, half_width, ring, ring_size)
-        if found == MEETING:
-            return MEETING
-        if found == UNSURE:
-            answer = UNSURE
+        for vertex in range(piece * PIECE + 1, min((piece + 1) * PIECE + 1, size)):
+            px, py = line[vertex - 1, 0], line[vertex - 1, 1]
+            qx, qy = line[vertex, 0], line[vertex, 1]
+            if (
+                (px < low_x and qx < low_x)
+                or (px > high_x and qx > high_x)
+                or (py < low_y and qy < low_y)
+                or (py > high_y and qy > high_y)
+            ):
+                continue
+            found = _touches_segment(px, py, qx, qy, half_width, ring, ring_size)
+            if found == MEETING:
+                return MEETING
+            if found == UNSURE:
+                answer = UNSURE
     if answer == APART and winds_around(ring, ring_size, line[0, 0], line[0, 1]):
         return MEETING
     return answer

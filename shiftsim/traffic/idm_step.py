@@ -26,7 +26,11 @@ from shiftsim.traffic.idm_paths import (
 from shiftsim.traffic.idm_policy import idm_step
 from shiftsim.traffic.idm_shapes import (
     MEETING,
+    PIECE,
     UNSURE,
+    bound_pieces,
+    last_near_piece,
+    num_pieces,
     ring_bounds,
     ring_gap,
     touches_corridor,
@@ -64,12 +68,14 @@ class Scratch(NamedTuple):
     Attributes:
         line: (K, 2) a piece of a path [m].
         keep: (K,) flags of its vertices.
+        pieces: (C, 4) bounding boxes of the line's pieces [m].
         corridor: (W, 2) outline of the buffer of the path ahead [m].
         hits: (M,) obstacles in the corridor.
     """
 
     line: FloatArray
     keep: BoolArray
+    pieces: FloatArray
     corridor: FloatArray
     hits: IntArray
 
@@ -101,18 +107,72 @@ def set_box(
 
 
 @kernel
-def set_boxes(obstacles: Obstacles, first: int, poses: FloatArray, sizes: FloatArray) -> None:
-    """Put boxes, poses (N, 3) and sizes (N, 2), at the places from `first` on."""
-    for index in range(len(poses)):
-        set_box(
-            obstacles,
-            first + index,
-            poses[index, 0],
-            poses[index, 1],
-            poses[index, 2],
-            sizes[index, 0],
-            sizes[index, 1],
-        )
+def place_replayed(
+    obstacles: Obstacles,
+    first: int,
+    replayed: IntArray,
+    valid: BoolArray,
+    poses: FloatArray,
+    sizes: FloatArray,
+) -> int:
+    """Put the replayed tracks that are present among the obstacles.
+
+    Args:
+        obstacles: The obstacles.
+        first: Place of the first one.
+        replayed: (R,) which tracks are replayed.
+        valid: (N,) whether a track is present.
+        poses: (N, 3) x [m], y [m], heading [rad].
+        sizes: (N, 2) length, width [m].
+
+    Returns:
+        How many obstacles count now.
+    """
+    count = first
+    for track in replayed:
+        if valid[track]:
+            x, y, heading = poses[track, 0], poses[track, 1], poses[track, 2]
+            set_box(obstacles, count, x, y, heading, sizes[track, 0], sizes[track, 1])
+            count += 1
+    return count
+
+
+@kernel
+def set_speeds(
+    obstacles: Obstacles, first: int, replayed: IntArray, valid: BoolArray, velocities: FloatArray
+) -> None:
+    """Give the replayed tracks, placed from `first` on, the speed they really have."""
+    index = first
+    for track in replayed:
+        if valid[track]:
+            vx, vy = velocities[track, 0], velocities[track, 1]
+            speed = np.hypot(vx, vy)  # NaN for static objects
+            obstacles.speed[index] = speed if speed > 0.0 else 0.0
+            obstacles.heading[index] = np.arctan2(vy, vx) if speed > 0.0 else 0.0
+            index += 1
+
+
+@kernel
+def write_agents(
+    fleet: Fleet,
+    tracks: IntArray,
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+) -> None:
+    """Write the agents into a row of tracks: (N,), (N, 3), (N, 2), (N, 2); the gone as absent."""
+    for agent in range(len(tracks)):
+        track = tracks[agent]
+        alive = fleet.alive[agent]
+        heading, speed = fleet.pose[agent, 2], fleet.speed[agent]
+        valid[track] = alive
+        for column in range(3):
+            poses[track, column] = fleet.pose[agent, column] if alive else np.nan
+        velocities[track, 0] = speed * np.cos(heading) if alive else np.nan
+        velocities[track, 1] = speed * np.sin(heading) if alive else np.nan
+        for column in range(2):
+            sizes[track, column] = fleet.size[agent, column] if alive else np.nan
 
 
 @kernel
@@ -191,80 +251,63 @@ def _copy(path: FloatArray, start: int, stop: int, line: FloatArray, count: int)
 @kernel
 def find_hits(
     fleet: Fleet, agent: int, obstacles: Obstacles, count: int, scratch: Scratch
-) -> tuple[int, int, int]:
+) -> tuple[int, int]:
     """Obstacles that meet the corridor along the path ahead of an agent.
 
     Returns:
-        How many there are (in `scratch.hits`); the number of vertices of the path ahead (in
-        `scratch.line`), and of the corridor's outline, 0 where it was not needed.
+        How many there are (in `scratch.hits`), and the number of vertices of the path ahead (in
+        `scratch.line`).
     """
     half_width = 0.5 * fleet.size[agent, 1]
     size = remaining_path(fleet, agent, scratch.line)
+    bound_pieces(scratch.line, size, scratch.pieces)
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for vertex in range(size):
-        x, y = scratch.line[vertex, 0], scratch.line[vertex, 1]
-        low_x, high_x = min(low_x, x), max(high_x, x)
-        low_y, high_y = min(low_y, y), max(high_y, y)
+    for piece in range(num_pieces(size)):
+        bounds = scratch.pieces[piece]
+        low_x, low_y = min(low_x, bounds[0]), min(low_y, bounds[1])
+        high_x, high_y = max(high_x, bounds[2]), max(high_y, bounds[3])
     margin = 1.1 * half_width
     low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
-    hits, outline = 0, 0
+    hits = 0
     for other in range(count):
+        bounds = obstacles.bounds[other]
         if (
             other == agent
             or not obstacles.present[other]
-            or obstacles.bounds[other, 0] > high_x
-            or obstacles.bounds[other, 1] > high_y
-            or obstacles.bounds[other, 2] < low_x
-            or obstacles.bounds[other, 3] < low_y
+            or bounds[0] > high_x
+            or bounds[1] > high_y
+            or bounds[2] < low_x
+            or bounds[3] < low_y
         ):
             continue
-        hit, outline = _meets(
-            fleet,
-            agent,
-            obstacles.box[other],
-            _BOX,
-            obstacles.bounds[other],
-            size,
-            outline,
-            scratch,
-        )
-        if not hit and other < len(obstacles.curve) and obstacles.curve_size[other]:
-            hit, outline = _meets(
-                fleet,
-                agent,
-                obstacles.curve[other],
-                obstacles.curve_size[other],
-                obstacles.bounds[other],
-                size,
-                outline,
-                scratch,
-            )
-        if hit:
+        hit = False
+        if other < len(obstacles.curve) and obstacles.curve_size[other]:
+            curve, curve_size = obstacles.curve[other], obstacles.curve_size[other]
+            hit = _meets(half_width, curve, curve_size, bounds, size, scratch)
+        if hit or _meets(half_width, obstacles.box[other], _BOX, bounds, size, scratch):
             scratch.hits[hits] = other
             hits += 1
-    return hits, size, outline
+    return hits, size
 
 
 @kernel
 def _meets(
-    fleet: Fleet,
-    agent: int,
+    half_width: float,
     ring: FloatArray,
     ring_size: int,
     bounds: FloatArray,
     size: int,
-    outline: int,
     scratch: Scratch,
-) -> tuple[bool, int]:
-    """Whether a ring meets the corridor, and the size of its outline if that had to be made."""
-    half_width = 0.5 * fleet.size[agent, 1]
-    found = touches_corridor(scratch.line, size, half_width, ring, ring_size, bounds)
+) -> bool:
+    """Whether a ring meets the corridor along the first `size` vertices of `scratch.line`."""
+    line, pieces = scratch.line, scratch.pieces
+    found = touches_corridor(line, size, pieces, half_width, ring, ring_size, bounds)
     if found != UNSURE:
-        return found == MEETING, outline
-    if outline == 0:
-        outline = buffer_curve(scratch.line, size, half_width, scratch.keep, scratch.corridor)
-    gap = ring_gap(ring, ring_size, scratch.corridor, outline, 1e-3)
-    return gap == 0.0, outline
+        return found == MEETING
+    # of the exact corridor only what comes up to the ring is needed, and a piece to spare
+    near = min((last_near_piece(pieces, size, half_width, bounds) + 2) * PIECE + 1, size)
+    outline = buffer_curve(line, near, half_width, scratch.keep, scratch.corridor)
+    return ring_gap(ring, ring_size, scratch.corridor, outline, 1e-3) == 0.0
 
 
 @kernel
@@ -272,11 +315,21 @@ def footprint_gap(
     obstacles: Obstacles, agent: int, ring: FloatArray, ring_size: int, limit: float
 ) -> float:
     """Distance from an agent's footprint to a ring, at most `limit` [m]."""
-    best = ring_gap(obstacles.box[agent], _BOX, ring, ring_size, limit)
-    if best > 0.0 and obstacles.curve_size[agent]:
+    best = limit
+    if obstacles.curve_size[agent]:
         size = obstacles.curve_size[agent]
-        best = min(best, ring_gap(obstacles.curve[agent], size, ring, ring_size, best))
+        best = ring_gap(obstacles.curve[agent], size, ring, ring_size, best)
+    if best > 0.0:
+        best = ring_gap(obstacles.box[agent], _BOX, ring, ring_size, best)
     return best
+
+
+@kernel
+def _bounds_apart(bounds: FloatArray, a: int, b: int) -> float:
+    """Lower bound of the distance between two obstacles [m]."""
+    apart_x = max(bounds[a, 0] - bounds[b, 2], bounds[b, 0] - bounds[a, 2])
+    apart_y = max(bounds[a, 1] - bounds[b, 3], bounds[b, 1] - bounds[a, 3])
+    return max(apart_x, apart_y)
 
 
 @kernel
@@ -296,14 +349,20 @@ def find_lead(
         Its index, `count` for a stop line, -1 where the corridor is free; the gap between the
         footprints [m].
     """
-    hits, size, outline = find_hits(fleet, agent, obstacles, count, scratch)
+    half_width = 0.5 * fleet.size[agent, 1]
+    hits, size = find_hits(fleet, agent, obstacles, count, scratch)
     best, lead = np.inf, -1
     for index in range(hits):
         other = scratch.hits[index]
-        gap = footprint_gap(obstacles, agent, obstacles.box[other], _BOX, best)
-        if gap > 0.0 and other < len(obstacles.curve) and obstacles.curve_size[other]:
+        if best == 0.0:
+            break
+        if _bounds_apart(obstacles.bounds, agent, other) >= best:
+            continue
+        gap = best
+        if other < len(obstacles.curve) and obstacles.curve_size[other]:
             curve, curve_size = obstacles.curve[other], obstacles.curve_size[other]
             gap = footprint_gap(obstacles, agent, curve, curve_size, gap)
+        gap = footprint_gap(obstacles, agent, obstacles.box[other], _BOX, gap)
         if gap < best:
             best, lead = gap, other
     for segment in range(fleet.route_size[agent]):
@@ -315,10 +374,7 @@ def find_lead(
             first = stops.ring_ptr[stops.poly_ptr[stop]]
             last = stops.ring_ptr[stops.poly_ptr[stop] + 1]
             ring = stops.xy[first:last]
-            hit, outline = _meets(
-                fleet, agent, ring, last - first, stops.bounds[stop], size, outline, scratch
-            )
-            if hit:
+            if _meets(half_width, ring, last - first, stops.bounds[stop], size, scratch):
                 gap = footprint_gap(obstacles, agent, ring, last - first, best)
                 if gap < best:
                     best, lead = gap, count
