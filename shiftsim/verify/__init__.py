@@ -36,7 +36,7 @@ def verify(
     for kind in KINDS:
         if kind.matches(folder):
             report = Report()
-            kind.verify(folder, report, mode, scenes, maps)
+            kind.verify(folder, report, mode=mode, scenes=scenes, maps=maps)
             return report
     raise DataError(
         f"{folder}: not recognised as a folder of reference outputs",

@@ -1,12 +1,10 @@
 """The kinds of reference folders, how each is recognised, and who compares it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from shiftsim.verify.report import Report
-
-Check = Callable[[Path, Report, str | None, Path | None, Path | None], None]
 
 
 @dataclass(frozen=True)
@@ -15,54 +13,48 @@ class Kind:
 
     Attributes:
         name: What it is called.
-        signature: Glob patterns; the folder is of this kind when all of them match something.
-        verify: Compares the folder: (folder, report, mode, scenes, maps).
+        signature: Glob patterns; the folder is of this kind when all of them match something,
+            where `a|b` stands for either.
+        function: `module:function` below `shiftsim.verify`, called with folder and report.
+        takes: Which of `mode`, `scenes` and `maps` it takes besides.
     """
 
     name: str
     signature: tuple[str, ...]
-    verify: Check
+    function: str
+    takes: tuple[str, ...] = ()
 
     def matches(self, folder: Path) -> bool:
         """Whether a folder is of this kind."""
-        return all(any(folder.glob(pattern)) for pattern in self.signature)
+        return all(
+            any(any(folder.glob(pattern)) for pattern in either.split("|"))
+            for either in self.signature
+        )
 
-
-def _nuplan(
-    folder: Path, report: Report, mode: str | None, scenes: Path | None, maps: Path | None
-) -> None:
-    from shiftsim.verify.nuplan import verify_nuplan
-
-    verify_nuplan(folder, report, mode)
-
-
-def _nuplan_format(
-    folder: Path, report: Report, mode: str | None, scenes: Path | None, maps: Path | None
-) -> None:
-    from shiftsim.verify.nuplan_format import verify_nuplan_format
-
-    verify_nuplan_format(folder, report)
-
-
-def _metric_worlds(
-    folder: Path, report: Report, mode: str | None, scenes: Path | None, maps: Path | None
-) -> None:
-    from shiftsim.verify.metric_worlds import verify_metric_worlds
-
-    verify_metric_worlds(folder, report)
-
-
-def _dynamics(
-    folder: Path, report: Report, mode: str | None, scenes: Path | None, maps: Path | None
-) -> None:
-    from shiftsim.verify.dynamics import verify_dynamics
-
-    verify_dynamics(folder, report)
+    def verify(self, folder: Path, report: Report, **options: object) -> None:
+        """Compare the folder; `options` are `mode`, `scenes` and `maps`."""
+        module, _, function = self.function.partition(":")
+        taken = {name: options[name] for name in self.takes}
+        getattr(import_module(f"shiftsim.verify.{module}"), function)(folder, report, **taken)
 
 
 KINDS = (
-    Kind("nuplan", ("scenes.json", "expected/*.parquet"), _nuplan),
-    Kind("nuplan_format", ("devkit_readback.json",), _nuplan_format),
-    Kind("metric_worlds", ("metric_world_*.json",), _metric_worlds),
-    Kind("dynamics", ("meta.json", "*.npz"), _dynamics),
+    Kind("nuplan", ("scenes.json", "expected/*.parquet"), "nuplan:verify_nuplan", ("mode",)),
+    Kind("nuplan_format", ("devkit_readback.json",), "nuplan_format:verify_nuplan_format"),
+    Kind("metric_worlds", ("metric_world_*.json",), "metric_worlds:verify_metric_worlds"),
+    Kind(
+        "dynamics",
+        (
+            "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",
+        ),
+        "dynamics:verify_dynamics",
+    ),
+    Kind("dsc3d_sample", ("expected_rows.parquet", "data"), "dsc3d:verify_dsc3d_sample"),
+    Kind(
+        "dsc3d_synthetic",
+        ("**/expected_ego_20hz.parquet",),
+        "dsc3d:verify_dsc3d_synthetic",
+        ("maps",),
+    ),
+    Kind("opendrive", ("*.refline.parquet",), "opendrive:verify_opendrive", ("maps",)),
 )

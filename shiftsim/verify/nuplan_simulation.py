@@ -6,7 +6,7 @@ import numpy as np
 
 from shiftsim import state
 from shiftsim.arrays import FloatArray
-from shiftsim.metrics import compute_metrics
+from shiftsim.metrics import judge, measure
 from shiftsim.planners import load_planner
 from shiftsim.scenario import Scenario
 from shiftsim.simulation import simulate
@@ -30,14 +30,15 @@ STATE_COLUMNS = {
 CENTER_COLUMNS = {"center_x": (0, 1e-6), "center_y": (1, 1e-6), "center_heading": (2, 1e-7)}
 SCORE_TOLERANCE = 1e-9
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
-CONTROLLERS = {"NR": "lqr", "PT": "perfect"}
+CONTROLLERS = {"NR": "lqr", "PT": "perfect", "R": "lqr"}
+TRAFFIC = {"NR": "nonreactive", "PT": "nonreactive", "R": "reactive"}
 _SCRIPTED = "scripted_"
 
 
 def verify_simulation(
     folder: Path, report: Report, scenes: dict[str, Scenario], mode: str | None = None
 ) -> None:
-    """Simulate every non-reactive run of `expected/ego.parquet` and compare states and scores.
+    """Simulate every run of `expected/ego.parquet` and compare states and scores.
 
     Args:
         folder: The nuplan folder.
@@ -50,21 +51,26 @@ def verify_simulation(
         folder / "expected" / "scores.parquet", ("scene", "challenge", "planner", "thresholds")
     )
     for (scene, challenge, planner), rows in runs.items():
-        if mode not in (None, challenge) or challenge not in CONTROLLERS:
+        if mode not in (None, challenge):
             continue
         where = f"{scene} {challenge} {planner}"
+        if challenge not in CONTROLLERS or scene not in scenes:
+            report.fail("simulation", where, "no such challenge or scene")
+            continue
         log = simulate(
             scenes[scene],
             load_planner(*reference_planner(planner, folder)),
             controller=CONTROLLERS[challenge],
+            traffic=TRAFFIC[challenge],
         )
         compare_ego(report, where, log.time_us, log.ego, rows)
+        measurements = measure(log, scenes[scene].map)
         for thresholds, profile in PROFILES.items():
             expected = scores.get((scene, challenge, planner, thresholds))
             if expected is None:
                 report.fail("simulated score", where, f"no row with thresholds {thresholds}")
                 continue
-            result = compute_metrics(log, scenes[scene].map, thresholds=profile)
+            result = judge(measurements, profile)
             for metric, score in {**result.scores, "score": result.score}.items():
                 if score is not None:
                     report.compare(
