@@ -161,10 +161,10 @@ def _compare_scenarios(
         given = json.dumps(lanes_wanted.get(key))
         ways = [json.dumps(way) for way in lane_sequences(local, centers[start:])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
-    for key in sorted(set(poses) - seen):
-        report.fail("20 Hz pose", f"{name} window {key[0]} track {key[1]}", "no such scenario")
-    for key in sorted(set(lanes_wanted) - seen):
-        report.fail("lanes", f"{name} window {key[0]} track {key[1]}", "no such scenario")
+    for lost in sorted(set(poses) - seen):
+        report.fail("20 Hz pose", f"{name} window {lost[0]} track {lost[1]}", "no such scenario")
+    for lost in sorted(set(lanes_wanted) - seen):
+        report.fail("lanes", f"{name} window {lost[0]} track {lost[1]}", "no such scenario")
 
 
 def _compare_rows(
