@@ -46,6 +46,7 @@ from shiftsim.state import (
 )
 from shiftsim.traffic.idm_policy import idm_acceleration, idm_step
 from shiftsim.verify.array_file import EXACT, ArrayFile
+from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report
 
 CORNER_TOLERANCE = 2e-9  # m, coordinates near 4e6 are spaced 5e-10
@@ -79,7 +80,7 @@ def verify_dynamics(folder: Path, report: Report) -> None:
         if path.suffix == ".npz" and path.stem in _CHECKS:
             _verify_file(path, report)
         elif path.name.startswith("idm_world_"):
-            _verify_reactive_world(path, report)
+            verify_idm_world(path, report)
         elif path.name in ("README.md", "meta.json"):
             report.note(f"{path.name}: origin of the folder")
         else:
@@ -94,10 +95,6 @@ def _verify_file(path: Path, report: Report) -> None:
         file.finish()
     except (ShiftsimError, OSError, BadZipFile, ValueError, TypeError, IndexError) as error:
         report.fail(path.stem, path.name, f"cannot be compared: {error}")
-
-
-def _verify_reactive_world(path: Path, report: Report) -> None:
-    report.skip("idm_world (reactive traffic)")
 
 
 def _centers(states: FloatArray) -> FloatArray:

@@ -68,16 +68,23 @@ class Observed:
 _COLUMNS = ("iteration", "track_token", "type", *_TOLERANCES, "length", "width")
 
 
-def verify_nuplan_reactive(folder: Path, report: Report, scenes: dict[str, Scenario]) -> None:
+def verify_nuplan_reactive(
+    folder: Path, report: Report, scenes: dict[str, Scenario], *, loops: Path | None = None
+) -> None:
     """Compare the objects of every reactive run.
 
     Args:
         folder: The nuplan folder.
         report: Receives the comparisons.
         scenes: The scenarios by scene name.
+        loops: Folder with the tables of other runs in the same scenes, instead of `expected`.
     """
-    runs = read_groups(folder / "expected" / "ego.parquet")
-    objects = read_groups(folder / "expected" / "objects.parquet")
+    expected = folder / "expected"
+    runs = read_groups((loops or expected) / "ego.parquet")
+    objects = read_groups(expected / "objects.parquet")
+    if loops is not None:
+        logged = {key: rows for key, rows in objects.items() if key[1:] == ("NR", "*")}
+        objects = {**logged, **read_groups(loops / "objects.parquet")}
     known = {key for key in runs if key[1] == CHALLENGE}
     for key in sorted({key for key in objects if key[1] == CHALLENGE} - known):
         report.fail("reactive objects", " ".join(key), "ego.parquet has no such run")
@@ -102,8 +109,8 @@ def drive(scenario: Scenario, ego_rows: Group) -> Observed:
     orders = [
         order_observed(tracks.kinds, row, traffic.parameters.open_loop) for row in tracks.valid
     ]
-    iteration = np.repeat(np.arange(len(ego)), [len(order) for order in orders])
-    return Observed(iteration, np.concatenate(orders), tracks)
+    rows = np.repeat(np.arange(len(ego)), [len(order) for order in orders])
+    return Observed(rows, np.concatenate(orders), tracks)
 
 
 def _compare(
