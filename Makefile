@@ -1,9 +1,6 @@
 # Targets of the project; each needs nothing but Python 3.11 or newer, pip, make and gcc.
 PYTHON ?= python3
 BIN := .venv/bin
-# numba's disk cache does not see an edit of a kernel in another file: one folder per state of them
-KERNELS := $(shell grep -rl --include='*.py' kernel shiftsim planners metrics data | sort | xargs cat | cksum | cut -d' ' -f1)
-export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba-cache/$(KERNELS)
 
 .PHONY: install demo test test-fast lint types bench verify dist clean-cache
 
@@ -30,7 +27,7 @@ types: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/python -m pytest benchmarks/speed
+	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s --benchmark-disable-gc --benchmark-columns=median,iqr
 
 verify: install
 	for folder in ../shared/reference/*/; do $(BIN)/shiftsim verify $$folder || exit 1; done

@@ -1,8 +1,16 @@
 """Array type aliases, and the one decorator that compiles a kernel.
 
 Shapes and units are in the docstrings; the aliases say the kind of number only.
+
+Compiled kernels are cached on disk. numba's cache looks only at the file of the outermost kernel,
+so in a checkout, where a kernel of another file may change under it, the cache lives in a folder
+named by a hash of all kernel sources. An installed package is replaced as a whole and needs no such
+care. `NUMBA_CACHE_DIR` overrides both.
 """
 
+import hashlib
+import os
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numba
@@ -12,6 +20,26 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
+
+_CHECKOUT = Path(__file__).resolve().parent.parent
+
+
+def _kernel_sources() -> list[Path]:
+    folders = ("shiftsim", "planners", "metrics", "data")
+    return sorted(path for name in folders for path in (_CHECKOUT / name).rglob("*.py"))
+
+
+def _use_checkout_cache() -> None:
+    if "NUMBA_CACHE_DIR" in os.environ or not (_CHECKOUT / "pyproject.toml").is_file():
+        return
+    digest = hashlib.sha256()
+    for path in _kernel_sources():
+        if b"@kernel" in (source := path.read_bytes()):
+            digest.update(path.name.encode() + b"\n" + source)
+    numba.config.CACHE_DIR = str(_CHECKOUT / ".numba-cache" / digest.hexdigest()[:16])
+
+
+_use_checkout_cache()
 
 
 def kernel(function: Any) -> Any:

@@ -1,6 +1,5 @@
-"""Shared fixtures, and a kernel cache that any edit of a kernel starts afresh."""
+"""Fixtures and hypothesis profiles shared by all tests."""
 
-import hashlib
 import os
 import tarfile
 from pathlib import Path
@@ -12,17 +11,6 @@ from hypothesis import settings
 REPOSITORY = Path(__file__).resolve().parent.parent
 GOLDEN = REPOSITORY / "tests" / "golden"
 
-
-def _kernel_cache() -> Path:
-    digest = hashlib.sha256()
-    for folder in ("shiftsim", "planners", "metrics", "data"):
-        for path in sorted((REPOSITORY / folder).glob("**/*.py")):
-            if "kernel" in (text := path.read_text()):
-                digest.update(f"{path.name}\n{text}".encode())
-    return REPOSITORY / ".numba-cache" / digest.hexdigest()[:16]
-
-
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache()))
 
 settings.register_profile("fast", max_examples=25, deadline=None, derandomize=True)
 settings.register_profile("thorough", max_examples=500, deadline=None)
