@@ -37,7 +37,7 @@ from shiftsim.errors import ConversionError
 
 MAX_BYTES = 200_000_000
 MAX_COORDINATE = 1e8  # m, beyond any projection of the earth
-MAX_LENGTH = 2e5  # m, of one road
+MAX_LENGTH = 1e5  # m, of one road
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}  # opendrive.md §5
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")

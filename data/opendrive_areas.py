@@ -134,16 +134,23 @@ def drivable_tiles(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]
 
     One polygon for a town would have thousands of edges to test against for each corner of a car.
     """
+    waiting = merge_areas(polygons, _SLIVER)
     tiles = []
-    for part in merge_areas(polygons, _SLIVER):
+    while waiting:
+        part = waiting.pop()
         left, bottom, right, top = part.bounds
-        shapely.prepare(part)
-        for x in np.arange(left, right, _TILE):
-            for y in np.arange(bottom, top, _TILE):
-                box = shapely.box(x, y, x + _TILE + _TILE_OVERLAP, y + _TILE + _TILE_OVERLAP)
-                if part.intersects(box):
-                    tiles += _parts(shapely.intersection(part, box))
-    return tiles
+        if max(right - left, top - bottom) <= _TILE:
+            tiles.append(part)
+            continue
+        x, y, lap = 0.5 * (left + right), 0.5 * (bottom + top), 0.5 * _TILE_OVERLAP
+        halves = (
+            (shapely.box(left, bottom, x + lap, top), shapely.box(x - lap, bottom, right, top))
+            if right - left > top - bottom
+            else (shapely.box(left, bottom, right, y + lap), shapely.box(left, y - lap, right, top))
+        )
+        for half in halves:
+            waiting += _parts(shapely.intersection(part, half))
+    return sorted(tiles, key=lambda tile: tile.bounds)
 
 
 def _parts(shape: shapely.Geometry) -> list[shapely.Polygon]:

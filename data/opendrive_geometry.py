@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive_records import ARC, POLY3, SPIRAL, Geometry
+from shiftsim.data.opendrive_records import ARC, PARAM_POLY3, POLY3, SPIRAL, Geometry
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # on [0, 1]
@@ -104,13 +104,17 @@ def evaluate_local(
 
 
 def length_error(record: Geometry) -> float:
-    """By how much the true length of a cubic record differs from its stated one, as a share.
+    """By how much the true length of a paramPoly3 differs from its stated one, as a share.
 
-    0 where the difference is within what opendrive.md §1 takes as rounding.
+    0 where the difference is within what opendrive.md §1 takes as rounding; inf where the curve
+    has no finite length.
     """
-    if record.kind != "paramPoly3":
+    if record.kind != PARAM_POLY3:
         return 0.0
-    true = float(_arc_table(record)[1][-1])
+    with np.errstate(over="ignore", invalid="ignore"):
+        true = float(_arc_table(record)[1][-1])
+    if not np.isfinite(true):
+        return float("inf")
     error = abs(true - record.length)
     allowed = max(_LENGTH_SLACK * record.length, _MIN_LENGTH_SLACK)
     return error / record.length if error > allowed else 0.0

@@ -18,15 +18,15 @@ from shiftsim.data.opendrive_control import (
     is_lit,
     stop_lines,
 )
-from shiftsim.data.opendrive_geometry import ReferenceLine, length_error
-from shiftsim.data.opendrive_graph import DRIVABLE, LaneGraph, Piece, build_lane_graph
-from shiftsim.data.opendrive_lanes import LaneKey, border_is_mirrored
+from shiftsim.data.opendrive_graph import LaneGraph, Piece, build_lane_graph
+from shiftsim.data.opendrive_lanes import LaneKey
 from shiftsim.data.opendrive_overlaps import (
     Levels,
     cut_crossings,
     overlapping,
     subtract_overlaps,
 )
+from shiftsim.data.opendrive_prepare import prepare
 from shiftsim.data.opendrive_records import OpenDrive
 from shiftsim.data.opendrive_shapes import Shapes, bend_ends, lane_polygon, largest_part, widen
 from shiftsim.data.opendrive_speed import speed_limit
@@ -34,8 +34,6 @@ from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # intersections, nuplan-formats.md
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # stop polygons, nuplan-formats.md
-UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
-GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m, opendrive.md §7
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -85,37 +83,14 @@ def build_road_map(
 
     Returns:
         The map, without lanes where the file has none that cars may use, and the report.
+
+    Raises:
+        MapError: The file has more road than one map can hold.
     """
     warnings = Counter(od.warnings)
-    placed = _placed(od)
-    note_flaws(placed, warnings)
+    placed = prepare(od, warnings)
     graph = build_lane_graph(placed, warnings)
-    maker = _Maker(placed, graph, warnings, country)
-    return maker.build(name, np.array(offset), epsg)
-
-
-def _placed(od: OpenDrive) -> OpenDrive:
-    """The file with its header offset applied to every reference line."""
-    if od.offset is None:
-        return od
-    x, y, _, turn = od.offset
-    cos, sin = np.cos(turn), np.sin(turn)
-    roads = {
-        name: replace(
-            road,
-            geometries=tuple(
-                replace(
-                    g,
-                    x=float(x + cos * g.x - sin * g.y),
-                    y=float(y + sin * g.x + cos * g.y),
-                    heading=g.heading + turn,
-                )
-                for g in road.geometries
-            ),
-        )
-        for name, road in od.roads.items()
-    }
-    return replace(od, roads=roads, offset=None)
+    return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
 
 
 def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
@@ -424,27 +399,3 @@ def turn_type(line: FloatArray) -> int:
     if abs(turn) > _U_TURN:
         return 3
     return 1 if turn > 0 else 2
-
-
-def note_flaws(od: OpenDrive, warnings: Counter[str]) -> None:
-    """Count flaws of the geometry and lane types that the map lives with."""
-    known = DRIVABLE | areas.PAVED | areas.WALKED | areas.SEAMS | UNUSED
-    for road in od.roads.values():
-        gaps, _ = ReferenceLine(road.geometries).joints()
-        small = int(((gaps > GAP_NOTED) & (gaps <= GAP_SERIOUS)).sum())
-        serious = int((gaps > GAP_SERIOUS).sum())
-        if small:
-            warnings[f"gap of more than {GAP_NOTED:g} m between geometries"] += small
-        if serious:
-            warnings[f"gap of more than {GAP_SERIOUS:g} m between geometries"] += serious
-        wrong = sum(length_error(geometry) > 0 for geometry in road.geometries)
-        if wrong:
-            warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
-        for section in road.sections:
-            for lane in section.lanes.values():
-                if lane.type in ("tram", "rail"):
-                    warnings["tram or rail lane left out"] += 1
-                elif lane.type not in known:
-                    warnings["lane of unknown type left out"] += 1
-                if border_is_mirrored(lane):
-                    warnings["border of a right lane given on the left, mirrored"] += 1
