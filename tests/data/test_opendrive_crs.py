@@ -27,7 +27,7 @@ def test_projection_and_code_are_understood(text: str):
 def test_origin_alone_is_taken_as_transverse_mercator():
     warnings: Counter[str] = Counter()
     crs = coordinate_system(file_with("+lat_0=4.9e+1 +lon_0=8.0e+0"), warnings)
-    assert crs.to_dict()["proj"] == "tmerc"
+    assert crs.coordinate_operation.method_name == "Transverse Mercator"
     assert sum(warnings.values()) == 1
 
 
