@@ -137,7 +137,7 @@ def convert_dsc3d(
     road, map_report = build_road_map(
         drive,
         name=city,
-        offset=(float(source.offset[0]), float(source.offset[1])),
+        offset=_map_offset(drive, source),
         epsg=source.epsg,
         country=config.country,
     )
@@ -258,6 +258,12 @@ def check_placement(
             f" ({x:+.1f}, {y:+.1f}) m: check that map and reference_utm.offset belong together",
         )
     return found.share
+
+
+def _map_offset(drive: OpenDrive, site: Site) -> tuple[float, float]:
+    """What brings the map, whose header offset the reader applies, to UTM."""
+    x, y, *_ = drive.offset or (0.0, 0.0)
+    return float(site.offset[0]) - x, float(site.offset[1]) - y
 
 
 def _check_georeference(drive: OpenDrive, site: Site) -> None:

@@ -208,6 +208,17 @@ def test_a_map_with_another_georeference_is_refused(tmp_path):
         convert_dsc3d(folder, tmp_path / "store")
 
 
+def test_a_map_that_carries_its_utm_offset_is_placed_once(tmp_path):
+    times = writer.frame_times(18.08)
+    road = writer.straight_road().replace(
+        '<header revMajor="1" revMinor="7"/>',
+        '<header revMajor="1" revMinor="7"><geoReference>EPSG:32632</geoReference>'
+        '<offset x="500000" y="5300000" z="0" hdg="0"/></header>',
+    )
+    folder = writer.write_site(tmp_path / "s", [writer.car(1, times)], 18.08, road=road)
+    assert convert_dsc3d(folder, tmp_path / "store").drivable_share == 1.0
+
+
 def test_a_short_recording_is_converted_with_a_short_window_and_marked(tmp_path):
     folder = writer.write_site(tmp_path / "s", [writer.car(1, writer.frame_times(4.96))], 4.96)
     config = ConversionConfig(window_s=4.0, overlap_s=1.0, history_s=1.0, padding_s=2.0)
