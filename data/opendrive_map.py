@@ -103,10 +103,11 @@ class _Maker:
         self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
     ) -> None:
         self.od, self.warnings, self.country = od, warnings, country
-        self.graph, crossings = cut_crossings(od, graph, _shapes_of(od, graph))
+        self.shapes = _shapes_of(od, graph)
+        self.graph, crossings = cut_crossings(od, graph, self.shapes)
         if crossings:
             warnings["lanes that cross without a junction, made an intersection"] += crossings
-        self.shapes = _shapes_of(od, self.graph)
+            self.shapes = _shapes_of(od, self.graph)
         self._next_id = 0
 
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
