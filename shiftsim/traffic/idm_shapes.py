@@ -243,7 +243,9 @@ def touches_corridor(
                 return MEETING
             if found == UNSURE:
                 answer = UNSURE
-    if answer == APART and winds_around(ring, ring_size, line[0, 0], line[0, 1]):
+    x, y = line[0, 0], line[0, 1]
+    around = bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
+    if answer == APART and around and winds_around(ring, ring_size, x, y):
         return MEETING
     return answer
 
