@@ -71,6 +71,8 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
+    import numba
+
     from shiftsim.manifest import versions
     from shiftsim.verify import verify
 
@@ -91,7 +93,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         cores=cores,
         memory=memory,
         workers=max(1, min(cores, fitting)),
-        kernel_cache=os.environ.get("NUMBA_CACHE_DIR", ""),
+        kernel_cache=str(numba.config.CACHE_DIR),
         seconds=perf_counter() - began,
         cases=cases,
         mismatches=tuple(mismatches),

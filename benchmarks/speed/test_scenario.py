@@ -1,0 +1,120 @@
+"""A whole non-reactive scenario: read from the store, step loop, metrics, result rows."""
+
+import resource
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store import StoreWriter
+from shiftsim.data.synthetic import bench_scene
+from shiftsim.metrics import compute_metrics
+from shiftsim.noise import parse_noise
+from shiftsim.rollouts import Task
+from shiftsim.simulation import simulate
+from shiftsim.tasks import TaskRunner, planner_entry
+from shiftsim.verify.nuplan_import import load_scenes
+
+GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
+WHOLE_BOUND, METRICS_BOUND = 25e-3, 5e-3  # s
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """The reference scenes and the city scene with 100 agents."""
+    folder = tmp_path_factory.mktemp("reference")
+    with tarfile.open(GOLDEN) as archive:
+        archive.extractall(folder, filter="data")
+    return {**load_scenes(folder / "nuplan"), "bench_scene_100": bench_scene(100, 0)}
+
+
+@pytest.fixture(scope="module")
+def runner(scenes, tmp_path_factory):
+    """What a worker of a run does with a task, on a store that holds the scenes."""
+    path = tmp_path_factory.mktemp("store")
+    with StoreWriter(path) as writer:
+        for name, scene in scenes.items():
+            writer.add_map(scene.map)
+            writer.add_recording(
+                Recording(name, scene.city, scene.time_us, scene.tracks, scene.traffic_lights)
+            )
+            writer.add_ego(EgoTrace(name, "ego", 0, scene.ego))
+            rows = (0, len(scene.time_us), scene.iteration_rows, scene.row_step)
+            place = (scene.route, scene.mission_goal, scene.mapping)
+            writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
+    planners = {"constant-velocity": planner_entry("constant-velocity", {})}
+    noises = {"none": parse_noise("none")}
+    return TaskRunner(path, planners, noises, "nonreactive", "lqr", "nuplan", (), True)
+
+
+NAMES = (
+    "s01_lead_brakes",
+    "s04_left_turn",
+    "s07_parked_in_lane",
+    "s13_empty_road",
+    "bench_scene_100",
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_whole_scenario(measure, runner, name):
+    task = Task(name, "constant-velocity", "none", 0)
+
+    def whole():
+        runner._last = None  # read the scenario again each time
+        result = runner(task)
+        assert result.status == "ok", result.traceback
+
+    assert measure(whole, calls=1) < WHOLE_BOUND
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_step_loop(measure, scenes, runner, name):
+    planner = runner.planners["constant-velocity"].make()
+    measure(lambda: simulate(scenes[name], planner), calls=1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_metrics(measure, scenes, runner, name):
+    log = simulate(scenes[name], runner.planners["constant-velocity"].make())
+    assert measure(lambda: compute_metrics(log, scenes[name].map), calls=1) < METRICS_BOUND
+
+
+def test_help_against_importing_numpy_and_numba():
+    """`shiftsim --help` as a share of importing numpy and numba, both as user time of a process."""
+
+    def user_seconds(*command):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+        return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+
+    ratios = [
+        user_seconds("-m", "shiftsim", "--help") / user_seconds("-c", "import numpy, numba")
+        for _ in range(7)
+    ]
+    ratio = sorted(ratios)[3]
+    print(f"\nhelp: {ratio:.2f} of importing numpy and numba", end="")
+    assert ratio < 0.8
+
+
+def test_peak_memory_of_a_worker(runner):
+    """Peak memory of a process that reads, drives and scores the city scene."""
+    code = (
+        "import resource, sys\n"
+        "from shiftsim.data.store import open_store\n"
+        "from shiftsim.metrics import compute_metrics\n"
+        "from shiftsim.planners import load_planner\n"
+        "from shiftsim.simulation import simulate\n"
+        "scene = open_store(sys.argv[1]).read('bench_scene_100')\n"
+        "log = simulate(scene, load_planner('constant-velocity', {}))\n"
+        "compute_metrics(log, scene.map)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+    )
+    command = [sys.executable, "-c", code, str(runner.store)]
+    out = subprocess.run(command, check=True, capture_output=True, text=True)
+    peak = float(out.stdout)
+    print(f"\npeak memory with bench_scene(100): {peak:.0f} MB", end="")
+    assert peak < 400.0
