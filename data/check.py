@@ -17,6 +17,7 @@ _MAX_SPEED = 100.0  # m/s; anything faster is in the wrong unit
 _MAX_LENGTH = 60.0  # m, of a track
 _MAX_ANGLE = 2.0 * np.pi  # rad; larger headings are in degrees
 _MAX_STEP_US = 1_000_000  # us between rows
+_BESIDE = ("filter", "splits")  # folders that hold statements about the scenarios
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
     known = {MANIFEST, *files}
     for path in sorted(store.rglob("*")):
         name = path.relative_to(store).as_posix()
-        if path.is_file() and name not in known:
+        beside = path.relative_to(store).parts[0] in _BESIDE
+        if path.is_file() and not beside and name not in known:
             yield Problem(name, f"the file is not listed in {MANIFEST}", is_error=False)
 
 
