@@ -38,6 +38,7 @@ class RunConfig:
         store: Name or path of the scenario store.
         split: Name or file of a split; empty for all scenarios of the store.
         limit: Use only the first scenarios of the split, 0 for all.
+        all_scenarios: Also use what the filter dropped, where a whole store is run.
         workers: Worker processes; 0 chooses from the cores.
         out: Run folder; empty for `runs/<id>`.
         save_rollouts: `all` or `none`.
@@ -55,6 +56,7 @@ class RunConfig:
     store: str = DEFAULT_STORE
     split: str = ""
     limit: int = 0
+    all_scenarios: bool = False
     workers: int = 0
     out: str = ""
     save_rollouts: str = "all"
@@ -84,7 +86,7 @@ class RunConfig:
 
 
 _LISTS = {"planners": str, "noise": str, "seeds": int, "metrics": str}
-_SCALARS = {"limit": int, "workers": int, "allow_partial": bool}
+_SCALARS = {"limit": int, "workers": int, "allow_partial": bool, "all_scenarios": bool}
 
 
 def _check_type(name: str, value: object) -> None:

@@ -18,6 +18,7 @@ import shiftsim
 from shiftsim.config import DEFAULT_STORE, RunConfig, default_workers, make_config, store_path
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.executors import Outcome, map_unordered
+from shiftsim.filtering import Verdicts, read_verdicts
 from shiftsim.manifest import make_manifest, now
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.noise import NOISE_NAMES, NoiseModel, parse_noise
@@ -44,6 +45,7 @@ class Prepared:
         determining: Everything that the scores depend on.
         folder: Where the run folder will be.
         workers: Number of worker processes.
+        num_dropped: Scenarios left out because the filter dropped them.
     """
 
     config: RunConfig
@@ -54,6 +56,7 @@ class Prepared:
     determining: dict[str, Any]
     folder: Path
     workers: int
+    num_dropped: int = 0
 
     @property
     def num_expected(self) -> int:
@@ -128,7 +131,9 @@ def prepare(
     ]
     store = open_named_store(config.store)
     known = tuple(store.tokens)
-    split = find_split(config.split, Path(store.path), known)
+    verdicts = _verdicts(config, store)
+    usable = known if verdicts is None else verdicts.accepted
+    split = find_split(config.split, Path(store.path), usable)
     chosen = split.tokens[: config.limit] if config.limit else split.tokens
     lacking = sorted(set(chosen) - set(known))
     if lacking and not config.allow_partial:
@@ -143,6 +148,8 @@ def prepare(
             hint="name the store that was converted for this split",
         )
     determining = _determining(config, entries, models, thresholds, store.hash, chosen)
+    if verdicts is not None:
+        determining["filter"] = verdicts.hash
     folder = Path(config.out) if config.out else RUNS / run_name(config, split.name, determining)
     check_target(folder, determining)
     present = [token for token in chosen if token not in set(lacking)]
@@ -169,7 +176,24 @@ def prepare(
         determining,
         folder,
         max(1, min(workers, len(tasks))),
+        len(known) - len(usable),
     )
+
+
+def _verdicts(config: RunConfig, store: Any) -> Verdicts | None:
+    """The verdicts that decide which scenarios of a whole store are run.
+
+    A split names its scenarios itself.
+    """
+    if config.all_scenarios or config.split not in ("", store.path.name):
+        return None
+    found = read_verdicts(store.path, store.hash)
+    if found is not None and not found.accepted:
+        raise DataError(
+            f"store {config.store!r}: the filter dropped all {len(found.rows)} scenarios",
+            hint="`shiftsim filter` says why; --all to use them nevertheless",
+        )
+    return found
 
 
 def _expanded(names: Iterable[str]) -> list[str]:

@@ -39,6 +39,9 @@ Thresholds = Annotated[str | None, typer.Option(help="nuplan or deepplan. [nupla
 Store = Annotated[str | None, typer.Option("--store", "-s", help="Name or folder. [demo]")]
 Split = Annotated[str | None, typer.Option(help="Name or file (.toml, .txt). [whole store]")]
 Limit = Annotated[int | None, typer.Option(help="Only the first N scenarios.")]
+AllScenarios = Annotated[
+    bool, typer.Option("--all", help="Also the scenarios that the filter dropped.")
+]
 Workers = Annotated[str | None, typer.Option(help="Worker processes. [auto]")]
 Out = Annotated[str | None, typer.Option(help="Run folder. [runs/<id>]")]
 SaveRollouts = Annotated[str | None, typer.Option(help="all or none. [all]")]
@@ -67,6 +70,7 @@ def run(
     store: Store = None,
     split: Split = None,
     limit: Limit = None,
+    all_scenarios: AllScenarios = False,
     traffic: Traffic = None,
     controller: Controller = None,
     thresholds: Thresholds = None,
@@ -93,12 +97,13 @@ def run(
         "store": store,
         "split": split,
         "limit": limit,
+        "all_scenarios": all_scenarios or None,
         "traffic": traffic,
         "controller": controller,
         "thresholds": thresholds,
         "metrics": metric or None,
         "out": out,
-        "workers": None if workers is None else _workers(workers),
+        "workers": None if workers is None else worker_count(workers),
         "save_rollouts": save_rollouts,
         "allow_partial": allow_partial or None,
     }
@@ -125,10 +130,11 @@ def _numbers(text: str) -> list[int]:
         ) from error
 
 
-def _workers(text: str) -> int:
+def worker_count(text: str | None) -> int:
+    """Worker processes as given on the command line; 0 chooses from the cores."""
     from shiftsim.errors import ConfigError
 
-    if text == "auto":
+    if text is None or text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
         raise ConfigError(
@@ -193,6 +199,8 @@ def _announce(prepared: "Prepared") -> None:
         f"split       {prepared.split}  {found} of {plural(found + lacking, 'scenario')} found"
         f"   store {prepared.runner.store}"
     )
+    if prepared.num_dropped:
+        say(f"filter      {prepared.num_dropped} dropped scenarios left out (--all keeps them)")
     say(
         f"settings    traffic {config.traffic}   controller {config.controller}"
         f"   thresholds {config.thresholds}"
@@ -250,7 +258,7 @@ def demo(
         "noise": list(_DEMO_NOISE),
         "store": str(folder) if out else DEFAULT_STORE,
         "limit": limit or 0,
-        "workers": 0 if workers is None else _workers(workers),
+        "workers": worker_count(workers),
     }
     try:
         _run(make_config(values, where="demo"), dry_run=False, quiet=quiet, as_json=False)
@@ -288,7 +296,7 @@ def score(
             metrics=tuple(metric or ()),
             store=store,
             out=out,
-            workers=0 if workers is None else _workers(workers),
+            workers=worker_count(workers),
             on_progress=lambda progress: advance(progress.done, progress.total, ""),
             argv=sys.argv,
         )
