@@ -105,15 +105,15 @@ class Table:
         """Number of row groups."""
         return int(self._file.num_row_groups)
 
-    def read(self, blocks: list[int] | None = None) -> pa.Table:
-        """Rows of some row groups; of all where None.
+    def read(self, blocks: list[int] | None = None, columns: list[str] | None = None) -> pa.Table:
+        """Rows of some row groups and columns; of all where None.
 
         Raises:
             DataError: The file is damaged.
         """
         groups = list(range(self.num_blocks)) if blocks is None else blocks
         try:
-            return self._file.read_row_groups(groups, self._names, use_threads=False)
+            return self._file.read_row_groups(groups, columns or self._names, use_threads=False)
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=MEND) from error
 
