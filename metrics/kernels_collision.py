@@ -40,8 +40,9 @@ def _set_corners(box: FloatArray, out: FloatArray) -> None:
     for index in range(4):
         lon = box[6] if index == 0 or index == 3 else -box[6]
         lat = box[7] if index < 2 else -box[7]
-        out[index, 0] = box[0] + lon * box[2] + lat * box[4]
-        out[index, 1] = box[1] + lon * box[3] + lat * box[5]
+        # nuPlan: the offset is summed first, as in geometry.box_corners
+        out[index, 0] = box[0] + (lat * box[4] + lon * box[2])
+        out[index, 1] = box[1] + (lat * box[5] + lon * box[3])
 
 
 @kernel
