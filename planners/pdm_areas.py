@@ -1,8 +1,8 @@
 """The drivable area PDM-Closed knows: lanes and connectors of near blocks, and car parks (§5.4).
 
-nuPlan puts them into a new spatial index at every step. Here a grid over the whole map is kept, and
-a step marks the areas that belong to it. Edges of a ring are grouped in runs with bounds, so that
-a point-in-polygon test looks at the few that its ray can cross.
+nuPlan puts them into a new spatial index at every step. Here a step names the areas that belong to
+it. Every ring is sliced into horizontal slabs that list the edges in them, so that a
+point-in-polygon test looks at the few edges that its ray can cross.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from shiftsim.geometry import (
 from shiftsim.layers import Lists, Polygons, index_polygons
 from shiftsim.map import VectorMap
 
-RUN = 8  # edges of a ring per bound
+EDGES_PER_SLAB = 3  # on average, if none spanned several
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
@@ -31,15 +31,19 @@ class Areas(NamedTuple):
 
     Attributes:
         polygons: The areas.
-        run_ptr: (R + 1,) first run of each ring.
-        runs: (C, 3) min y, max y, max x of each run of edges [m].
+        slab_ptr: (R + 1,) first slab of each ring.
+        slab_grid: (R, 2) y of the lowest slab [m], slabs per metre.
+        edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
+        edge_ends: Vertices at which the edges of a slab end.
         on_route: (M,) whether the route holds an edge of that id.
         edge: (M,) the edge of that id; for a car park usually -1.
     """
 
     polygons: Polygons
-    run_ptr: IntArray
-    runs: FloatArray
+    slab_ptr: IntArray
+    slab_grid: FloatArray
+    edge_ptr: IntArray
+    edge_ends: IntArray
     on_route: BoolArray
     edge: IntArray
 
@@ -57,29 +61,52 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
     # nuPlan: membership is a test on ids, which car parks share with lanes (pdm-closed.md §11 Q11)
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
     edge = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
-    run_ptr, runs = _bound_runs(polygons.xy, polygons.ring_ptr)
-    return Areas(polygons, run_ptr, runs, np.isin(edge, np.array(route_lanes)), edge)
+    return areas_of(polygons, np.isin(edge, np.array(route_lanes)), edge)
+
+
+def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
+    """Areas from polygons, and the fields of `Areas`."""
+    ring_ptr = polygons.ring_ptr
+    slab_ptr = np.zeros(len(ring_ptr), np.int64)
+    np.cumsum(np.diff(ring_ptr) // EDGES_PER_SLAB + 1, out=slab_ptr[1:])
+    slab_grid, counts = np.empty((len(ring_ptr) - 1, 2)), np.zeros(slab_ptr[-1], np.int64)
+    nothing = np.zeros(0, np.int64)
+    _slice(polygons.xy, ring_ptr, slab_ptr, slab_grid, counts, nothing)
+    edge_ptr = np.concatenate([[0], np.cumsum(counts)])
+    edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
+    _slice(polygons.xy, ring_ptr, slab_ptr, slab_grid, fill, edge_ends)
+    return Areas(polygons, slab_ptr, slab_grid, edge_ptr, edge_ends, on_route, edge)
 
 
 @kernel
-def _bound_runs(xy: FloatArray, ring_ptr: IntArray) -> tuple[IntArray, FloatArray]:
-    num_rings = len(ring_ptr) - 1
-    run_ptr = np.zeros(num_rings + 1, np.int64)
-    for ring in range(num_rings):
-        run_ptr[ring + 1] = run_ptr[ring] + (ring_ptr[ring + 1] - ring_ptr[ring] + RUN - 1) // RUN
-    runs = np.empty((run_ptr[-1], 3))
-    for ring in range(num_rings):
+def _slice(
+    xy: FloatArray,
+    ring_ptr: IntArray,
+    slab_ptr: IntArray,
+    slab_grid: FloatArray,
+    fill: IntArray,
+    edge_ends: IntArray,
+) -> None:
+    """Add the edges of every slab to `fill`, and write them to `edge_ends` where it has room."""
+    for ring in range(len(slab_grid)):
         start, stop = ring_ptr[ring], ring_ptr[ring + 1]
-        for run in range(run_ptr[ring], run_ptr[ring + 1]):
-            first = start + (run - run_ptr[ring]) * RUN
-            before = first - 1 if first > start else stop - 1
-            low = high = xy[before, 1]
-            right = xy[before, 0]
-            for vertex in range(first, min(first + RUN, stop)):
-                low, high = min(low, xy[vertex, 1]), max(high, xy[vertex, 1])
-                right = max(right, xy[vertex, 0])
-            runs[run, 0], runs[run, 1], runs[run, 2] = low, high, right
-    return run_ptr, runs
+        num_slabs = slab_ptr[ring + 1] - slab_ptr[ring]
+        low, high = np.inf, -np.inf
+        for vertex in range(start, stop):
+            low, high = min(low, xy[vertex, 1]), max(high, xy[vertex, 1])
+        scale = num_slabs / (high - low) if high > low else 0.0
+        slab_grid[ring, 0], slab_grid[ring, 1] = low, scale
+        before = stop - 1
+        for vertex in range(start, stop):
+            bottom = min(xy[before, 1], xy[vertex, 1])
+            top = max(xy[before, 1], xy[vertex, 1])
+            first = min(int((bottom - low) * scale), num_slabs - 1)
+            last = min(int((top - low) * scale), num_slabs - 1)
+            for slab in range(slab_ptr[ring] + first, slab_ptr[ring] + last + 1):
+                if len(edge_ends) > 0:
+                    edge_ends[fill[slab]] = vertex
+                fill[slab] += 1
+            before = vertex
 
 
 def admit(road: VectorMap, areas: Areas, x: float, y: float, half_width: float) -> IntArray:
@@ -158,21 +185,43 @@ def touches_square(polygons: Polygons, poly: int, x: float, y: float, half_width
 
 @kernel
 def _locate(
-    xy: FloatArray, ring_ptr: IntArray, run_ptr: IntArray, runs: FloatArray, x: float, y: float
+    xy: FloatArray,
+    ring_ptr: IntArray,
+    slab_ptr: IntArray,
+    slab_grid: FloatArray,
+    edge_ptr: IntArray,
+    edge_ends: IntArray,
+    first: int,
+    last: int,
+    x: float,
+    y: float,
 ) -> int:
-    """Where a point lies relative to one area: INTERIOR, BOUNDARY or EXTERIOR.
+    """Where a point lies relative to rings `first` … `last` - 1: INTERIOR, BOUNDARY or EXTERIOR.
 
-    `ring_ptr` and `run_ptr` are the parts that belong to the area.
+    The point must not be above or below the polygon's bounds.
     """
     inside = False
-    for ring in range(len(ring_ptr) - 1):
+    for ring in range(first, last):
+        num_slabs = slab_ptr[ring + 1] - slab_ptr[ring]
+        place = (y - slab_grid[ring, 0]) * slab_grid[ring, 1]
+        if not place >= 0.0:
+            continue
+        slab = slab_ptr[ring] + min(int(place), num_slabs - 1)
         start, stop = ring_ptr[ring], ring_ptr[ring + 1]
-        for run in range(run_ptr[ring], run_ptr[ring + 1]):
-            if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
-                continue
-            first = start + (run - run_ptr[ring]) * RUN
-            before = first - 1 if first > start else stop - 1
-            odd, on_edge = ray_crossings(xy, before, first, min(first + RUN, stop), x, y)
+        for entry in range(edge_ptr[slab], edge_ptr[slab + 1]):
+            end = edge_ends[entry]
+            before = end - 1 if end > start else stop - 1
+            ay, by = xy[before, 1], xy[end, 1]
+            if ay != y and by != y:  # nearly always
+                if (ay > y) == (by > y):
+                    continue
+                ax, bx = xy[before, 0], xy[end, 0]
+                if ax < x and bx < x:
+                    continue
+                if ax > x and bx > x:
+                    inside = not inside
+                    continue
+            odd, on_edge = ray_crossings(xy, before, end, end + 1, x, y)
             if on_edge:
                 return BOUNDARY
             if odd:
@@ -198,9 +247,19 @@ def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray
             or found == len(out)
         ):
             continue
-        first, last = polygons.poly_ptr[area], polygons.poly_ptr[area + 1]
-        rings, runs = polygons.ring_ptr[first : last + 1], areas.run_ptr[first : last + 1]
-        if _locate(polygons.xy, rings, runs, areas.runs, x, y) != EXTERIOR:
+        side = _locate(
+            polygons.xy,
+            polygons.ring_ptr,
+            areas.slab_ptr,
+            areas.slab_grid,
+            areas.edge_ptr,
+            areas.edge_ends,
+            polygons.poly_ptr[area],
+            polygons.poly_ptr[area + 1],
+            x,
+            y,
+        )
+        if side != EXTERIOR:
             out[found] = area
             found += 1
     return found
@@ -248,12 +307,15 @@ def ego_areas(
             or bounds[area, 3] < low_y
         ):
             continue
-        first, last = polygons.poly_ptr[area], polygons.poly_ptr[area + 1]
         _tally_area(
             polygons.xy,
-            polygons.ring_ptr[first : last + 1],
-            areas.run_ptr[first : last + 1],
-            areas.runs,
+            polygons.ring_ptr,
+            areas.slab_ptr,
+            areas.slab_grid,
+            areas.edge_ptr,
+            areas.edge_ends,
+            polygons.poly_ptr[area],
+            polygons.poly_ptr[area + 1],
             bounds[area],
             areas.on_route[area],
             points,
@@ -272,24 +334,31 @@ def ego_areas(
 def _tally_area(
     xy: FloatArray,
     ring_ptr: IntArray,
-    run_ptr: IntArray,
-    runs: FloatArray,
+    slab_ptr: IntArray,
+    slab_grid: FloatArray,
+    edge_ptr: IntArray,
+    edge_ends: IntArray,
+    first: int,
+    last: int,
     bounds: FloatArray,
     on_route: bool,
     points: FloatArray,
     tally: IntArray,
 ) -> None:
-    """Add one area to the tally of every pose (see `ego_areas`)."""
+    """Add one area to the tally of every pose (see `ego_areas` and `_locate`)."""
     west, south, east, north = bounds[0], bounds[1], bounds[2], bounds[3]
     for row in range(len(points)):
         held = 0
         for point in range(5):
             x, y = points[row, 2 * point], points[row, 2 * point + 1]
-            if x < west or x > east or y < south or y > north:
-                continue
+            if not (west <= x <= east and south <= y <= north):
+                continue  # also where a coordinate is NaN
             if point == 4 and not on_route:
                 continue
-            if _locate(xy, ring_ptr, run_ptr, runs, x, y) == INTERIOR:
+            side = _locate(
+                xy, ring_ptr, slab_ptr, slab_grid, edge_ptr, edge_ends, first, last, x, y
+            )
+            if side == INTERIOR:
                 held |= 1 << point
         corners = held & 15
         tally[row, 0] |= corners

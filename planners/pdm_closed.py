@@ -17,7 +17,13 @@ from shiftsim.map import VectorMap
 from shiftsim.planner import Observation, SceneInfo
 from shiftsim.planners.pdm_areas import Areas, admit, covering, index_ranks, make_areas
 from shiftsim.planners.pdm_centerline import centerline, follow_route, lane_off_road, nearest_vertex
-from shiftsim.planners.pdm_forecast import LIGHT_TOKEN, make_occupants, select_tracks, touched
+from shiftsim.planners.pdm_forecast import (
+    LIGHT_TOKEN,
+    Occupants,
+    make_occupants,
+    select_tracks,
+    touched,
+)
 from shiftsim.planners.pdm_parameters import STEP_US, STEPS, FollowingModel, PdmParameters
 from shiftsim.planners.pdm_path import PdmPath, make_path, offset_poses
 from shiftsim.planners.pdm_route import Start, correct_route, find_start, known_blocks
@@ -50,11 +56,13 @@ class Seen:
     """What one step was planned from.
 
     Attributes:
+        occupants: What is around.
         tokens: Of the occupants, red lights included.
         admitted: Drivable areas, in nuPlan's order.
         lane: The current lane.
     """
 
+    occupants: Occupants
     tokens: list[str]
     admitted: IntArray
     lane: int
@@ -130,7 +138,9 @@ class PdmClosed:
             raise PlannerError("pdm-closed: plan() was called before reset()")
         ego, center = observation.history.ego[-1], observation.ego.center
         vehicle, params = scene.vehicle, self.parameters
-        route = self.route or self._start(scene, ego)
+        if self.route is None:
+            self.route = start_route(scene.map, scene.route, ego, scene.token)
+        route = self.route
         admitted = admit(scene.map, route.areas, center[0], center[1], params.map_radius)
         size = (vehicle.length, vehicle.width)
         lane = current_lane(scene.map, route, admitted, ego, center, size)
@@ -149,7 +159,7 @@ class PdmClosed:
             occupants.ignored[:] = [token in self.collided for token in tokens]
         limit = float(scene.map.speed_limits[lane])
         limit = params.fallback_velocity if np.isnan(limit) else limit
-        self.seen = Seen(tokens, admitted, lane)
+        self.seen = Seen(occupants, tokens, admitted, lane)
         intersections = scene.map.intersections.polygons
         return plan_step(
             ego,
@@ -160,21 +170,6 @@ class PdmClosed:
             vehicle,
             params,
         )
-
-    def _start(self, scene: SceneInfo, ego: FloatArray) -> Route:
-        """Correct the route, once per scenario."""
-        road = scene.map
-        blocks = known_blocks(road, scene.route, scene.token)
-        start = find_start(road, blocks, ego[:3])
-        corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
-        lanes = [edge for block in corrected for edge in road.block_edges.at(block).tolist()]
-        if not lanes:
-            raise PlannerError(
-                f"pdm-closed: the route of scenario {scene.token!r} has no lanes",
-                hint="correct the route of the scenario, or leave it out",
-            )
-        self.route = Route(start, corrected, np.array(lanes), make_areas(road, lanes))
-        return self.route
 
     def _follow(self, road: VectorMap, route: Route, lane: int) -> None:
         """Lay the centerline and the paths beside it, once per scenario."""
@@ -188,6 +183,30 @@ class PdmClosed:
         red = [n for n, s in observation.traffic_lights.items() if s == LightStatus.RED]
         edges = [road.edges.index.get(name, -1) for name in red]
         return [edge for edge in edges if edge >= 0 and route.areas.on_route[edge]]
+
+
+def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
+    """Correct a route at the start of a scenario (pdm-closed.md §3).
+
+    Args:
+        road: The map.
+        ids: Roadblock ids of the route.
+        ego: (11,) ego state.
+        token: Id of the scenario, for messages.
+
+    Raises:
+        PlannerError: The route is empty, unknown to the map, or has no lanes.
+    """
+    blocks = known_blocks(road, ids, token)
+    start = find_start(road, blocks, ego[:3])
+    corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
+    lanes = [edge for block in corrected for edge in road.block_edges.at(block).tolist()]
+    if not lanes:
+        raise PlannerError(
+            f"pdm-closed: the route of scenario {token!r} has no lanes",
+            hint="correct the route of the scenario, or leave it out",
+        )
+    return Route(start, corrected, np.array(lanes), make_areas(road, lanes))
 
 
 def current_lane(

@@ -7,9 +7,9 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.geometry import boxes_to_corners, convex_intersect, wrap_angles
+from shiftsim.geometry import box_corners, convex_intersect, wrap_angle
 from shiftsim.planners.pdm_areas import index_ranks
-from shiftsim.planners.pdm_parameters import DT, STEPS, PdmParameters
+from shiftsim.planners.pdm_parameters import STEPS, PdmParameters
 from shiftsim.state import LAST_AGENT_KIND, AgentKind, Tracks
 
 LIGHT_TOKEN = "red_light_"
@@ -54,8 +54,7 @@ def select_tracks(
     if collided:
         seen &= np.array([token not in collided for token in tracks.tokens], np.bool_)
     near = np.flatnonzero(seen)
-    kinds = tracks.kinds[near]
-    near = near[np.argsort(kinds, kind="stable")]
+    near = near[np.argsort(tracks.kinds[near], kind="stable")]
     kinds = tracks.kinds[near]
     groups = (
         (kinds > LAST_AGENT_KIND, params.max_static),
@@ -73,29 +72,48 @@ def select_tracks(
 
 def make_occupants(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray]) -> Occupants:
     """Occupants from tracks of the last row and rings (V, 2) of red connectors; none ignored."""
-    poses, sizes, kinds = tracks.poses[-1, chosen], tracks.sizes[-1, chosen], tracks.kinds[chosen]
-    velocities = tracks.velocities[-1, chosen]
-    speeds = np.hypot(velocities[:, 0], velocities[:, 1])
-    speeds = np.where(kinds <= LAST_AGENT_KIND, speeds, 0.0)
-    # nuPlan: boxes move along their own axis with the full speed (pdm-closed.md §11 Q9)
-    course = np.arctan2(velocities[:, 1], velocities[:, 0])
-    is_forward = np.abs(wrap_angles(poses[:, 2] - course)) < np.pi / 2.0
-    heading = np.where(is_forward, poses[:, 2], poses[:, 2] + np.pi)
-    motion = speeds[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
-    boxes = boxes_to_corners(poses, sizes)
-    shift = (2.0 * DT * np.arange(NUM_FORECASTS))[:, None, None] * motion
-    return Occupants(
-        np.ascontiguousarray(boxes + shift[:, :, None]),
-        np.ascontiguousarray(poses[:, :2] + shift),
-        0.5 * np.hypot(sizes[:, 0], sizes[:, 1]),
-        motion.any(axis=1),
-        np.ascontiguousarray(poses[:, 2]),
-        speeds,
+    kinds = tracks.kinds[chosen]
+    count = len(chosen)
+    made = Occupants(
+        np.empty((NUM_FORECASTS, count, 4, 2)),
+        np.empty((NUM_FORECASTS, count, 2)),
+        np.empty(count),
+        np.empty(count, np.bool_),
+        np.empty(count),
+        np.empty(count),
         kinds,
-        np.zeros(len(chosen) + len(lights), np.bool_),
+        np.zeros(count + len(lights), np.bool_),
         np.concatenate([np.zeros((0, 2)), *lights]),
         np.cumsum([0, *(len(ring) for ring in lights)]),
     )
+    _forecast(
+        tracks.poses[-1, chosen], tracks.velocities[-1, chosen], tracks.sizes[-1, chosen], made
+    )
+    return made
+
+
+@kernel
+def _forecast(poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out: Occupants) -> None:
+    """Fill in the boxes of all forecast maps."""
+    for index in range(len(poses)):
+        heading, vx, vy = poses[index, 2], velocities[index, 0], velocities[index, 1]
+        speed = np.hypot(vx, vy) if out.kinds[index] <= LAST_AGENT_KIND else 0.0
+        # nuPlan: boxes move along their own axis with the full speed (pdm-closed.md §11 Q9)
+        is_forward = abs(wrap_angle(heading - np.arctan2(vy, vx))) < np.pi / 2.0
+        course = heading if is_forward else heading + np.pi
+        step_x, step_y = speed * np.cos(course), speed * np.sin(course)
+        out.radii[index] = 0.5 * np.hypot(sizes[index, 0], sizes[index, 1])
+        out.moves[index] = step_x != 0.0 or step_y != 0.0
+        out.headings[index], out.speeds[index] = heading, speed
+        x, y, box = poses[index, 0], poses[index, 1], out.boxes[0, index]
+        box_corners(x, y, heading, sizes[index, 0], sizes[index, 1], box)
+        for forecast in range(NUM_FORECASTS):
+            seconds = 0.1 * (2 * forecast)
+            out.centers[forecast, index, 0] = x + seconds * step_x
+            out.centers[forecast, index, 1] = y + seconds * step_y
+            for corner in range(4):
+                out.boxes[forecast, index, corner, 0] = box[corner, 0] + seconds * step_x
+                out.boxes[forecast, index, corner, 1] = box[corner, 1] + seconds * step_y
 
 
 def touched(occupants: Occupants, footprint: FloatArray) -> list[int]:

@@ -109,11 +109,9 @@ def score(
     drivable = np.where(areas[:, :, 1].any(axis=1), 0.0, 1.0)
     factor = no_collision * drivable * direction
     progress = normalise(raw, factor)
-    comfortable = bounded.all(axis=1).astype(np.float64)
-    weights = (params.progress_weight, params.ttc_weight, params.comfort_weight)
-    weighted = (weights[0] * progress + weights[1] * ttc + weights[2] * comfortable) / sum(weights)
+    comfortable = np.where(bounded.all(axis=1), 1.0, 0.0)
     return Scores(
-        factor * weighted,
+        factor * weigh(progress, ttc, comfortable, params),
         no_collision,
         drivable,
         direction,
@@ -125,6 +123,15 @@ def score(
         ttc_index,
         areas,
     )
+
+
+def weigh(
+    progress: FloatArray, ttc: FloatArray, comfortable: FloatArray, params: PdmParameters
+) -> FloatArray:
+    """(P,) weighted mean of what is not a factor."""
+    weights = (params.progress_weight, params.ttc_weight, params.comfort_weight)
+    mean: FloatArray = weights[0] * progress + weights[1] * ttc + weights[2] * comfortable
+    return mean / sum(weights)
 
 
 def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:

@@ -43,6 +43,12 @@ KINDS = (
     Kind("nuplan_format", ("devkit_readback.json",), "nuplan_format:verify_nuplan_format"),
     Kind("metric_worlds", ("metric_world_*.json",), "metric_worlds:verify_metric_worlds"),
     Kind(
+        "pdm",
+        ("kernels/*.npz|kernels/*.json|routes.json|idm_calls.json|loop/steps.parquet",),
+        "pdm:verify_pdm",
+        ("mode", "scenes"),
+    ),
+    Kind(
         "dynamics",
         (
             "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",

@@ -93,7 +93,12 @@ class _Tables:
 
 
 def verify_nuplan_metrics(
-    folder: Path, report: Report, maps: dict[str, VectorMap], mode: str | None = None
+    folder: Path,
+    report: Report,
+    maps: dict[str, VectorMap],
+    mode: str | None = None,
+    *,
+    loops: Path | None = None,
 ) -> None:
     """Score the recorded rollout of every run of `expected/ego.parquet`.
 
@@ -102,12 +107,16 @@ def verify_nuplan_metrics(
         report: Filled with the comparisons.
         maps: Maps by name.
         mode: Only runs of this challenge (`NR`, `R`, `PT`).
+        loops: Folder with the tables of other runs in the same scenes, instead of `expected`.
     """
     expected = folder / "expected"
     scenes = {scene["scene"]: scene for scene in json.loads((folder / "scenes.json").read_text())}
-    runs = read_groups(expected / "ego.parquet")
+    runs = read_groups((loops or expected) / "ego.parquet")
     experts = read_groups(expected / "log_ego.parquet", ("scene", "kind"))
-    tables = _read_tables(expected)
+    tables = _read_tables(loops or expected)
+    if loops is not None:
+        logged = read_groups(expected / "objects.parquet")
+        tables.objects.update({key: rows for key, rows in logged.items() if key[1:] == ("NR", "*")})
     _name_unknown(tables, runs, mode, report)
     report.note("objects height: no metric reads it")
     for run, rows in runs.items():

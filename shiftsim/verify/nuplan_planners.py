@@ -113,7 +113,7 @@ def _plan(
     row: FloatArray = np.zeros(state.NUM_STATE)
     for column, index in EGO_COLUMNS.items():
         row[index] = ego[column][where[0]]
-    tracks = None if objects is None else _tracks(objects, iteration)
+    tracks = None if objects is None else tracks_at(objects, iteration)
     try:
         plan = planner.plan(observe(scenario, iteration, row, tracks))
     except ShiftsimError as error:
@@ -122,8 +122,8 @@ def _plan(
     return plan if isinstance(plan, Trajectory) else None
 
 
-def _tracks(objects: Group, iteration: int) -> Tracks:
-    """One row of tracks, in the order of the table."""
+def tracks_at(objects: Group, iteration: int) -> Tracks:
+    """One row of tracks from a table of objects, in its order."""
     where = np.flatnonzero(objects["iteration"] == iteration)
 
     def table(*names: str) -> Any:
