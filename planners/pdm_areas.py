@@ -22,7 +22,7 @@ from shiftsim.geometry import (
 from shiftsim.layers import Lists, Polygons, index_polygons
 from shiftsim.map import VectorMap
 
-EDGES_PER_SLAB = 3  # on average, if none spanned several
+EDGES_PER_SLAB = 2  # on average, if none spanned several
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
@@ -31,7 +31,7 @@ class Areas(NamedTuple):
 
     Attributes:
         polygons: The areas.
-        slab_ptr: (R + 1,) first slab of each ring.
+        rings: (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs.
         slab_grid: (R, 2) y of the lowest slab [m], slabs per metre.
         edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
         edge_ends: Vertices at which the edges of a slab end.
@@ -40,7 +40,7 @@ class Areas(NamedTuple):
     """
 
     polygons: Polygons
-    slab_ptr: IntArray
+    rings: IntArray
     slab_grid: FloatArray
     edge_ptr: IntArray
     edge_ends: IntArray
@@ -66,31 +66,24 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
 
 def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
     """Areas from polygons, and the fields of `Areas`."""
-    ring_ptr = polygons.ring_ptr
-    slab_ptr = np.zeros(len(ring_ptr), np.int64)
-    np.cumsum(np.diff(ring_ptr) // EDGES_PER_SLAB + 1, out=slab_ptr[1:])
-    slab_grid, counts = np.empty((len(ring_ptr) - 1, 2)), np.zeros(slab_ptr[-1], np.int64)
-    nothing = np.zeros(0, np.int64)
-    _slice(polygons.xy, ring_ptr, slab_ptr, slab_grid, counts, nothing)
+    starts, stops = polygons.ring_ptr[:-1], polygons.ring_ptr[1:]
+    num_slabs = (stops - starts) // EDGES_PER_SLAB + 1
+    rings = np.column_stack([starts, stops, np.cumsum(num_slabs) - num_slabs, num_slabs])
+    slab_grid, counts = np.empty((len(rings), 2)), np.zeros(num_slabs.sum(), np.int64)
+    _slice(polygons.xy, rings, slab_grid, counts, np.zeros(0, np.int64))
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
     edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
-    _slice(polygons.xy, ring_ptr, slab_ptr, slab_grid, fill, edge_ends)
-    return Areas(polygons, slab_ptr, slab_grid, edge_ptr, edge_ends, on_route, edge)
+    _slice(polygons.xy, rings, slab_grid, fill, edge_ends)
+    return Areas(polygons, rings, slab_grid, edge_ptr, edge_ends, on_route, edge)
 
 
 @kernel
 def _slice(
-    xy: FloatArray,
-    ring_ptr: IntArray,
-    slab_ptr: IntArray,
-    slab_grid: FloatArray,
-    fill: IntArray,
-    edge_ends: IntArray,
+    xy: FloatArray, rings: IntArray, slab_grid: FloatArray, fill: IntArray, edge_ends: IntArray
 ) -> None:
     """Add the edges of every slab to `fill`, and write them to `edge_ends` where it has room."""
-    for ring in range(len(slab_grid)):
-        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
-        num_slabs = slab_ptr[ring + 1] - slab_ptr[ring]
+    for ring in range(len(rings)):
+        start, stop, first_slab, num_slabs = rings[ring]
         low, high = np.inf, -np.inf
         for vertex in range(start, stop):
             low, high = min(low, xy[vertex, 1]), max(high, xy[vertex, 1])
@@ -102,7 +95,7 @@ def _slice(
             top = max(xy[before, 1], xy[vertex, 1])
             first = min(int((bottom - low) * scale), num_slabs - 1)
             last = min(int((top - low) * scale), num_slabs - 1)
-            for slab in range(slab_ptr[ring] + first, slab_ptr[ring] + last + 1):
+            for slab in range(first_slab + first, first_slab + last + 1):
                 if len(edge_ends) > 0:
                     edge_ends[fill[slab]] = vertex
                 fill[slab] += 1
@@ -185,12 +178,7 @@ def touches_square(polygons: Polygons, poly: int, x: float, y: float, half_width
 
 @kernel
 def _locate(
-    xy: FloatArray,
-    ring_ptr: IntArray,
-    slab_ptr: IntArray,
-    slab_grid: FloatArray,
-    edge_ptr: IntArray,
-    edge_ends: IntArray,
+    slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
     first: int,
     last: int,
     x: float,
@@ -198,16 +186,17 @@ def _locate(
 ) -> int:
     """Where a point lies relative to rings `first` … `last` - 1: INTERIOR, BOUNDARY or EXTERIOR.
 
-    The point must not be above or below the polygon's bounds.
+    The point must be within their bounds. `slabs` are the vertices and the fields of `Areas` from
+    `rings` to `edge_ends`; the whole of `Areas` takes longer to pass than to use.
     """
+    xy, rings, slab_grid, edge_ptr, edge_ends = slabs
     inside = False
     for ring in range(first, last):
-        num_slabs = slab_ptr[ring + 1] - slab_ptr[ring]
         place = (y - slab_grid[ring, 0]) * slab_grid[ring, 1]
         if not place >= 0.0:
             continue
-        slab = slab_ptr[ring] + min(int(place), num_slabs - 1)
-        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
+        start, stop = rings[ring, 0], rings[ring, 1]
+        slab = rings[ring, 2] + min(int(place), rings[ring, 3] - 1)
         for entry in range(edge_ptr[slab], edge_ptr[slab + 1]):
             end = edge_ends[entry]
             before = end - 1 if end > start else stop - 1
@@ -235,8 +224,8 @@ def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray
 
     They are in the order of `admitted`; at most `len(out)` are found.
     """
-    polygons = areas.polygons
-    bounds = polygons.bounds
+    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
+    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
     found = 0
     for area in admitted:
         if (
@@ -247,127 +236,118 @@ def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray
             or found == len(out)
         ):
             continue
-        side = _locate(
-            polygons.xy,
-            polygons.ring_ptr,
-            areas.slab_ptr,
-            areas.slab_grid,
-            areas.edge_ptr,
-            areas.edge_ends,
-            polygons.poly_ptr[area],
-            polygons.poly_ptr[area + 1],
-            x,
-            y,
-        )
-        if side != EXTERIOR:
+        if _locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
             out[found] = area
             found += 1
     return found
 
 
 @kernel
-def ego_areas(
-    areas: Areas, admitted: IntArray, corners: FloatArray, centers: FloatArray, out: BoolArray
-) -> None:
-    """How every pose of every proposal lies on the road (§8.1).
-
-    Args:
-        areas: The areas.
-        admitted: Those that count.
-        corners: (P, T, 4, 2) corners of the ego [m].
-        centers: (P, T, 2) its centres [m].
-        out: (P, T, 3) receives: on multiple lanes, off the road, on no lane of the route.
-    """
-    points = np.empty((centers.shape[0] * centers.shape[1], 10))  # corners, centre
+def near_areas(areas: Areas, admitted: IntArray, points: FloatArray) -> IntArray:
+    """Those of the admitted areas whose bounds overlap the bounds of points (..., 2)."""
+    flat = points.reshape(-1, 2)
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
-    row = 0
-    for proposal in range(centers.shape[0]):
-        for step in range(centers.shape[1]):
-            for corner in range(4):
-                points[row, 2 * corner] = corners[proposal, step, corner, 0]
-                points[row, 2 * corner + 1] = corners[proposal, step, corner, 1]
-            points[row, 8] = centers[proposal, step, 0]
-            points[row, 9] = centers[proposal, step, 1]
-            for point in range(4):
-                low_x = min(low_x, points[row, 2 * point])
-                high_x = max(high_x, points[row, 2 * point])
-                low_y = min(low_y, points[row, 2 * point + 1])
-                high_y = max(high_y, points[row, 2 * point + 1])
-            row += 1
-    # per pose: corners on any area, areas with a corner, whether one has all, whether on the route
-    tally = np.zeros((row, 4), np.int64)
-    polygons = areas.polygons
-    bounds = polygons.bounds
+    for row in range(len(flat)):
+        low_x, high_x = min(low_x, flat[row, 0]), max(high_x, flat[row, 0])
+        low_y, high_y = min(low_y, flat[row, 1]), max(high_y, flat[row, 1])
+    bounds = areas.polygons.bounds
+    out = np.empty(len(admitted), np.int64)
+    count = 0
     for area in admitted:
         if (
-            bounds[area, 0] > high_x
-            or bounds[area, 2] < low_x
-            or bounds[area, 1] > high_y
-            or bounds[area, 3] < low_y
+            bounds[area, 0] <= high_x
+            and bounds[area, 2] >= low_x
+            and bounds[area, 1] <= high_y
+            and bounds[area, 3] >= low_y
         ):
-            continue
-        _tally_area(
-            polygons.xy,
-            polygons.ring_ptr,
-            areas.slab_ptr,
-            areas.slab_grid,
-            areas.edge_ptr,
-            areas.edge_ends,
-            polygons.poly_ptr[area],
-            polygons.poly_ptr[area + 1],
-            bounds[area],
-            areas.on_route[area],
-            points,
-            tally,
-        )
-    row = 0
-    for proposal in range(centers.shape[0]):
-        for step in range(centers.shape[1]):
-            out[proposal, step, 0] = tally[row, 1] > 1 and tally[row, 2] == 0
-            out[proposal, step, 1] = tally[row, 0] != 15
-            out[proposal, step, 2] = tally[row, 3] == 0
-            row += 1
+            out[count] = area
+            count += 1
+    return out[:count]
 
 
 @kernel
-def _tally_area(
-    xy: FloatArray,
-    ring_ptr: IntArray,
-    slab_ptr: IntArray,
-    slab_grid: FloatArray,
-    edge_ptr: IntArray,
-    edge_ends: IntArray,
-    first: int,
-    last: int,
-    bounds: FloatArray,
-    on_route: bool,
-    points: FloatArray,
-    tally: IntArray,
+def cover_poses(
+    areas: Areas,
+    near: IntArray,
+    corners: FloatArray,
+    centers: FloatArray,
+    off_road: BoolArray,
+    oncoming: BoolArray,
 ) -> None:
-    """Add one area to the tally of every pose (see `ego_areas` and `_locate`)."""
-    west, south, east, north = bounds[0], bounds[1], bounds[2], bounds[3]
-    for row in range(len(points)):
-        held = 0
-        for point in range(5):
-            x, y = points[row, 2 * point], points[row, 2 * point + 1]
-            if not (west <= x <= east and south <= y <= north):
-                continue  # also where a coordinate is NaN
-            if point == 4 and not on_route:
-                continue
-            side = _locate(
-                xy, ring_ptr, slab_ptr, slab_grid, edge_ptr, edge_ends, first, last, x, y
-            )
-            if side == INTERIOR:
-                held |= 1 << point
-        corners = held & 15
-        tally[row, 0] |= corners
-        if corners != 0:
-            tally[row, 1] += 1
-        if corners == 15:
-            tally[row, 2] = 1
-        if held >= 16:
-            tally[row, 3] = 1
+    """Whether every pose of every proposal lies on the road, and on the route (§8.1).
+
+    Args:
+        areas: The areas.
+        near: Those that count.
+        corners: (P, T, 4, 2) corners of the ego [m].
+        centers: (P, T, 2) its centres [m].
+        off_road: (P, T) receives whether a corner is on no area.
+        oncoming: (P, T) receives whether the centre is on no area of the route.
+    """
+    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
+    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
+    on_route = np.empty(len(near), np.int64)
+    count = 0
+    for area in near:
+        if areas.on_route[area]:
+            on_route[count] = area
+            count += 1
+    on_route = on_route[:count]
+    last = np.full(5, -1)  # the area that held each point one step before is tried first
+    for proposal in range(corners.shape[0]):
+        for step in range(corners.shape[1]):
+            is_off = False
+            for corner in range(4):
+                x, y = corners[proposal, step, corner, 0], corners[proposal, step, corner, 1]
+                last[corner] = _find_holder(slabs, bounds, poly_ptr, near, last[corner], x, y)
+                is_off = is_off or last[corner] < 0
+            off_road[proposal, step] = is_off
+            x, y = centers[proposal, step, 0], centers[proposal, step, 1]
+            last[4] = _find_holder(slabs, bounds, poly_ptr, on_route, last[4], x, y)
+            oncoming[proposal, step] = last[4] < 0
+
+
+@kernel
+def _find_holder(
+    slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
+    bounds: FloatArray,
+    poly_ptr: IntArray,
+    near: IntArray,
+    guess: int,
+    x: float,
+    y: float,
+) -> int:
+    """An area that holds a point in its interior, tried from `guess` on; -1 if none does."""
+    for attempt in range(-1, len(near)):
+        area = guess if attempt < 0 else near[attempt]
+        if area < 0 or not (
+            bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
+        ):
+            continue  # also where a coordinate is NaN
+        if _locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) == INTERIOR:
+            return area
+    return -1
+
+
+@kernel
+def on_multiple_lanes(areas: Areas, near: IntArray, box: FloatArray) -> bool:
+    """Whether the corners (4, 2) of the ego are on several areas, none of which has all (§8.1)."""
+    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
+    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
+    num_touched = 0
+    for entry in range(len(near)):
+        num_held = 0
+        for corner in range(4):
+            x, y = box[corner, 0], box[corner, 1]
+            this = near[entry : entry + 1]
+            if _find_holder(slabs, bounds, poly_ptr, this, -1, x, y) >= 0:
+                num_held += 1
+        if num_held == 4:
+            return False
+        if num_held > 0:
+            num_touched += 1
+    return num_touched > 1
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

@@ -58,13 +58,13 @@ class Seen:
     Attributes:
         occupants: What is around.
         tokens: Of the occupants, red lights included.
-        admitted: Drivable areas, in nuPlan's order.
+        road: The map of the step.
         lane: The current lane.
     """
 
     occupants: Occupants
     tokens: list[str]
-    admitted: IntArray
+    road: Road
     lane: int
 
 
@@ -159,14 +159,14 @@ class PdmClosed:
             occupants.ignored[:] = [token in self.collided for token in tokens]
         limit = float(scene.map.speed_limits[lane])
         limit = params.fallback_velocity if np.isnan(limit) else limit
-        self.seen = Seen(occupants, tokens, admitted, lane)
-        intersections = scene.map.intersections.polygons
+        road = Road(route.areas, admitted, scene.map.intersections.polygons, self._paths[0])
+        self.seen = Seen(occupants, tokens, road, lane)
         return plan_step(
             ego,
             limit * np.array(params.speed_fractions),
             self._paths,
             occupants,
-            Road(route.areas, admitted, intersections, self._paths[0]),
+            road,
             vehicle,
             params,
         )

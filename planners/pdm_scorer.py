@@ -16,7 +16,7 @@ from shiftsim.geometry import (
     segments_intersect,
 )
 from shiftsim.layers import Polygons, in_any
-from shiftsim.planners.pdm_areas import Areas, ego_areas
+from shiftsim.planners.pdm_areas import Areas, cover_poses, near_areas, on_multiple_lanes
 from shiftsim.planners.pdm_comfort import Filters, comfort
 from shiftsim.planners.pdm_forecast import Occupants, centroid
 from shiftsim.planners.pdm_parameters import (
@@ -48,7 +48,8 @@ class Scores(NamedTuple):
         raw_progress: (P,) along the centerline, before factors [m].
         collision_index: (P,) first time index of an at-fault collision, inf if none.
         ttc_index: (P,) first time index of a violation, inf if none.
-        areas: (P, T, 3) on multiple lanes, off the road, on no lane of the route.
+        off_road: (P, T) whether a corner is on no drivable area.
+        oncoming: (P, T) whether the centre is on no lane of the route.
     """
 
     total: FloatArray
@@ -61,7 +62,8 @@ class Scores(NamedTuple):
     raw_progress: FloatArray
     collision_index: FloatArray
     ttc_index: FloatArray
-    areas: BoolArray
+    off_road: BoolArray
+    oncoming: BoolArray
 
 
 class Road(NamedTuple):
@@ -93,20 +95,24 @@ def score(
     corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
     size = (vehicle.length, vehicle.width, vehicle.rear_axle_to_center)
     place_ego(states, size, corners, centers)
-    areas = np.empty((count, steps, 3), np.bool_)
-    ego_areas(road.areas, road.admitted, corners, centers, areas)
+    lanes = near_areas(road.areas, road.admitted, corners)
+    off_road, oncoming = np.empty((count, steps), np.bool_), np.empty((count, steps), np.bool_)
+    cover_poses(road.areas, lanes, corners, centers, off_road, oncoming)
     near = _near(states, centers, occupants, size)
     no_collision, collision_index = np.empty(count), np.empty(count)
-    _collisions(states, corners, areas, occupants, near, no_collision, collision_index)
+    place = (road.areas, lanes, off_road)
+    _collisions(states, corners, *place, occupants, near, no_collision, collision_index)
     ttc, ttc_index = np.empty(count), np.empty(count)
-    _times_to_collision(states, corners, areas, occupants, near, road.intersections, ttc, ttc_index)
-    raw, oncoming = np.empty(count), np.empty(count)
-    _travel(centers, areas, road.centerline, raw, oncoming)
+    _times_to_collision(
+        states, corners, *place, occupants, near, road.intersections, ttc, ttc_index
+    )
+    raw, stray = np.empty(count), np.empty(count)
+    _travel(centers, oncoming, road.centerline, raw, stray)
     signals, bounded = np.empty((count, 6, steps)), np.empty((count, 6), np.bool_)
     comfort(states, filters, params.comfort, signals, bounded)
     low, high = params.direction_limits
-    direction = np.where(oncoming < low, 1.0, np.where(oncoming < high, 0.5, 0.0))
-    drivable = np.where(areas[:, :, 1].any(axis=1), 0.0, 1.0)
+    direction = np.where(stray < low, 1.0, np.where(stray < high, 0.5, 0.0))
+    drivable = np.where(off_road.any(axis=1), 0.0, 1.0)
     factor = no_collision * drivable * direction
     progress = normalise(raw, factor)
     comfortable = np.where(bounded.all(axis=1), 1.0, 0.0)
@@ -121,7 +127,8 @@ def score(
         raw,
         collision_index,
         ttc_index,
-        areas,
+        off_road,
+        oncoming,
     )
 
 
@@ -221,7 +228,9 @@ def _front_touches(corners: FloatArray, ring: FloatArray) -> bool:
 def _collisions(
     states: FloatArray,
     corners: FloatArray,
-    areas: BoolArray,
+    areas: Areas,
+    lanes: IntArray,
+    off_road: BoolArray,
     occupants: Occupants,
     near: IntArray,
     scores: FloatArray,
@@ -249,8 +258,8 @@ def _collisions(
                     continue
                 is_agent = kinds[index] <= LAST_AGENT_KIND
                 is_stopped = not is_agent or speeds[index] <= TRACK_STOPPED
-                on_edge = areas[row, step, 0] or areas[row, step, 1]
-                if _is_at_fault(state, box, ring, is_stopped, on_edge):
+                is_off = off_road[row, step]
+                if _is_at_fault(state, box, ring, is_stopped, is_off, areas, lanes):
                     scores[row] = min(scores[row], 0.0 if is_agent else 0.5)
                     first[row] = min(first[row], float(step))
                 else:
@@ -266,9 +275,15 @@ def _circle_of(box: FloatArray) -> tuple[float, float, float]:
 
 @kernel
 def _is_at_fault(
-    state: FloatArray, box: FloatArray, ring: FloatArray, is_stopped: bool, on_edge: bool
+    state: FloatArray,
+    box: FloatArray,
+    ring: FloatArray,
+    is_stopped: bool,
+    is_off: bool,
+    areas: Areas,
+    lanes: IntArray,
 ) -> bool:
-    """Whether the ego causes a collision; `on_edge`: on several lanes, or off the road."""
+    """Whether the ego causes a collision; `is_stopped` is the other, `is_off` the ego's place."""
     if np.hypot(state[VX], state[VY]) <= EGO_STOPPED:
         return False
     if is_stopped:
@@ -276,14 +291,16 @@ def _is_at_fault(
     x, y = centroid(ring)
     if bearing(state, x, y) > BEHIND:
         return False
-    return on_edge or _front_touches(box, ring)
+    return _front_touches(box, ring) or is_off or on_multiple_lanes(areas, lanes, box)
 
 
 @kernel
 def _times_to_collision(
     states: FloatArray,
     corners: FloatArray,
-    areas: BoolArray,
+    areas: Areas,
+    lanes: IntArray,
+    off_road: BoolArray,
     occupants: Occupants,
     near: IntArray,
     intersections: Polygons,
@@ -304,12 +321,12 @@ def _times_to_collision(
             if speed < TTC_STOPPED:
                 continue
             cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
-            on_edge = areas[row, step, 0] or areas[row, step, 1]
+            here = corners[row, step]
             for ahead in TTC_STEPS:
                 travel = 0.1 * ahead * speed
                 for corner in range(4):
-                    box[corner, 0] = corners[row, step, corner, 0] + travel * cos
-                    box[corner, 1] = corners[row, step, corner, 1] + travel * sin
+                    box[corner, 0] = here[corner, 0] + travel * cos
+                    box[corner, 1] = here[corner, 1] + travel * sin
                 forecast = (step + ahead) // 2
                 x, y, radius = _circle_of(box)
                 for entry in range(len(near)):
@@ -321,7 +338,16 @@ def _times_to_collision(
                     ring = boxes[forecast, index]
                     if not convex_intersect(box, ring):
                         continue
-                    if _is_violation(state, ring, on_edge, intersections):
+                    centroid_x, centroid_y = centroid(ring)
+                    angle = bearing(state, centroid_x, centroid_y)
+                    if angle < AHEAD or (
+                        not angle > BEHIND
+                        and (
+                            off_road[row, step]
+                            or in_any(intersections, state[X], state[Y])
+                            or on_multiple_lanes(areas, lanes, here)
+                        )
+                    ):
                         scores[row] = 0.0
                         first[row] = min(first[row], float(step))
                     else:
@@ -331,26 +357,12 @@ def _times_to_collision(
 
 
 @kernel
-def _is_violation(
-    state: FloatArray, ring: FloatArray, on_edge: bool, intersections: Polygons
-) -> bool:
-    """Whether an object in the ego's way counts: it is ahead, or beside it where lanes meet."""
-    x, y = centroid(ring)
-    angle = bearing(state, x, y)
-    if angle < AHEAD:
-        return True
-    if angle > BEHIND:
-        return False
-    return on_edge or in_any(intersections, state[X], state[Y])
-
-
-@kernel
 def _travel(
     centers: FloatArray,
-    areas: BoolArray,
+    oncoming: BoolArray,
     centerline: PdmPath,
     progress: FloatArray,
-    oncoming: FloatArray,
+    stray: FloatArray,
 ) -> None:
     """Progress along the centerline (§8.5) and longest way off the route (§8.3), both (P,) [m]."""
     last = centers.shape[1] - 1
@@ -360,11 +372,11 @@ def _travel(
         progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
         for step in range(last + 1):
-            if not areas[row, step, 2]:
+            if not oncoming[row, step]:
                 stretch = 0.0
             elif step > 0:
                 dx = centers[row, step, 0] - centers[row, step - 1, 0]
                 dy = centers[row, step, 1] - centers[row, step - 1, 1]
                 stretch += np.hypot(dx, dy)
             longest = max(longest, stretch)
-        oncoming[row] = longest
+        stray[row] = longest

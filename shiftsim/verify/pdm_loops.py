@@ -213,7 +213,7 @@ def _compare_step(
         "speed_limit_mps": limit,
         "collided_ids": ",".join(planner.collided),
         "n_map_tokens": len(sight.tokens),
-        "n_drivable_tokens": len(sight.admitted),
+        "n_drivable_tokens": len(sight.road.admitted),
     }
     for column, value in ours.items():
         given = run.steps[column][index]
@@ -262,12 +262,12 @@ def _compare_arrays(
     assert planner.route is not None
     names = {**_ARRAYS, "ego_areas": "ego_areas"}
     stored = {o: file[f"{n}_{index}"] for n, o in names.items() if f"{n}_{index}" in file.arrays}
-    compare_arrays(report, where, step, stored)
+    compare_arrays(report, where, step, planner.seen.road, stored)
     if (name := f"map_tokens_{index}") in file.arrays:
         report.compare("PDM map tokens", where, planner.seen.tokens, file[name].tolist())
     if (name := f"drivable_tokens_{index}") in file.arrays:
         ids = [*scenario.map.edges.ids, *scenario.map.car_parks.ids]
-        ours = [ids[area] for area in planner.seen.admitted.tolist()]
+        ours = [ids[area] for area in planner.seen.road.admitted.tolist()]
         report.compare("PDM drivable tokens", where, ours, file[name].tolist())
 
 

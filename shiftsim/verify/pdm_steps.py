@@ -9,7 +9,7 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import DataError
 from shiftsim.geometry import boxes_to_corners
 from shiftsim.layers import make_polygons
-from shiftsim.planners.pdm_areas import areas_of
+from shiftsim.planners.pdm_areas import areas_of, near_areas, on_multiple_lanes
 from shiftsim.planners.pdm_forecast import (
     LIGHT_TOKEN,
     Occupants,
@@ -19,7 +19,7 @@ from shiftsim.planners.pdm_forecast import (
 )
 from shiftsim.planners.pdm_parameters import DEFAULT, SCORED, STEP_US, STEPS
 from shiftsim.planners.pdm_path import make_path, offset_poses
-from shiftsim.planners.pdm_scorer import Road
+from shiftsim.planners.pdm_scorer import Road, place_ego
 from shiftsim.planners.pdm_step import Step, plan_step
 from shiftsim.state import PACIFICA, AgentKind, Tracks, center_poses
 from shiftsim.verify.array_file import ArrayFile
@@ -44,6 +44,7 @@ class Planned(NamedTuple):
     occupants: Occupants
     collided: list[str]
     step: Step
+    road: Road
 
 
 def verify_step(path: Path, report: Report) -> dict[str, Any]:
@@ -113,7 +114,7 @@ def _plan(inputs: dict[str, Any]) -> Planned:
     road = Road(areas, np.arange(len(ids)), crossings, paths[0])
     targets = limit * np.array(DEFAULT.speed_fractions)
     step = plan_step(ego, targets, paths, occupants, road, PACIFICA, DEFAULT)
-    return Planned(tokens, occupants, [tokens[i] for i in hit], step)
+    return Planned(tokens, occupants, [tokens[i] for i in hit], step, road)
 
 
 def _open(ring: FloatArray) -> FloatArray:
@@ -146,7 +147,7 @@ def _compare(
     report.compare("PDM collided", where, planned.collided, file["collided_ids"].tolist())
     boxes = occupants.boxes[[index // 2 for index in SHOWN_FORECASTS]]
     report.compare("PDM map boxes", where, boxes, file["map_boxes"], atol=TOLERANCE)
-    compare_arrays(report, where, step, {name: file[name] for name in STEP_ARRAYS})
+    compare_arrays(report, where, step, planned.road, {name: file[name] for name in STEP_ARRAYS})
     multi, weighted = file.take("multi", 3, -1), file.take("weighted", 3, -1)
     theirs = Recorded(
         total=file["scores"],
@@ -171,7 +172,9 @@ def _compare(
 STEP_ARRAYS = ("proposal_poses", "idm", "lead", "simulated", "ego_areas")
 
 
-def compare_arrays(report: Report, where: str, step: Step, theirs: dict[str, np.ndarray]) -> None:
+def compare_arrays(
+    report: Report, where: str, step: Step, road: Road, theirs: dict[str, np.ndarray]
+) -> None:
     """Compare proposals, leads, driven states and areas of one step with arrays by name."""
     made, scored = step.proposals, slice(0, SCORED + 1)
     count = len(step.driven)
@@ -181,10 +184,24 @@ def compare_arrays(report: Report, where: str, step: Step, theirs: dict[str, np.
         "idm": made.motion[:, :, scored].reshape(count, SCORED + 1, 2),
         "lead": made.leads[:, :, scored].reshape(count, SCORED + 1, 3),
         "simulated": step.driven,
-        "ego_areas": step.scores.areas,
+        "ego_areas": _ego_areas(step, road),
     }
     for name, array in theirs.items():
         report.compare(f"PDM {name}", where, ours[name], array, atol=TOLERANCE)
+
+
+def _ego_areas(step: Step, road: Road) -> np.ndarray:
+    """(P, T, 3) on multiple lanes, off the road, on no lane of the route."""
+    shape = step.driven.shape[:2]
+    corners, centers = np.empty((*shape, 4, 2)), np.empty((*shape, 2))
+    size = (PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center)
+    place_ego(step.driven, size, corners, centers)
+    lanes = near_areas(road.areas, road.admitted, corners)
+    boxes = corners.reshape(-1, 4, 2)
+    multiple = [on_multiple_lanes(road.areas, lanes, box) for box in boxes]
+    return np.stack(
+        [np.reshape(multiple, shape), step.scores.off_road, step.scores.oncoming], axis=-1
+    )
 
 
 def verify_summary(path: Path, report: Report, steps: dict[str, dict[str, Any]]) -> None:

@@ -101,7 +101,7 @@ def change_array(path, name):
 
 ARRAYS = [
     ("idm", "next_progress_velocity"),
-    ("idm", "lead_progress_velocity_rear"),
+    ("idm", "prev_progress_velocity"),
     ("tracker_sim", "velocity_profile"),
     ("tracker_sim", "curvature_profile"),
     ("tracker_sim", "simulated_states"),
