@@ -1,76 +1,82 @@
-"""DSC3D recordings and an OpenDRIVE map to scenarios (deepplan-conversion.md).
+"""A DSC3D download and its OpenDRIVE map to scenarios of a store (deepplan-conversion.md).
 
-One pass per recording: windows and verdicts on the source frames, everything at 20 Hz once, then an
-ego trace per accepted track and a scenario per accepted (window, track). Nothing is dropped without
-being counted in the report.
+Every recording is read twice: for the place of the map, which the whole site decides, and to be
+converted. Each is converted by itself into a folder below `.partial` that appears in one step and
+moves into the store at the end. So recordings may be spread over processes, a conversion that was
+killed goes on with those that it lacks, and the bytes are the same each time.
 """
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import pyproj
 
+from shiftsim import __version__
 from shiftsim.arrays import FloatArray
-from shiftsim.data.deepplan_route import find_route, nearest_lane, place_on_map
-from shiftsim.data.deepplan_states import ego_trace, resample, run_token, sample_runs
-from shiftsim.data.deepplan_windows import (
-    EGO,
-    LANE,
-    ROUTE,
-    ConversionConfig,
-    Runs,
-    WindowVerdicts,
-    find_runs,
-    judge_windows,
-    rows_of,
-)
+from shiftsim.data import schema
+from shiftsim.data.deepplan_recording import RecordingSummary, convert_recording
+from shiftsim.data.deepplan_route import place_on_map
+from shiftsim.data.deepplan_windows import ConversionConfig
 from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site, read_recording
 from shiftsim.data.opendrive import read_opendrive
 from shiftsim.data.opendrive_map import build_road_map
 from shiftsim.data.opendrive_records import OpenDrive
-from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import StoreWriter
-from shiftsim.errors import ConversionError
+from shiftsim.data.store import PARTIAL, StoreWriter, read_report, window_row
+from shiftsim.data.store_files import digest, file_name
+from shiftsim.data.store_map import read_map_file, write_map
+from shiftsim.data.store_tracks import write_ego, write_recording
+from shiftsim.errors import ConversionError, DataError
 from shiftsim.map import VectorMap
-from shiftsim.state import AgentKind, rear_poses
+from shiftsim.state import AgentKind
 
-SCENARIO_TYPE = "deepplan"
 _MAX_FRAME_SHIFT = 0.5  # m between the map's own georeference and that of the annotations
 _MOVING = 1.0  # m/s
-_MAP_MARGIN = 200.0  # m around the map in which objects are expected
+_MAX_POINTS = 20_000  # of a recording that tell where the map lies
+_MAP, _PART, _FILES = "map.parquet", "part.json", "files"
 
 Progress = Callable[[int, int, str], None]
 
 
-@dataclass(frozen=True)
-class RecordingSummary:
-    """What became of one recording.
+class Finished(Protocol):
+    """What became of one task: `result` of the function, or how its process died."""
 
-    Attributes:
-        name: Name of the recording.
-        duration_s: Its length [s].
-        tracks: Tracks in it.
-        windows: Windows that fit.
-        seen: (window, track) pairs looked at.
-        candidates: Pairs that pass category, presence, speed and overlap.
-        accepted: Scenarios.
-        rejected: Count of the other pairs by the rule they failed.
-        warnings: Count by kind of what was mended.
-    """
+    task: Any
+    result: Any
+    death: str
 
-    name: str
-    duration_s: float
-    tracks: int
-    windows: int
-    seen: int
-    candidates: int
-    accepted: int
-    rejected: dict[str, int]
-    warnings: dict[str, int]
+
+class Spread(Protocol):
+    """Applies a function to tasks in any order, as `shiftsim.executors.map_unordered` does."""
+
+    def __call__(
+        self, make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any], /
+    ) -> Generator[Finished, None, None]:
+        """Yield one outcome per task; `make` is called once per process and gives the function."""
+
+
+@dataclass
+class _Done:
+    task: Any
+    result: Any
+    death: str = ""
+
+
+def _one_by_one(
+    make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any]
+) -> Generator[Finished, None, None]:
+    function = make()
+    yield from (_Done(task, function(task)) for task in tasks)
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,9 @@ class ConversionReport:
         site: Name of the site, which is the name of its map.
         lanes: Lanes and lane connectors of the map.
         drivable_share: Share of moving vehicles on drivable area.
-        recordings: Summary of every recording.
+        recordings: Summary of every recording that was converted.
+        skipped: Why, by name of a recording that cannot be converted.
+        kept: How many recordings were converted before, by an interrupted or an earlier call.
         map_warnings: Count by kind of what was mended in the map.
     """
 
@@ -89,6 +97,8 @@ class ConversionReport:
     lanes: int
     drivable_share: float
     recordings: tuple[RecordingSummary, ...]
+    skipped: dict[str, str] = field(default_factory=dict)
+    kept: int = 0
     map_warnings: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -98,13 +108,14 @@ class ConversionReport:
 
 
 @dataclass(frozen=True)
-class Converted:
-    """One recording, ready for the store."""
+class _Broken:
+    """A recording that cannot be converted."""
 
-    recording: Recording
-    egos: tuple[EgoTrace, ...]
-    windows: tuple[Window, ...]
-    summary: RecordingSummary
+    reason: str
+    hint: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.reason} ({self.hint})" if self.hint else self.reason
 
 
 def convert_dsc3d(
@@ -115,8 +126,12 @@ def convert_dsc3d(
     map_path: Path | None = None,
     options: ConversionConfig | None = None,
     progress: Progress | None = None,
+    spread: Spread = _one_by_one,
 ) -> ConversionReport:
     """Convert a DSC3D download to scenarios in a store.
+
+    A recording that is broken is skipped and named; what was converted before from the same files
+    with the same options is kept.
 
     Args:
         src: Folder with `data_meta.json`, `annotations/` and `map/`.
@@ -124,17 +139,65 @@ def convert_dsc3d(
         site: Name of the site in the store; the name of the folder by default.
         map_path: OpenDRIVE file, where it is not in the download.
         options: Thresholds.
-        progress: Called with recordings done, recordings in all and the name of the next one.
+        progress: Called with recordings done, recordings in all and the name of the last one.
+        spread: How recordings are spread over processes; one by one in this process by default.
 
     Raises:
-        ConversionError: The download cannot be converted; nothing is left out silently.
+        ConversionError: Nothing of the download can be converted.
     """
     config = options or ConversionConfig()
     source = open_site(src)
-    city = site or src.resolve().name
+    road, warnings = _build_map(source, site or src.resolve().name, map_path, config)
+    names = source.recordings
+    show = progress or (lambda done, total, name: None)
+    show(0, len(names), "")
+    read = _collect(spread, partial(_moving_vehicles, source, config), names, lambda name: None)
+    skipped = {name: str(found) for name, found in read.items() if isinstance(found, _Broken)}
+    if len(skipped) == len(names):
+        _refuse_all(source, read)
+    share = check_placement(road, source, [p for p in read.values() if not _is_broken(p)], config)
+    with _alone_in(store), StoreWriter(store) as writer:
+        work = store / PARTIAL / file_name(road.name)
+        work.mkdir(parents=True, exist_ok=True)
+        write_map(work / _MAP, road)
+        job = _Job(source, work, config, digest(work / _MAP))
+        good = [name for name in names if name not in skipped]
+        kept = job.kept(read_report(store, road.name), good)
+        staged = [name for name in good if job.is_staged(name) and name not in kept]
+        done = len(skipped) + len(kept) + len(staged)
+        show(done, len(names), "")
+        counted = iter(range(done + 1, len(names) + 1))
+        made = _collect(
+            spread,
+            partial(_Converter, job),
+            [name for name in good if name not in kept and name not in staged],
+            lambda name: show(next(counted), len(names), name),
+        )
+        skipped |= {name: str(end) for name, end in made.items() if end is not None}
+        writer.add_map(road)
+        for name in good:
+            if name not in kept and name not in skipped:
+                kept[name] = job.merge(name, writer)
+        content = _report_content(source, job, road, share, warnings, kept, skipped)
+        writer.add_report(road.name, content)
+    shutil.rmtree(store / PARTIAL, ignore_errors=True)
+    return ConversionReport(
+        road.name,
+        len(road.edges),
+        share,
+        tuple(RecordingSummary(**kept[name]["summary"]) for name in names if name in kept),
+        skipped,
+        len(good) - len(made),
+        warnings,
+    )
+
+
+def _build_map(
+    source: Site, city: str, map_path: Path | None, config: ConversionConfig
+) -> tuple[VectorMap, dict[str, int]]:
     drive = read_opendrive(find_map(source, map_path))
     _check_georeference(drive, source)
-    road, map_report = build_road_map(
+    road, report = build_road_map(
         drive,
         name=city,
         offset=_map_offset(drive, source),
@@ -143,112 +206,81 @@ def convert_dsc3d(
     )
     if road.num_lanes == 0:
         raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
-    annotations = []
-    for number, name in enumerate(source.recordings):
-        if progress:
-            progress(number, len(source.recordings), name)
-        annotations.append(read_recording(source, name, config.category_map))
-    share = check_placement(road, source, annotations, config)
-    summaries = []
-    with StoreWriter(store) as writer:
-        writer.add_map(road)
-        for recording in annotations:
-            result = convert_recording(recording, road, source.offset[:2], config)
-            writer.add_recording(result.recording)
-            for ego in result.egos:
-                writer.add_ego(ego)
-            for window in result.windows:
-                writer.add_window(window)
-            summaries.append(result.summary)
-    if progress:
-        progress(len(source.recordings), len(source.recordings), "")
-    return ConversionReport(
-        city, len(road.edges), share, tuple(summaries), dict(map_report.warnings)
+    return road, dict(report.warnings)
+
+
+def _collect(
+    spread: Spread,
+    make: Callable[[], Callable[[str], Any]],
+    names: Sequence[str],
+    seen: Callable[[str], None],
+) -> dict[str, Any]:
+    """Result by name, in the order of the names, `_Broken` where the process died."""
+    found = {}
+    with closing(spread(make, names)) as outcomes:
+        for outcome in outcomes:
+            found[outcome.task] = _Broken(outcome.death) if outcome.death else outcome.result
+            seen(outcome.task)
+    return {name: found[name] for name in names}
+
+
+def _is_broken(result: object) -> bool:
+    return isinstance(result, _Broken)
+
+
+def _refuse_all(source: Site, read: dict[str, _Broken]) -> None:
+    name, first = next(iter(read.items()))
+    if len(read) == 1:
+        raise ConversionError(first.reason, first.hint)
+    raise ConversionError(
+        f"{source.folder}: none of the {len(read)} recordings can be converted; the first is"
+        f" {name}: {first.reason}",
+        first.hint,
     )
 
 
-def convert_recording(
-    source: Annotations, road: VectorMap, offset: FloatArray, config: ConversionConfig
-) -> Converted:
-    """All scenarios of one recording.
+def _moving_vehicles(source: Site, config: ConversionConfig) -> Callable[[str], Any]:
+    return partial(_moving_in, source, config)
 
-    Args:
-        source: The recording.
-        road: Map of the site, in UTM.
-        offset: (2,) UTM of the local origin [m].
-        config: Thresholds.
-    """
-    log_name = f"{road.name}_{source.name}"
-    runs = find_runs(source, config.max_hole_s)
-    recording = resample(
-        source,
-        runs,
-        log_name=log_name,
-        city=road.name,
-        offset=offset,
-        padding_s=config.padding_s,
-    )
-    windows = judge_windows(source, runs, config)
-    verdicts: Counter[str] = Counter()
-    accepted: dict[int, list[tuple[int, WindowVerdicts]]] = {}
-    for number, window in enumerate(windows):
-        num_egos = 0
-        for run, verdict in zip(window.runs.tolist(), window.verdicts, strict=True):
-            if verdict == EGO and num_egos != config.max_per_window:
-                accepted.setdefault(run, []).append((number, window))
-                num_egos += 1
-            else:
-                verdicts[verdict if verdict != EGO else "beyond max_per_window"] += 1
-    egos, scenarios = [], []
-    candidates = sum(map(len, accepted.values()))
-    for run in sorted(accepted):
-        trace = _trace(source, runs, run, accepted[run], log_name, offset, config)
-        kept = 0
-        for number, window in accepted[run]:
-            made = _scenario(source, runs, run, number, window, trace, road, offset, config)
-            if isinstance(made, Window):
-                scenarios.append(made)
-                kept += 1
-            else:
-                verdicts[made] += 1
-        if kept:
-            egos.append(trace)
-    outside = _outside_map(source, road, offset)
-    warnings = {**source.warnings, **({"rows far outside the map": outside} if outside else {})}
-    summary = RecordingSummary(
-        name=source.name,
-        duration_s=source.duration,
-        tracks=len(source.track_ids),
-        windows=len(windows),
-        seen=sum(len(window.tracks) for window in windows),
-        candidates=candidates,
-        accepted=len(scenarios),
-        rejected=dict(sorted(verdicts.items())),
-        warnings=warnings,
-    )
-    order = sorted(scenarios, key=lambda w: (w.first_row, len(w.ego), w.ego))
-    return Converted(recording, tuple(egos), tuple(order), summary)
+
+def _moving_in(source: Site, config: ConversionConfig, name: str) -> FloatArray | _Broken:
+    recording = _try_read(source, name, config)
+    return recording if isinstance(recording, _Broken) else moving_vehicles(recording)
+
+
+def _try_read(source: Site, name: str, config: ConversionConfig) -> Annotations | _Broken:
+    try:
+        return read_recording(source, name, config.category_map)
+    except DataError as error:
+        return _Broken(str(error).replace(f"{source.folder}{os.sep}", ""), error.hint)
+    except MemoryError:
+        return _Broken("it does not fit into memory", "split the recording")
+
+
+def moving_vehicles(recording: Annotations) -> FloatArray:
+    """(n, 2) local places of moving vehicles, enough of them to tell where the map lies [m]."""
+    is_vehicle = (recording.kinds == AgentKind.VEHICLE)[recording.track]
+    moves = np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]) > _MOVING
+    points = recording.centers[is_vehicle & moves, :2]
+    return points[:: max(1, len(points) // _MAX_POINTS)]
 
 
 def check_placement(
-    road: VectorMap, site: Site, recordings: list[Annotations], config: ConversionConfig
+    road: VectorMap, site: Site, places: list[FloatArray], config: ConversionConfig
 ) -> float:
     """Share of moving vehicles on drivable area.
+
+    Args:
+        road: The map, in UTM.
+        site: The site.
+        places: `moving_vehicles` of every recording.
+        config: Thresholds.
 
     Raises:
         ConversionError: It is too small: map and tracks do not lie on each other.
     """
-    points = np.concatenate(
-        [
-            recording.centers[
-                (recording.kinds == AgentKind.VEHICLE)[recording.track]
-                & (np.hypot(*recording.velocities.T) > _MOVING),
-                :2,
-            ]
-            for recording in recordings
-        ]
-    )
-    found = place_on_map(road, points + site.offset[:2], config.min_drivable_share)
+    points = np.concatenate(places) + site.offset[:2]
+    found = place_on_map(road, points, config.min_drivable_share)
     if found.share < config.min_drivable_share:
         x, y = found.shift
         raise ConversionError(
@@ -258,6 +290,127 @@ def check_placement(
             f" ({x:+.1f}, {y:+.1f}) m: check that map and reference_utm.offset belong together",
         )
     return found.share
+
+
+@contextmanager
+def _alone_in(store: Path) -> Iterator[None]:
+    """Keeps other conversions out of a store; the system ends that with this process."""
+    store.mkdir(parents=True, exist_ok=True)
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    handle = os.open(store, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise DataError(
+            f"{store}: another conversion writes to this store", "wait until it has finished"
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What the conversion of each recording of a site depends on, and where it is put."""
+
+    source: Site
+    work: Path
+    config: ConversionConfig
+    map_digest: str
+
+    def key(self, name: str) -> str:
+        """Equal where the result is equal."""
+        folder = self.source.folder / "annotations" / name
+        depends = {
+            "version": [__version__, schema.VERSION],
+            "site": [self.work.name, *self.source.offset.tolist()],
+            "rate": [self.source.frame_rate, self.source.frame_distance],
+            "config": asdict(self.config),
+            "map": self.map_digest,
+            "files": [digest(folder / f"{part}.parquet") for part in ("annotations", "frames")],
+        }
+        return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+
+    def folder(self, name: str) -> Path:
+        """Where the result is until the end."""
+        return self.work / file_name(name)
+
+    def is_staged(self, name: str) -> bool:
+        """Whether an interrupted conversion left the result."""
+        try:
+            part = json.loads((self.folder(name) / _PART).read_text("utf-8"))
+            return bool(part["key"] == self.key(name)) and (self.folder(name) / _FILES).is_dir()
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+    def kept(self, report: dict[str, Any], names: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """What the store holds already, by name."""
+        before = report.get("recordings", {})
+        return {n: before[n] for n in names if n in before and before[n]["key"] == self.key(n)}
+
+    def merge(self, name: str, writer: StoreWriter) -> dict[str, Any]:
+        """Move a result into the store."""
+        part = json.loads((self.folder(name) / _PART).read_text("utf-8"))
+        writer.take_recording(self.folder(name) / _FILES, part["log_name"], part["windows"])
+        return {"key": part["key"], "summary": part["summary"]}
+
+
+class _Converter:
+    """Converts recordings of one site, each into a folder of its own."""
+
+    def __init__(self, job: _Job) -> None:
+        self.job = job
+        self.road = read_map_file(job.work / _MAP)
+
+    def __call__(self, name: str) -> _Broken | None:
+        """Convert one recording; the folder appears when it is complete."""
+        job = self.job
+        recording = _try_read(job.source, name, job.config)
+        if isinstance(recording, _Broken):
+            return recording
+        result = convert_recording(recording, self.road, job.source.offset[:2], job.config)
+        # A process that outlives a killed conversion writes beside its successor, never into it.
+        draft = Path(tempfile.mkdtemp(prefix=".", dir=job.work))
+        write_recording(draft / _FILES, result.recording)
+        for ego in result.egos:
+            write_ego(draft / _FILES, ego)
+        content = {
+            "key": job.key(name),
+            "log_name": result.recording.log_name,
+            "summary": asdict(result.summary),
+            "windows": [window_row(window, self.road.name) for window in result.windows],
+        }
+        (draft / _PART).write_text(json.dumps(content), "utf-8")
+        shutil.rmtree(job.folder(name), ignore_errors=True)
+        os.replace(draft, job.folder(name))
+        return None
+
+
+def _report_content(
+    source: Site,
+    job: _Job,
+    road: VectorMap,
+    share: float,
+    warnings: dict[str, int],
+    kept: dict[str, dict[str, Any]],
+    skipped: dict[str, str],
+) -> dict[str, Any]:
+    """What the store keeps about the conversion of a site."""
+    return {
+        "city": road.name,
+        "config": asdict(job.config),
+        "lanes": len(road.edges),
+        "drivable_share": share,
+        "map_warnings": warnings,
+        "recordings": {name: kept[name] for name in source.recordings if name in kept},
+        "skipped": skipped,
+    }
 
 
 def _map_offset(drive: OpenDrive, site: Site) -> tuple[float, float]:
@@ -286,92 +439,3 @@ def _check_georeference(drive: OpenDrive, site: Site) -> None:
             f" reference_utm.offset at ({site.offset[0]:.2f}, {site.offset[1]:.2f})",
             "correct the one that is wrong; they must agree to 0.5 m",
         )
-
-
-def _trace(
-    source: Annotations,
-    runs: Runs,
-    run: int,
-    accepted: list[tuple[int, WindowVerdicts]],
-    log_name: str,
-    offset: FloatArray,
-    config: ConversionConfig,
-) -> EgoTrace:
-    starts = [rows_of(window.start_s) for _, window in accepted]
-    padding = rows_of(config.padding_s)
-    return ego_trace(
-        source,
-        runs,
-        run,
-        log_name=log_name,
-        offset=offset,
-        first_row=min(starts),
-        last_row=max(starts) + padding + rows_of(config.window_s),
-        padding=padding,
-    )
-
-
-def _scenario(
-    source: Annotations,
-    runs: Runs,
-    run: int,
-    number: int,
-    window: WindowVerdicts,
-    trace: EgoTrace,
-    road: VectorMap,
-    offset: FloatArray,
-    config: ConversionConfig,
-) -> Window | str:
-    """One scenario, or the rule it fails."""
-    padding = rows_of(config.padding_s)
-    first = rows_of(window.start_s)  # with the padding, one padding earlier than the window
-    start = first + padding + rows_of(config.history_s)
-    end = first + padding + rows_of(config.window_s)
-    states = trace.states[start - trace.first_row : end - trace.first_row]
-    track = int(runs.track[run])
-    at_start = sample_runs(
-        source, runs, np.array([run]), np.array([window.start_s + config.history_s])
-    ).poses[0]
-    at_start[:2] += offset
-    if nearest_lane(road, at_start, config) is None:
-        return LANE
-    route = find_route(road, states[:, :3], config)
-    if route is None:
-        return ROUTE
-    goal = states[-1, :3].copy()
-    last = int(np.searchsorted(source.track, track, side="right")) - 1
-    if source.time[last] > window.start_s + config.window_s:
-        center = np.array([*source.centers[last, :2] + offset, source.headings[last]])
-        goal = rear_poses(center)
-    key = f"{road.name}|{source.name}|{window.start_s}|{source.track_ids[track]}|{config.window_s}"
-    return Window(
-        token=hashlib.blake2b(key.encode(), digest_size=8).hexdigest(),
-        scenario_type=SCENARIO_TYPE,
-        log_name=trace.log_name,
-        ego=run_token(source, runs, run),
-        first_row=first,
-        last_row=end,
-        iteration_rows=np.arange(start, end, 2),
-        row_step=2,
-        route=route.ids,
-        mission_goal=goal,
-        mapping=(config.window_s - config.history_s, 0.0, 0.5),
-        is_short=config.is_short,
-        metadata={
-            "recording": source.name,
-            "window": number,
-            "window_start_s": window.start_s,
-            "track_id": int(source.track_ids[track]),
-            "category": source.categories[track],
-            "size_m": source.sizes[track].tolist(),
-            "driven_blocks": route.num_driven,
-            "padded_history_s": max(0.0, config.padding_s - window.start_s),
-        },
-    )
-
-
-def _outside_map(source: Annotations, road: VectorMap, offset: FloatArray) -> int:
-    bounds = road.edges.polygons.bounds
-    low, high = bounds[:, :2].min(axis=0) - _MAP_MARGIN, bounds[:, 2:].max(axis=0) + _MAP_MARGIN
-    xy = source.centers[:, :2] + offset
-    return int(((xy < low) | (xy > high)).any(axis=1).sum())

@@ -10,8 +10,8 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.data.deepplan_windows import ConversionConfig
-from shiftsim.geometry import wrap_angle
-from shiftsim.layers import Polygons, containing, distance_to, in_any
+from shiftsim.geometry import project_on_polyline, wrap_angle
+from shiftsim.layers import Polygons, Polylines, containing, distance_to, in_any
 from shiftsim.map import VectorMap
 
 _MAX_AT_POINT = 16  # blocks looked at per point
@@ -69,6 +69,11 @@ def follow_blocks(road: VectorMap, points: FloatArray) -> list[int]:
     """Blocks along points (R, 2), by nuPlan's rule; neighbours may be unlinked."""
     at = np.full((len(points), _MAX_AT_POINT), -1, np.int64)
     _containing_points(road.blocks.polygons, np.ascontiguousarray(points), at)
+    # Only the first two of equal rows matter: the second may settle what the first left open.
+    same = (at[1:] == at[:-1]).all(axis=1)
+    changes = np.ones(len(at), np.bool_)
+    changes[2:] = ~(same[1:] & same[:-1])
+    at = at[changes]
     route: list[int] = []
     open_ends: list[int] = []  # connectors, one of which the ego is on; later points tell
     for row in at:
@@ -106,23 +111,14 @@ def nearest_lane(
     road: VectorMap, pose: FloatArray, config: ConversionConfig
 ) -> tuple[int, float] | None:
     """The edge an ego can start on, and its distance [m]; None where none is near and along it."""
-    x, y, heading = pose
-    reach = config.max_lane_distance
-    bounds = road.edges.polygons.bounds
-    near = np.flatnonzero(
-        (bounds[:, 0] <= x + reach)
-        & (bounds[:, 2] >= x - reach)
-        & (bounds[:, 1] <= y + reach)
-        & (bounds[:, 3] >= y - reach)
+    edge, distance = _start_edge(
+        road.edges.polygons,
+        road.baselines,
+        pose,
+        config.max_lane_distance,
+        config.max_lane_angle,
     )
-    best: tuple[int, float] | None = None
-    for edge in near.tolist():
-        distance = distance_to(road.edges.polygons, edge, x, y)
-        if distance > reach or (best is not None and distance >= best[1]):
-            continue
-        if abs(wrap_angle(heading - _direction_at(road, edge, x, y))) < config.max_lane_angle:
-            best = edge, distance
-    return best
+    return None if edge < 0 else (edge, distance)
 
 
 def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placement:
@@ -218,16 +214,6 @@ def _turn(road: VectorMap, edge: int) -> float:
     return float(wrap_angle(heading[-1] - heading[0]))
 
 
-def _direction_at(road: VectorMap, edge: int, x: float, y: float) -> float:
-    """Heading of a baseline where it is nearest to a point [rad]."""
-    line = road.baselines.at(edge)
-    arc = road.baselines.arc[road.baselines.ptr[edge] : road.baselines.ptr[edge + 1]]
-    following = int(np.searchsorted(arc, road.progress_on(edge, x, y), side="right"))
-    segment = min(max(following - 1, 0), len(line) - 2)
-    dx, dy = line[segment + 1] - line[segment]
-    return float(np.arctan2(dy, dx))
-
-
 def _on_drivable(road: VectorMap, points: FloatArray) -> FloatArray:
     """(n,) 1 where a point is on a lane, a connector or another drivable polygon, else 0."""
     out = np.zeros(len(points))
@@ -261,6 +247,31 @@ def _best_shift(road: VectorMap, points: FloatArray) -> tuple[FloatArray, float]
     shifts = low + steps * cell - own_low
     best = shifts[np.argmin(np.abs(shifts).sum(axis=1))]
     return best, float(match.max() / len(points))
+
+
+@kernel
+def _start_edge(
+    polygons: Polygons, baselines: Polylines, pose: FloatArray, reach: float, max_angle: float
+) -> tuple[int, float]:
+    """The nearest edge that leads along a pose, and its distance [m]; (-1, inf) without one."""
+    found, best = -1, np.inf
+    x, y = pose[0], pose[1]
+    for edge in range(len(polygons.bounds)):
+        low_x, low_y, high_x, high_y = polygons.bounds[edge]
+        if x + reach < low_x or x - reach > high_x or y + reach < low_y or y - reach > high_y:
+            continue
+        distance = distance_to(polygons, edge, x, y)
+        if distance > reach or distance >= best:
+            continue
+        first, last = baselines.ptr[edge], baselines.ptr[edge + 1]
+        along = project_on_polyline(baselines.xy, baselines.arc, first, last, x, y)
+        segment = int(np.searchsorted(baselines.arc[first:last], along, side="right")) - 1
+        at = first + min(max(segment, 0), last - first - 2)
+        dx = baselines.xy[at + 1, 0] - baselines.xy[at, 0]
+        dy = baselines.xy[at + 1, 1] - baselines.xy[at, 1]
+        if abs(wrap_angle(pose[2] - np.arctan2(dy, dx))) < max_angle:
+            found, best = edge, distance
+    return found, best
 
 
 @kernel

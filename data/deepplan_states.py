@@ -48,9 +48,8 @@ def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatAr
         time: (G,) since the first frame [s].
     """
     num_frames = len(recording.clock)
-    key = runs.of_row * num_frames + recording.frame
     frame = np.searchsorted(recording.clock, time + _EPS, side="right") - 1
-    row = np.searchsorted(key, run * num_frames + frame, side="right") - 1
+    row = np.searchsorted(runs.row_key, run * num_frames + frame, side="right") - 1
     row = np.clip(row, runs.first[run], np.maximum(runs.last[run] - 1, runs.first[run]))
     following = np.minimum(row + 1, runs.last[run])
     row_time = recording.time
@@ -75,10 +74,12 @@ def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatAr
 
 def run_rows(recording: Annotations, runs: Runs) -> tuple[IntArray, IntArray]:
     """(U,) first and last 20 Hz row of every run; a run between two rows has first > last."""
-    time = recording.time
-    first = np.ceil(time[runs.first] / ROW_S - _EPS).astype(np.int64)
-    last = np.floor(time[runs.last] / ROW_S + _EPS).astype(np.int64)
-    return first, last
+    return _rows_between(recording.time[runs.first], recording.time[runs.last])
+
+
+def _rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
+    first = np.ceil(first_s / ROW_S - _EPS).astype(np.int64)
+    return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
 
 
 def run_token(recording: Annotations, runs: Runs, run: int) -> str:
@@ -166,9 +167,10 @@ def ego_trace(
         last_row: One past the last row that is wanted.
         padding: Rows made up before the first frame; row numbers count from there.
     """
-    begin, end = run_rows(recording, runs)
-    low = min(int(begin[run]) + padding, first_row)
-    high = max(int(end[run]) + 1 + padding, last_row)
+    ends = recording.time[[runs.first[run], runs.last[run]]]
+    begin, end = _rows_between(ends[:1], ends[1:])
+    low = min(int(begin[0]) + padding, first_row)
+    high = max(int(end[0]) + 1 + padding, last_row)
     rows = np.arange(low, high)
     samples = sample_runs(
         recording,

@@ -88,14 +88,14 @@ class Runs:
         last: (U,) last row.
         track: (U,) track.
         number: (U,) how many runs of the same track came before.
-        of_row: (A,) run of a row.
+        row_key: (A,) run of a row times the number of frames, plus its frame: increasing.
     """
 
     first: IntArray
     last: IntArray
     track: IntArray
     number: IntArray
-    of_row: IntArray
+    row_key: IntArray
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ def find_runs(recording: Annotations, max_hole_s: float) -> Runs:
     last = np.r_[first[1:] - 1, len(time) - 1]
     track = recording.track[first]
     first_run = np.searchsorted(track, track)
-    return Runs(first, last, track, np.arange(len(first)) - first_run, np.cumsum(starts) - 1)
+    row_key = (np.cumsum(starts) - 1) * len(recording.clock) + recording.frame
+    return Runs(first, last, track, np.arange(len(first)) - first_run, row_key)
 
 
 def window_starts(duration: float, config: ConversionConfig) -> FloatArray:

@@ -7,6 +7,7 @@ Position and heading are taken as truth, heading through the rotation matrix (ds
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ class Annotations:
     sizes: FloatArray
     warnings: dict[str, int]
 
-    @property
+    @cached_property
     def time(self) -> FloatArray:
         """(A,) time of the rows since the first frame [s]."""
         return self.clock[self.frame]

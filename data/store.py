@@ -5,6 +5,8 @@ The layout and every column are described in `shiftsim.data.schema`.
 
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -32,6 +34,7 @@ from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
+PARTIAL = ".partial"  # folder of a conversion under way
 _OPEN_FILES = 64  # recordings and egos whose files stay open
 
 
@@ -161,6 +164,11 @@ def read_manifest(store: Path) -> dict[str, Any]:
     """
     path = store / MANIFEST
     if not path.is_file():
+        if (store / PARTIAL).is_dir():
+            raise DataError(
+                f"{store}: the conversion of this store was interrupted",
+                hint="start the same shiftsim convert again, it goes on",
+            )
         raise DataError(
             f"{store}: not a scenario store: {MANIFEST} is missing",
             hint="give the folder that `shiftsim convert` wrote",
@@ -201,6 +209,47 @@ def _window(row: dict[str, Any]) -> Window:
     )
 
 
+def read_report(store: Path, city: str) -> dict[str, Any]:
+    """What a store says about the conversion of a city; empty where it says nothing."""
+    path = _report_file(store, city)
+    try:
+        manifest = read_manifest(store)
+        if manifest["files"].get(path.relative_to(store).as_posix()) != digest(path):
+            return {}
+        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (DataError, OSError, ValueError):
+        return {}
+    return content
+
+
+def _report_file(store: Path, city: str) -> Path:
+    return store / "reports" / f"{file_name(city)}.json"
+
+
+def window_row(window: Window, city: str) -> dict[str, Any]:
+    """A window as a row of `schema.SCENARIOS`, JSON values only."""
+    goal = window.mission_goal
+    return {
+        "token": window.token,
+        "type": window.scenario_type,
+        "city": city,
+        "log": window.log_name.partition("@")[0],
+        "recording": window.log_name,
+        "ego": window.ego,
+        "first_row": window.first_row,
+        "last_row": window.last_row,
+        "row_step": window.row_step,
+        "iteration_rows": window.iteration_rows.tolist(),
+        "route": list(window.route),
+        "goal_pose": [] if goal is None else goal.tolist(),
+        "duration_s": window.mapping[0],
+        "offset_s": window.mapping[1],
+        "subsample_ratio": window.mapping[2],
+        "is_short": window.is_short,
+        "metadata": json.dumps(window.metadata, sort_keys=True),
+    }
+
+
 class StoreWriter:
     """Writes a store, or adds to one. Use it in a `with` block; it is complete at the end.
 
@@ -217,7 +266,7 @@ class StoreWriter:
             table = Table(self.path / SCENARIOS, schema.SCENARIOS).read()
             self._rows = {row["token"]: row for row in table.to_pylist()}
             self._cities = {row["recording"]: row["city"] for row in self._rows.values()}
-        elif self.path.is_dir() and any(self.path.iterdir()):
+        elif self.path.is_dir() and any(self.path.iterdir()) and not self._is_unfinished():
             raise DataError(
                 f"{self.path}: the folder is not empty and not a store",
                 hint="give a new folder, or a store to add to",
@@ -278,26 +327,35 @@ class StoreWriter:
                     f"scenario {window.token!r}: the store lacks {self._name(path)}",
                     hint="add the recording and the ego before the window",
                 )
-        goal = window.mission_goal
-        self._rows[window.token] = {
-            "token": window.token,
-            "type": window.scenario_type,
-            "city": self._cities[window.log_name],
-            "log": window.log_name.partition("@")[0],
-            "recording": window.log_name,
-            "ego": window.ego,
-            "first_row": window.first_row,
-            "last_row": window.last_row,
-            "row_step": window.row_step,
-            "iteration_rows": window.iteration_rows.tolist(),
-            "route": list(window.route),
-            "goal_pose": [] if goal is None else goal.tolist(),
-            "duration_s": window.mapping[0],
-            "offset_s": window.mapping[1],
-            "subsample_ratio": window.mapping[2],
-            "is_short": window.is_short,
-            "metadata": json.dumps(window.metadata, sort_keys=True),
-        }
+        self._rows[window.token] = window_row(window, self._cities[window.log_name])
+
+    def take_recording(self, folder: Path, log_name: str, rows: list[dict[str, Any]]) -> None:
+        """Move a recording that was written elsewhere into the store, with all its scenarios.
+
+        What the store has of that recording is replaced.
+
+        Args:
+            folder: Written by `write_recording` and `write_ego`.
+            log_name: Name of the recording.
+            rows: `window_row` of its scenarios.
+        """
+        target = recording_folder(self.path, log_name)
+        below = f"{self._name(target)}/"
+        self._files = {n: d for n, d in self._files.items() if not n.startswith(below)}
+        self._rows = {t: row for t, row in self._rows.items() if row["recording"] != log_name}
+        shutil.rmtree(target, ignore_errors=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(folder, target)
+        for path in sorted(target.iterdir()):
+            self._note(path)
+        self._rows |= {row["token"]: row for row in rows}
+
+    def add_report(self, city: str, content: dict[str, Any]) -> None:
+        """Write what is to be known about the conversion of a city."""
+        path = _report_file(self.path, city)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, content)
+        self._note(path)
 
     def close(self) -> None:
         """Write the list of scenarios and the manifest."""
@@ -316,6 +374,9 @@ class StoreWriter:
                 "files": files,
             },
         )
+
+    def _is_unfinished(self) -> bool:
+        return (self.path / PARTIAL).is_dir()
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.path).as_posix()

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pyproj
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.deepplan import convert_recording
+from shiftsim.data.deepplan_recording import convert_recording
 from shiftsim.data.deepplan_states import sample_runs
 from shiftsim.data.deepplan_windows import EGO, ConversionConfig, find_runs, judge_windows
 from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site, read_recording

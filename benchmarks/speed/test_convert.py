@@ -1,0 +1,107 @@
+"""Conversion of a crowded recording: pytest benchmarks/speed/test_convert.py.
+
+Ten minutes at 12.5 Hz with 200 vehicles that are there all the time and move in stop-and-go: every
+one of them is an ego in every window, more scenarios than any real recording of that length has.
+"""
+
+import json
+import resource
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from shiftsim.data.deepplan import convert_dsc3d
+
+DURATION, PERIOD = 600.0, 0.08
+ROADS, LENGTH, SPACING = 20, 500.0, 20.0
+PER_LANE, GAP = 5, 25.0
+START_US = 1_900_000_000_000_000
+
+
+def _road(number: int) -> str:
+    lane = (
+        '<lane id="{}" type="driving" level="false"><link/>'
+        '<width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>'
+    )
+    return (
+        f'<road id="{number}" length="{LENGTH}" junction="-1"><link/><planView>'
+        f'<geometry s="0" x="0" y="{SPACING * number}" hdg="0" length="{LENGTH}"><line/></geometry>'
+        f'</planView><lanes><laneSection s="0"><left>{lane.format(1)}</left>'
+        f'<center><lane id="0" type="none"/></center><right>{lane.format(-1)}</right>'
+        "</laneSection></lanes></road>"
+    )
+
+
+def write_crowd(folder: Path) -> Path:
+    """A DSC3D folder with one recording of 200 tracks over ten minutes."""
+    (folder / "map").mkdir(parents=True)
+    (folder / "annotations/crowd").mkdir(parents=True)
+    roads = "".join(map(_road, range(ROADS)))
+    (folder / "map/map.xodr").write_text(
+        f'<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="7"/>{roads}</OpenDRIVE>'
+    )
+    meta = {
+        "interface_version": "1.0",
+        "reference_utm": {"zone": [32, "N"], "offset": [500000.0, 5300000.0, 0.0]},
+        "frame_rate": 25.0,
+        "frame_distance": 2,
+        "locations": [{"id": 1, "recordings": ["crowd"]}],
+    }
+    (folder / "data_meta.json").write_text(json.dumps(meta))
+    count = round(DURATION / PERIOD) + 1
+    ids = pa.array(2 * np.arange(count), pa.uint32())
+    stamps = START_US + np.rint(np.arange(count) * PERIOD * 1e6).astype(np.int64)
+    times = pa.array(stamps, pa.timestamp("us", "UTC"))
+    frames = folder / "annotations/crowd/frames.parquet"
+    pq.write_table(pa.table({"frame_id": ids, "time": times}), frames)
+    pq.write_table(_boxes(count), folder / "annotations/crowd/annotations.parquet")
+    return folder
+
+
+def _boxes(count: int) -> pa.Table:
+    track = np.arange(2 * ROADS * PER_LANE)
+    frame, track = (part.ravel() for part in np.meshgrid(np.arange(count), track, indexing="ij"))
+    road, side, place = track // 10, np.where(track % 2, 1.0, -1.0), track // 2 % PER_LANE
+    time = frame * PERIOD
+    speed = 0.6 + 0.6 * np.sin(0.4 * time + track)
+    driven = 0.6 * time + 1.5 * (np.cos(track) - np.cos(0.4 * time + track))
+    along = 5.0 + GAP * place + driven
+    along = np.where(side > 0, LENGTH - along, along)
+    zero = np.zeros(len(track))
+    columns = {
+        "frame_id": pa.array(2 * frame, pa.uint32()),
+        "track_id": pa.array(track, pa.uint32()),
+        "category": pa.array(np.full(len(track), "car")).dictionary_encode(),
+    }
+    groups = {
+        "translation": (along, SPACING * road + 1.75 * side, zero),
+        "rotation": (zero, zero, np.where(side > 0, np.pi - 1e-9, 0.0)),
+        "dimension": (zero + 4.5, zero + 1.9, zero + 1.5),
+        "velocity": (-speed * side, zero, zero),
+    }
+    for name, values in groups.items():
+        for axis, column in zip("xyz", values, strict=True):
+            columns[f"{name}_{axis}"] = pa.array(column)
+    return pa.table(columns)
+
+
+@pytest.fixture(scope="module")
+def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_crowd(tmp_path_factory.mktemp("crowd") / "site")
+
+
+def test_conversion_is_50_times_faster_than_real_time(crowd, tmp_path):
+    convert_dsc3d(crowd, tmp_path / "warm")  # kernels
+    began = perf_counter()
+    report = convert_dsc3d(crowd, tmp_path / "store")
+    seconds = perf_counter() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    factor = DURATION / seconds
+    print(f"\n{report.accepted} scenarios in {seconds:.1f} s: {factor:.0f} x real time", end="")
+    print(f", peak {peak:.2f} GB", end="")
+    assert factor >= 50.0
+    assert peak <= 2.0
