@@ -136,7 +136,8 @@ def first_contacts(
     """
     ego, track, scratch = np.empty(_BOX), np.empty(_BOX), np.empty((2, 4, 2))
     num_samples, num_tracks = valid.shape
-    first[:] = num_samples
+    for j in range(num_tracks):
+        first[j] = num_samples
     for i in range(num_samples):
         _set_box(ego, centers[i], size[0], size[1])
         for j in range(num_tracks):
@@ -251,7 +252,8 @@ def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
 @kernel
 def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
     distance = speed * TTC_HORIZON
-    out[:] = box
+    for index in range(_BOX):  # a slice assignment takes numba seconds to compile
+        out[index] = box[index]
     out[0] += 0.5 * distance * box[2]
     out[1] += 0.5 * distance * box[3]
     _set_size(out, 2.0 * box[6] + distance, 2.0 * box[7])

@@ -114,13 +114,17 @@ def _clean_up(num_lanes: int, incoming: Lists, lists: IntArray, counts: IntArray
         if counts[i] < 2:
             continue
         after, size = lists[i + 1], counts[i + 1]
-        original, count = lists[i].copy(), counts[i]
+        count = counts[i]
+        original = np.empty(count, np.int64)
+        for index in range(count):
+            original[index] = lists[i, index]
         subset = count > size
         for index in range(size):
             subset = subset and has(original, count, after[index])
         if subset:
             # nuPlan: also when the next list is empty, nuplan-metrics.md §13 Q4
-            lists[i, :size] = after[:size]
+            for index in range(size):
+                lists[i, index] = after[index]
             counts[i] = size
         if size > 0 and after[0] < num_lanes:
             leading = incoming.items[incoming.ptr[after[0]] : incoming.ptr[after[0] + 1]]
@@ -234,10 +238,11 @@ def _common(
     lists: IntArray, size: IntArray, incoming: Lists, outgoing: Lists, out: IntArray
 ) -> int:
     fl, rl, rr, fr = lists[0], lists[1], lists[2], lists[3]
-    if size.max() == 0:
-        return 0
-    if size.min() == 0:
-        return -1
+    empty = 0
+    for corner in range(4):
+        empty += size[corner] == 0
+    if empty > 0:
+        return 0 if empty == 4 else -1
     found = 0
     for index in range(size[0]):
         edge = fl[index]
@@ -289,7 +294,8 @@ def lane_states(
             num, is_open = num + 1, False
         elif not is_open and i > 0 and state < 0 and states[i - 1] > 0:
             initial_size = states[i - 1]
-            initial[:initial_size] = previous[:initial_size]
+            for index in range(initial_size):
+                initial[index] = previous[index]
             changes[num, 0], is_open = i, True
         current, previous = previous, current
     if is_open:

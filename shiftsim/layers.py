@@ -146,7 +146,8 @@ def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntAr
         for ix in range(first[poly, 0], last[poly, 0] + 1):
             for iy in range(first[poly, 1], last[poly, 1] + 1):
                 ptr[ix * shape[1] + iy + 1] += 1
-    ptr = np.cumsum(ptr)
+    for cell in range(cells):
+        ptr[cell + 1] += ptr[cell]
     items = np.empty(ptr[-1], np.int64)
     fill = ptr[:-1].copy()
     for poly in range(len(first)):
