@@ -84,9 +84,8 @@ class PdmClosed:
         accel_max: float = 1.5,
         decel_max: float = 3.0,
         map_radius: float = 50.0,
-        parameters: PdmParameters | None = None,
     ) -> None:
-        """Set the planner's parameters.
+        """Set the most used parameters; `parameters` holds all of them and may be replaced.
 
         Args:
             speed_fractions: Target speeds as shares of the lane's limit, slowest first; as text
@@ -98,9 +97,8 @@ class PdmClosed:
             accel_max: Largest acceleration [m/s^2].
             decel_max: Largest deceleration, positive [m/s^2].
             map_radius: How far objects and the map are seen [m].
-            parameters: All numbers at once; the other arguments must then be left out.
         """
-        self.parameters = parameters or PdmParameters(
+        self.parameters = PdmParameters(
             speed_fractions=_floats("speed_fractions", speed_fractions),
             lateral_offsets=_floats("lateral_offsets", lateral_offsets),
             fallback_velocity=fallback_velocity,
@@ -136,7 +134,7 @@ class PdmClosed:
         scene = self._scene
         if scene is None:
             raise PlannerError("pdm-closed: plan() was called before reset()")
-        ego, center = observation.history.ego[-1], observation.ego.center
+        ego, center = observation.history.ego[-1].copy(), observation.ego.center
         vehicle, params = scene.vehicle, self.parameters
         if self.route is None:
             self.route = start_route(scene.map, scene.route, ego, scene.token)

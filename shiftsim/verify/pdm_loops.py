@@ -245,7 +245,8 @@ def _compare_scores(
         ends = run.proposals[column][rows]
         report.compare(f"PDM {column}", where, step.driven[:, -1, position], ends, atol=TOLERANCE)
     ego = seen.history.ego[-1]
-    return compare_scores(report, where, ego, step, planner.seen.occupants, theirs, choice)
+    sight = (planner.seen.occupants, planner.seen.road)
+    return compare_scores(report, where, ego, step, sight, theirs, choice)
 
 
 def _compare_arrays(

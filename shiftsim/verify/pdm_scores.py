@@ -1,7 +1,8 @@
 """Scores and choices of one recorded step of PDM-Closed, and which differences are exempt.
 
 Exempt are sub-scores that hang on the bearing of an object exactly ahead or behind (it is an
-arccos of a number that may round beyond 1), and choices between equal scores. Each is named.
+arccos of a number that may round beyond 1, and the object is overlooked), as far as overlooking
+such objects explains them, and choices between equal scores. Each is named.
 """
 
 from dataclasses import dataclass
@@ -9,11 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.planners.pdm_forecast import Occupants
+from shiftsim.geometry import boxes_to_corners
+from shiftsim.planners.pdm_comfort import make_filters
+from shiftsim.planners.pdm_forecast import Occupants, touches_boxes
 from shiftsim.planners.pdm_parameters import DEFAULT, DT
-from shiftsim.planners.pdm_scorer import TTC_STEPS, normalise, weigh
+from shiftsim.planners.pdm_scorer import TTC_STEPS, Road, normalise, weigh
+from shiftsim.planners.pdm_scorer import score as rate
 from shiftsim.planners.pdm_step import Step
-from shiftsim.state import HEADING, VX, VY, X, Y
+from shiftsim.state import HEADING, PACIFICA, VX, VY, X, Y, center_poses
 from shiftsim.verify.report import Report
 
 SCORE_TOLERANCE = 1e-9
@@ -43,7 +47,7 @@ def compare_scores(
     where: str,
     ego: FloatArray,
     step: Step,
-    occupants: Occupants,
+    seen: tuple[Occupants, Road],
     theirs: Recorded,
     choice: tuple[int, bool],
 ) -> bool:
@@ -54,7 +58,7 @@ def compare_scores(
         where: Which step.
         ego: (11,) ego state.
         step: Ours.
-        occupants: What it was planned from.
+        seen: What it was planned from.
         theirs: The recorded scores.
         choice: Number of the recorded best proposal, and whether the emergency brake came instead.
 
@@ -62,8 +66,8 @@ def compare_scores(
         Whether both chose the same plan, so that plans can be compared.
     """
     ours = step.scores
-    collision = _exempt(report, where, step, occupants, theirs, "collision")
-    ttc = _exempt(report, where, step, occupants, theirs, "ttc")
+    collision = _exempt(report, where, step, seen, theirs, "collision")
+    ttc = _exempt(report, where, step, seen, theirs, "ttc")
     no_collision = np.where(collision, theirs.no_collision, ours.no_collision)
     collision_index = np.where(collision, theirs.collision_index, ours.collision_index)
     ttc_score = np.where(ttc, theirs.ttc, ours.ttc)
@@ -100,42 +104,54 @@ def _exempt(
     report: Report,
     where: str,
     step: Step,
-    occupants: Occupants,
+    seen: tuple[Occupants, Road],
     theirs: Recorded,
     kind: str,
 ) -> np.ndarray:
     """(P,) proposals whose sub-score differs because of an unstable bearing; each is noted."""
-    ours = step.scores
-    pairs = {
-        "collision": (ours.no_collision, theirs.no_collision),
-        "ttc": (ours.ttc, theirs.ttc),
-    }
-    indices = {
-        "collision": (ours.collision_index, theirs.collision_index),
-        "ttc": (ours.ttc_index, theirs.ttc_index),
-    }
-    ahead = TTC_STEPS if kind == "ttc" else (0,)
+    ours, (occupants, road) = step.scores, seen
+    if kind == "ttc":
+        score, index = (ours.ttc, theirs.ttc), (ours.ttc_index, theirs.ttc_index)
+    else:
+        score = ours.no_collision, theirs.no_collision
+        index = ours.collision_index, theirs.collision_index
     out = np.zeros(len(ours.total), np.bool_)
-    for row in range(len(out)):
-        score, index = [pair[row] for pair in pairs[kind]], [pair[row] for pair in indices[kind]]
-        first = min(index)
-        if (score[0] == score[1] and index[0] == index[1]) or not np.isfinite(first):
+    for row in np.flatnonzero((score[0] != score[1]) | (index[0] != index[1])).tolist():
+        first = _unstable(step.driven[row], occupants, TTC_STEPS if kind == "ttc" else (0,))
+        if not first:
             continue
-        bearing = _least_bearing(step.driven[row, int(first)], occupants, int(first), ahead)
-        if bearing < UNSTABLE_BEARING:
+        ignored = occupants.ignored.copy()
+        ignored[list(first)] = True
+        blind = occupants._replace(ignored=ignored)
+        rest = rate(step.driven, road, blind, PACIFICA, DEFAULT, make_filters())
+        without = (rest.ttc_index if kind == "ttc" else rest.collision_index)[row]
+        is_hit = np.isfinite(index[1][row])
+        if index[1][row] in {without, *first.values()} and is_hit == (score[1][row] < 1.0):
             out[row] = True
-            which = f"PDM {kind} at {where}, proposal {row}"
-            report.note(f"{which}: an object at a bearing of {bearing:.0e} rad")
+            report.note(f"PDM {kind} at {where}, proposal {row}: an object exactly ahead or behind")
     return out
 
 
-def _least_bearing(
-    state: FloatArray, occupants: Occupants, step: int, ahead: tuple[int, ...]
-) -> float:
-    """Smallest angle between the ego's axis and an object, ahead or behind [rad]."""
-    centers = np.concatenate([occupants.centers[(step + later) // 2] for later in ahead])
-    if not len(centers):
-        return np.inf
-    dx, dy = centers[:, 0] - state[X], centers[:, 1] - state[Y]
-    cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
-    return float(np.arctan2(np.abs(cos * dy - sin * dx), np.abs(cos * dx + sin * dy)).min())
+def _unstable(driven: FloatArray, occupants: Occupants, ahead: tuple[int, ...]) -> dict[int, float]:
+    """Boxes exactly ahead or behind when the ego, or its projection, first touches them.
+
+    Returns:
+        Time index of the touch by box.
+    """
+    touched = occupants.ignored[: len(occupants.kinds)].copy()
+    size = np.array([PACIFICA.length, PACIFICA.width])
+    corners = boxes_to_corners(center_poses(driven[:, :3]), size)
+    out: dict[int, float] = {}
+    for index, row in enumerate(driven):
+        cos, sin = np.cos(row[HEADING]), np.sin(row[HEADING])
+        travel = DT * np.hypot(row[VX], row[VY]) * np.array([cos, sin])
+        for later in ahead:
+            forecast = (index + later) // 2
+            box = corners[index] + later * travel
+            for hit in np.flatnonzero(touches_boxes(box, occupants.boxes[forecast]) & ~touched):
+                touched[hit] = True
+                dx, dy = occupants.centers[forecast, hit] - row[[X, Y]]
+                turn = np.arctan2(abs(cos * dy - sin * dx), abs(cos * dx + sin * dy))
+                if turn < UNSTABLE_BEARING:
+                    out[int(hit)] = float(index)
+    return out

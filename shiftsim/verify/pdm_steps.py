@@ -162,7 +162,7 @@ def _compare(
         ttc_index=file["ttc_idx"],
     )
     choice = (int(file["best"]), bool(file["braked"]))
-    if compare_scores(report, where, ego, step, occupants, theirs, choice):
+    if compare_scores(report, where, ego, step, (occupants, planned.road), theirs, choice):
         plan = file["trajectory_rear"]
         report.compare("PDM plan", where, step.poses, plan, atol=TOLERANCE)
     times = time_us + STEP_US * np.arange(STEPS + 1)

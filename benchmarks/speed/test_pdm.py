@@ -1,0 +1,42 @@
+"""PDM-Closed: one planning step, from Python, warm.
+
+Run with `pytest benchmarks/speed/test_pdm.py -s`. Targets on one core: 6 ms with 100 agents.
+"""
+
+import numpy as np
+import pytest
+
+from shiftsim.planners import load_planner
+from shiftsim.planners.contract import frozen_inputs
+from shiftsim.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """A generated city with 100 agents around the ego."""
+    from shiftsim.data.synthetic import bench_scene
+
+    return bench_scene(100, 0)
+
+
+@pytest.fixture
+def ready(scenario):
+    """A planner that has planned once, and an observation."""
+    scene, observations = frozen_inputs(scenario)
+    planner = load_planner("pdm-closed")
+    planner.reset(scene)
+    planner.plan(observations[0])
+    return planner, observations[0]
+
+
+def test_step(measure, ready):
+    planner, observation = ready
+    measure(planner.plan, observation, calls=3)
+
+
+def test_scenario(benchmark, scenario):
+    """A whole non-reactive scenario."""
+    planner = load_planner("pdm-closed")
+    benchmark.pedantic(simulate, args=(scenario, planner), rounds=3, warmup_rounds=1)
+    seconds = float(np.median(benchmark.stats.stats.data))
+    print(f"\nscenario: {seconds:.2f} s", end="")
