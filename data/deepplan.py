@@ -12,8 +12,8 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -49,11 +49,19 @@ Progress = Callable[[int, int, str], None]
 
 
 class Finished(Protocol):
-    """What became of one task: `result` of the function, or how its process died."""
+    """What became of one task."""
 
-    task: Any
-    result: Any
-    death: str
+    @property
+    def task(self) -> Any:
+        """The task."""
+
+    @property
+    def result(self) -> Any:
+        """What the function returned."""
+
+    @property
+    def death(self) -> str:
+        """Empty where it did return."""
 
 
 class Spread(Protocol):
@@ -61,7 +69,7 @@ class Spread(Protocol):
 
     def __call__(
         self, make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any], /
-    ) -> Generator[Finished, None, None]:
+    ) -> Iterator[Finished]:
         """Yield one outcome per task; `make` is called once per process and gives the function."""
 
 
@@ -74,7 +82,7 @@ class _Done:
 
 def _one_by_one(
     make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any]
-) -> Generator[Finished, None, None]:
+) -> Iterator[Finished]:
     function = make()
     yield from (_Done(task, function(task)) for task in tasks)
 
@@ -156,7 +164,8 @@ def convert_dsc3d(
     if len(skipped) == len(names):
         _refuse_all(source, read)
     share = check_placement(road, source, [p for p in read.values() if not _is_broken(p)], config)
-    with _alone_in(store), StoreWriter(store) as writer:
+    with _alone_in(store):
+        writer = StoreWriter(store)
         work = store / PARTIAL / file_name(road.name)
         work.mkdir(parents=True, exist_ok=True)
         write_map(work / _MAP, road)
@@ -180,7 +189,10 @@ def convert_dsc3d(
                 kept[name] = job.merge(name, writer)
         content = _report_content(source, job, road, share, warnings, kept, skipped)
         writer.add_report(road.name, content)
-    shutil.rmtree(store / PARTIAL, ignore_errors=True)
+        writer.close()
+        shutil.rmtree(work, ignore_errors=True)
+        with suppress(OSError):  # another site was interrupted
+            work.parent.rmdir()
     return ConversionReport(
         road.name,
         len(road.edges),
@@ -217,10 +229,9 @@ def _collect(
 ) -> dict[str, Any]:
     """Result by name, in the order of the names, `_Broken` where the process died."""
     found = {}
-    with closing(spread(make, names)) as outcomes:
-        for outcome in outcomes:
-            found[outcome.task] = _Broken(outcome.death) if outcome.death else outcome.result
-            seen(outcome.task)
+    for outcome in spread(make, names):
+        found[outcome.task] = _Broken(outcome.death) if outcome.death else outcome.result
+        seen(outcome.task)
     return {name: found[name] for name in names}
 
 

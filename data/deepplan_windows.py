@@ -4,11 +4,14 @@ A window is a span of time, whatever the frame rate. Each track seen in it gets 
 the first rule it fails: category, presence, speed, overlap (later stages add lane and route).
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.config import one_of
 from shiftsim.data.dsc3d import Annotations
 from shiftsim.errors import ConfigError
 from shiftsim.geometry import box_corners
@@ -61,6 +64,8 @@ class ConversionConfig:
     category_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for item in fields(self):
+            _check_type(item.name, getattr(self, item.name))
         for name in ("window_s", "overlap_s", "history_s", "padding_s"):
             value = getattr(self, name)
             if not np.isfinite(value) or value < 0 or abs(rows_of(value) * ROW_S - value) > _EPS:
@@ -77,6 +82,43 @@ class ConversionConfig:
     def is_short(self) -> bool:
         """Whether scenarios are shorter than the benchmark's, so that scores do not compare."""
         return self.window_s < 18.0 or self.history_s < 3.0
+
+
+def make_config(values: Mapping[str, Any]) -> ConversionConfig:
+    """Thresholds from plain values, such as those of a TOML file.
+
+    Raises:
+        ConfigError: A name is unknown, or a value is wrong.
+    """
+    for name in values:
+        one_of("setting", name, [item.name for item in fields(ConversionConfig)])
+    plain: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+    return ConversionConfig(**plain)
+
+
+def _check_type(name: str, value: Any) -> None:
+    """Types are checked strictly: TOML and Python callers get the same message."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if name == "ego_categories":
+        good, wanted = isinstance(value, tuple) and all(map(_is_text, value)), "a list of names"
+    elif name == "category_map":
+        good = isinstance(value, dict) and all(map(_is_text, [*value, *value.values()]))
+        wanted = "a table of names"
+    elif name == "country":
+        good, wanted = _is_text(value), "a name"
+    elif name == "route_extension_blocks":
+        good, wanted = whole and value >= 0, "an integer from 0 on"
+    elif name == "max_per_window":
+        good, wanted = value is None or (whole and value > 0), "an integer from 1 on"
+    else:
+        number = whole or isinstance(value, float)
+        good, wanted = number and 0 <= value < np.inf, "a number from 0 on"
+    if not good:
+        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,22 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.dsc3d_files import (
+    DIMENSION,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    numbers,
+    read_table,
+)
 from shiftsim.data.dsc3d_motion import (
     believed_velocities,
     count,
     held_headings,
     rotation_angles,
+    track_medians,
 )
 from shiftsim.errors import ConversionError
 from shiftsim.state import AgentKind
@@ -44,10 +52,17 @@ CATEGORIES = {
     ),
 }  # deepplan-conversion.md §7
 
-_POSITION = ("translation_x", "translation_y", "translation_z")
-_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
-_DIMENSION = ("dimension_x", "dimension_y", "dimension_z")
-_VELOCITY = ("velocity_x", "velocity_y")
+_NEEDED = ("frame_id", "track_id", "category", *POSITION, *ROTATION, *DIMENSION, *VELOCITY)
+
+# Far beyond any recording, and still within 2 GB: what exceeds them is damaged or hostile.
+_MAX_META = 10_000_000  # bytes of data_meta.json
+_MAX_ROWS = 8_000_000  # boxes of a recording: 100 minutes of 100 tracks
+_MAX_FRAMES = 1_000_000
+_MAX_DURATION = 12 * 3600.0  # s
+_MAX_TRACKS = 100_000
+_MAX_AT_ONCE = 5_000  # boxes in a frame
+_MAX_NAMES = 1_000  # distinct categories
+_MAX_OFFSET = 2e7  # m, of UTM coordinates
 
 
 @dataclass(frozen=True)
@@ -157,8 +172,10 @@ def open_site(src: Path) -> Site:
         )
     path = found[0] / "data_meta.json"
     try:
+        if path.stat().st_size > _MAX_META:
+            raise ConversionError(f"{path} is larger than {_MAX_META} bytes")
         meta = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise ConversionError(f"{path}: not readable as JSON ({error})") from error
     version = str(_key(meta, "interface_version", path))
     if version.split(".")[0] != "1":
@@ -182,7 +199,7 @@ def open_site(src: Path) -> Site:
                 for name in _key(location, "recordings", path)
             ),
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConversionError(f"{path}: a value has the wrong type ({error})") from error
     _check_site(site, path)
     return site
@@ -229,29 +246,34 @@ def read_recording(
     warnings: dict[str, int] = {}
     frame_ids, start_us = _read_frames(folder / "frames.parquet", site, warnings)
     path = folder / "annotations.parquet"
-    table = _read_table(path)
-    columns = {key: _column(table, key, path) for key in (*_POSITION, *_ROTATION, *_DIMENSION)}
-    ids = _column(table, "track_id", path).astype(np.int64)
-    row_frames = _column(table, "frame_id", path).astype(np.int64)
+    table = read_table(path, _NEEDED, _MAX_ROWS)
+    columns = {key: numbers(table, key, path) for key in (*POSITION, *ROTATION, *DIMENSION)}
+    ids = numbers(table, "track_id", path).astype(np.int64)
+    row_frames = numbers(table, "frame_id", path).astype(np.int64)
     order = np.lexsort((row_frames, ids))
     track_ids, track = np.unique(ids[order], return_inverse=True)
+    if len(track_ids) > _MAX_TRACKS:
+        raise ConversionError(f"{path}: {len(track_ids)} tracks, more than {_MAX_TRACKS}")
     frame = _frame_index(frame_ids, row_frames[order], path)
+    most = int(np.bincount(frame).max())
+    if most > _MAX_AT_ONCE:
+        raise ConversionError(f"{path}: {most} boxes in one frame, more than {_MAX_AT_ONCE}")
     _refuse_duplicates(track_ids, frame_ids, track, frame, path)
 
     def matrix(keys: tuple[str, ...]) -> FloatArray:
         return np.stack([columns[key][order] for key in keys], axis=1)
 
-    sizes = _track_sizes(matrix(_DIMENSION), track, len(track_ids), path, warnings)
+    sizes = _track_sizes(matrix(DIMENSION), track, len(track_ids), path, warnings)
     names = _track_categories(table, order, track, len(track_ids), path, warnings)
     names, kinds = _agent_kinds(names, category_map or {}, path)
-    bottom, rotation = matrix(_POSITION), matrix(_ROTATION)
+    bottom, rotation = matrix(POSITION), matrix(ROTATION)
     angles, up = rotation_angles(rotation)
     centers = bottom + 0.5 * sizes[track, 2:3] * up
     clock = (frame_ids - frame_ids[0]) / site.frame_rate
     time = clock[frame]
     stored = None
-    if set(_VELOCITY) <= set(table.column_names):
-        stored = np.stack([_column(table, key, path)[order] for key in _VELOCITY], axis=1)
+    if set(VELOCITY) <= set(table.column_names):
+        stored = np.stack([numbers(table, key, path)[order] for key in VELOCITY], axis=1)
     velocities = believed_velocities(stored, centers[:, :2], time, track, warnings)
     return Annotations(
         name=name,
@@ -291,6 +313,10 @@ def _check_site(site: Site, path: Path) -> None:
         raise ConversionError(f"{path}: reference_utm.zone {site.zone!r} is not a UTM zone (1-60)")
     if not np.isfinite(site.offset).all():
         raise ConversionError(f"{path}: reference_utm.offset is not finite")
+    if (np.abs(site.offset) > _MAX_OFFSET).any():
+        raise ConversionError(
+            f"{path}: reference_utm.offset {site.offset.tolist()} is not a place in UTM"
+        )
     if not (np.isfinite(site.frame_rate) and site.frame_rate > 0 and site.frame_distance > 0):
         raise ConversionError(f"{path}: frame_rate and frame_distance must be positive")
     if not site.recordings:
@@ -300,39 +326,9 @@ def _check_site(site: Site, path: Path) -> None:
             raise ConversionError(f"{path}: recording name {name!r} is not a plain folder name")
 
 
-def _read_table(path: Path) -> pa.Table:
-    if not path.is_file():
-        raise ConversionError(f"{path} is missing", "copy the whole recording folder")
-    try:
-        return pq.ParquetFile(path).read()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise ConversionError(f"{path}: not a readable Parquet file ({error})") from error
-
-
-def _column(table: pa.Table, key: str, path: Path) -> FloatArray:
-    """One numeric column as float64, finite and without nulls."""
-    if key not in table.column_names:
-        raise ConversionError(f"{path}: column {key!r} is missing")
-    column = table[key]
-    if column.null_count:
-        raise ConversionError(f"{path}: column {key!r} holds {column.null_count} nulls")
-    try:
-        values = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=False)
-    except (pa.ArrowException, ValueError, TypeError) as error:
-        raise ConversionError(f"{path}: column {key!r} is {column.type}, need numbers") from error
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise ConversionError(
-            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]!r} is not a finite number"
-            f" ({len(bad)} such values)",
-            "mend or delete the rows; no position can be made up",
-        )
-    return values
-
-
 def _read_frames(path: Path, site: Site, warnings: dict[str, int]) -> tuple[IntArray, int]:
-    table = _read_table(path)
-    ids = _column(table, "frame_id", path).astype(np.int64)
+    table = read_table(path, ("frame_id", "time"), _MAX_FRAMES)
+    ids = numbers(table, "frame_id", path).astype(np.int64)
     if len(ids) < 2:
         raise ConversionError(f"{path}: {len(ids)} frames, need at least 2")
     if (np.diff(ids) <= 0).any():
@@ -347,6 +343,11 @@ def _read_frames(path: Path, site: Site, warnings: dict[str, int]) -> tuple[IntA
         raise ConversionError(f"{path}: column 'time' holds nulls")
     stamps = table["time"].cast(pa.timestamp("us", "UTC")).cast(pa.int64()).to_numpy()
     clock = (ids - ids[0]) / site.frame_rate
+    if clock[-1] > _MAX_DURATION:
+        raise ConversionError(
+            f"{path}: the frames span {clock[-1]:.0f} s, at most {_MAX_DURATION:.0f} s are read",
+            "check frame_id, and frame_rate in data_meta.json; or split the recording",
+        )
     wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * site.period
     count(warnings, "frames whose time disagrees with their id", int(wrong.sum()))
     missing = int((np.diff(ids) // site.frame_distance - 1).sum())
@@ -391,9 +392,10 @@ def _track_sizes(
     first = np.searchsorted(track, np.arange(num_tracks))
     varying = (np.abs(sizes - sizes[first][track]) > 1e-3).any(axis=1)
     out = sizes[first].copy()
-    for index in np.unique(track[varying]):
-        out[index] = np.median(sizes[track == index], axis=0)
-    count(warnings, "tracks of varying size (median taken)", len(np.unique(track[varying])))
+    changed = np.unique(track[varying])
+    for axis in range(sizes.shape[1]):
+        out[changed, axis] = track_medians(sizes[:, axis], track)[changed]
+    count(warnings, "tracks of varying size (median taken)", len(changed))
     return out
 
 
@@ -408,13 +410,18 @@ def _track_categories(
     if "category" not in table.column_names:
         raise ConversionError(f"{path}: column 'category' is missing")
     try:
-        encoded = table["category"].cast(pa.string()).combine_chunks().dictionary_encode()
+        encoded = table["category"].unify_dictionaries().combine_chunks()
+        if not pa.types.is_dictionary(encoded.type):
+            encoded = encoded.cast(pa.string()).dictionary_encode()
+        encoded = encoded.cast(pa.dictionary(pa.int32(), pa.string()))
     except (pa.ArrowException, ValueError) as error:
         raise ConversionError(f"{path}: column 'category' does not hold names") from error
     if encoded.null_count:
         raise ConversionError(f"{path}: column 'category' holds {encoded.null_count} nulls")
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.combine_chunks()
+    if len(encoded.dictionary) > _MAX_NAMES:
+        raise ConversionError(f"{path}: more than {_MAX_NAMES} categories")
     names = [normalise_category(str(name)) for name in encoded.dictionary.to_pylist()]
     codes = encoded.indices.to_numpy()[order].astype(np.int64)
     votes = np.zeros((num_tracks, len(names)), np.int64)

@@ -9,6 +9,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.geometry import wrap_angles
 
 _MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
+_MAX_SPEED = 200.0  # m/s along an axis
 _STANDSTILL = 0.3  # m/s
 _MAX_STANDING_TURN = 0.5  # rad/s
 _EPS = 1e-9  # s
@@ -56,15 +57,21 @@ def believed_velocities(
         count(warnings, "tracks without stored velocity (derived)", int(track[-1]) + 1)
         return derived
     error = np.linalg.norm(derived - stored, axis=1)
-    ranked = np.lexsort((error, track))
-    tracks = np.arange(track[-1] + 1)
-    first = np.searchsorted(track, tracks)
-    last = np.searchsorted(track, tracks, side="right") - 1
-    middle = ranked[(first + last) // 2], ranked[(first + last + 1) // 2]
-    refused = 0.5 * (error[middle[0]] + error[middle[1]]) >= _MAX_VELOCITY_ERROR
+    first = np.searchsorted(track, np.arange(track[-1] + 1))
+    last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
+    refused = track_medians(error, track) >= _MAX_VELOCITY_ERROR
     refused &= last > first  # a single row has nothing to compare with
+    refused[track[np.abs(stored).max(axis=1) > _MAX_SPEED]] = True
     count(warnings, "tracks whose stored velocity does not fit (derived)", int(refused.sum()))
     return np.where(refused[track][:, None], derived, stored)
+
+
+def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
+    """(N,) median of the rows of each track; values and track: (A,), sorted by track."""
+    ranked = values[np.lexsort((values, track))]
+    first = np.searchsorted(track, np.arange(track[-1] + 1))
+    last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
+    return 0.5 * (ranked[(first + last) // 2] + ranked[(first + last + 1) // 2])
 
 
 def _central_differences(xy: FloatArray, time: FloatArray, track: IntArray) -> FloatArray:

@@ -1,17 +1,21 @@
 """Commands that make scenario stores: convert nuplan, convert dsc3d."""
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli.running import Workers, worker_count
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan import ConversionReport
+    from shiftsim.data.deepplan_windows import ConversionConfig
 
 _CONVERT = typer.Typer(help="Make a scenario store from recordings.")
-_PARTIAL = 3
+_PARTIAL, _INTERRUPTED = 3, 130
 
 
 def register(app: typer.Typer) -> None:
@@ -97,83 +101,128 @@ def dsc3d(
     map_path: Annotated[
         Path | None, typer.Option("--map", help="OpenDRIVE file, if it is elsewhere.")
     ] = None,
-    window: Annotated[float | None, typer.Option(help="Length of a scenario [s].")] = None,
-    overlap: Annotated[float | None, typer.Option(help="Overlap of windows [s].")] = None,
-    history: Annotated[float | None, typer.Option(help="Part before iteration 0 [s].")] = None,
-    padding: Annotated[
-        float | None, typer.Option(help="History made up before the first frame [s].")
+    category: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=KNOWN", help="Read a category as a known one; repeatable."),
     ] = None,
-    max_per_window: Annotated[int | None, typer.Option(help="Egos per window.")] = None,
+    country: Annotated[
+        str | None, typer.Option(help="Whose speed limits hold where the map has none. [DE]")
+    ] = None,
+    window_s: Annotated[
+        float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
+    ] = None,
+    overlap_s: Annotated[float | None, typer.Option(help="Overlap of windows [s]. [6]")] = None,
+    history_s: Annotated[
+        float | None, typer.Option(help="Part of a window before iteration 0 [s]. [3]")
+    ] = None,
+    padding_s: Annotated[
+        float | None, typer.Option(help="History made up before the first frame [s]. [0]")
+    ] = None,
+    max_per_window: Annotated[int | None, typer.Option(help="Egos per window. [all]")] = None,
     config: Annotated[
         Path | None, typer.Option(help="All thresholds in TOML; flags win over it.")
     ] = None,
+    workers: Workers = None,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
-    """Convert recordings in the layout of DSC3D."""
-    from shiftsim.config import read_toml, store_path
+    """Convert recordings in the layout of DSC3D.
+
+    A broken recording is skipped and named; the others are converted, and the exit code is 3. A
+    conversion that was stopped goes on when it is started again.
+
+    Planners need 2 s of history. A recording too short for that is converted with a made-up one,
+    of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
+    """
+    from functools import partial
+
+    from shiftsim.config import default_workers, store_path
     from shiftsim.data.deepplan import convert_dsc3d
+    from shiftsim.executors import map_unordered
 
     flags = {
-        "window_s": window,
-        "overlap_s": overlap,
-        "history_s": history,
-        "padding_s": padding,
+        "country": country,
+        "window_s": window_s,
+        "overlap_s": overlap_s,
+        "history_s": history_s,
+        "padding_s": padding_s,
         "max_per_window": max_per_window,
+        "category_map": _category_map(category or []),
     }
-    values = read_toml(config) if config else {}
-    values |= {name: value for name, value in flags.items() if value is not None}
-    options = _options(values, str(config) if config else "convert dsc3d")
+    options = _options(config, {name: value for name, value in flags.items() if value is not None})
     folder = store_path(store)
+    count = worker_count(workers) or default_workers()
     with progress_bar(quiet=quiet or as_json) as advance:
-        report = convert_dsc3d(
-            source, folder, site=site, map_path=map_path, options=options, progress=advance
-        )
+        try:
+            report = convert_dsc3d(
+                source,
+                folder,
+                site=site,
+                map_path=map_path,
+                options=options,
+                progress=advance,
+                spread=partial(map_unordered, workers=count),
+            )
+        except KeyboardInterrupt:
+            again = shlex.join(["shiftsim", *sys.argv[1:]])
+            typer.echo("error: interrupted", err=True)
+            typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
+            raise typer.Exit(_INTERRUPTED) from None
     if as_json:
         from dataclasses import asdict
 
         say_json(asdict(report))
-        return
-    _show_dsc3d(report)
-    if options.is_short:
-        say(" note: scenarios are shorter than the benchmark's; their scores do not compare")
-    say(f" {plural(report.accepted, 'scenario')} → {folder}")
-    say(f" next: shiftsim run --planner idm --store {store}")
+    else:
+        _show_dsc3d(report)
+        if options.is_short:
+            say(" note: scenarios are shorter than the benchmark's; their scores do not compare")
+        say(f" {plural(report.accepted, 'scenario')} → {folder}")
+        say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
+    if report.skipped:
+        raise typer.Exit(_PARTIAL)
 
 
-def _options(values: dict[str, Any], where: str) -> Any:
-    from dataclasses import fields
-
-    from shiftsim.config import one_of
-    from shiftsim.data.deepplan_windows import ConversionConfig
+def _category_map(words: list[str]) -> dict[str, str] | None:
     from shiftsim.errors import ConfigError
 
-    known = [field.name for field in fields(ConversionConfig)]
-    for name in values:
-        one_of(f"{where}: setting", name, known)
-    if isinstance(values.get("ego_categories"), list):
-        values["ego_categories"] = tuple(values["ego_categories"])
+    for word in words:
+        name, equals, known = word.partition("=")
+        if not (name and equals and known):
+            raise ConfigError(f"category {word!r} is not NAME=KNOWN", "--category lorry=truck")
+    return dict(word.split("=", 1) for word in words) or None
+
+
+def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
+    from shiftsim.config import read_toml
+    from shiftsim.data.deepplan_windows import make_config
+    from shiftsim.errors import ConfigError
+
+    values = read_toml(path) if path else {}
     try:
-        return ConversionConfig(**values)
-    except TypeError as error:
-        raise ConfigError(f"{where}: a value has the wrong type ({error})") from error
+        return make_config(values | flags)
+    except ConfigError as error:
+        raise ConfigError(f"{path or 'convert dsc3d'}: {error}", error.hint) from error
 
 
 def _show_dsc3d(report: "ConversionReport") -> None:
     say(
-        f"site {report.site}: {report.lanes} lanes and connectors, ",
+        f"site {report.site}: {report.lanes} lanes and connectors, "
+        f"{100.0 * report.drivable_share:.1f} % of moving vehicles on drivable area"
     )
-    say(f" {100.0 * report.drivable_share:.1f} % of moving vehicles on drivable area")
     for name, count in report.map_warnings.items():
         say(f" map: {name} ({count})")
     for summary in report.recordings:
         say(
             f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "
-            f"{plural(summary.windows, 'window')}, {summary.candidates} candidates, "
+            f"{plural(summary.windows, 'window')}, {plural(summary.candidates, 'candidate')}, "
             f"{summary.accepted} accepted"
         )
         for rule, count in summary.rejected.items():
             say(f"   not accepted by rule {rule}: {count}")
         for name, count in summary.warnings.items():
             say(f"   mended: {name} ({count})")
+    for name, reason in report.skipped.items():
+        say(f" skipped: {name}: {reason}")
+    if report.kept:
+        say(f" {plural(report.kept, 'recording')} kept from before")

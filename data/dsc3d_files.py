@@ -1,0 +1,79 @@
+"""Columns of a DSC3D recording: read without trust, and refused with the place and the reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import ConversionError
+
+POSITION = ("translation_x", "translation_y", "translation_z")
+ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+DIMENSION = ("dimension_x", "dimension_y", "dimension_z")
+VELOCITY = ("velocity_x", "velocity_y")
+# Far beyond any recording: what exceeds it is damaged, in another unit or hostile.
+_LARGEST = {  # absolute values
+    **dict.fromkeys(POSITION, 1e5),  # m from the local origin
+    **dict.fromkeys(ROTATION, 100.0),  # rad
+    **dict.fromkeys(DIMENSION, 500.0),  # m
+    "frame_id": 2.0**53,
+    "track_id": 2.0**53,
+}
+
+
+def read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
+    """The columns wanted, as far as the file has them.
+
+    Raises:
+        ConversionError: The file is missing, not Parquet, or has more rows than `max_rows`.
+    """
+    if not path.is_file():
+        raise ConversionError(f"{path} is missing", "copy the whole recording folder")
+    try:
+        file = pq.ParquetFile(path)
+        if file.metadata.num_rows > max_rows:
+            raise ConversionError(
+                f"{path}: {file.metadata.num_rows} rows, at most {max_rows} can be read",
+                "split the recording",
+            )
+        names = [name for name in wanted if name in file.schema_arrow.names]
+        names_only = [name for name in ("category",) if name in names]
+        file = pq.ParquetFile(path, read_dictionary=names_only)  # long names are not repeated
+        return file.read(names, use_threads=False)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise ConversionError(f"{path}: not a readable Parquet file ({error})") from error
+
+
+def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
+    """One numeric column as float64, finite and without nulls.
+
+    Raises:
+        ConversionError: It is missing, or a value cannot be.
+    """
+    if key not in table.column_names:
+        raise ConversionError(f"{path}: column {key!r} is missing")
+    column = table[key]
+    if column.null_count:
+        raise ConversionError(f"{path}: column {key!r} holds {column.null_count} nulls")
+    try:
+        values = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=False)
+    except (pa.ArrowException, ValueError, TypeError) as error:
+        raise ConversionError(f"{path}: column {key!r} is {column.type}, need numbers") from error
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise ConversionError(
+            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]!r} is not a finite number"
+            f" ({len(bad)} such values)",
+            "mend or delete the rows; no position can be made up",
+        )
+    largest = _LARGEST.get(key, np.inf)
+    bad = np.flatnonzero(np.abs(values) > largest)
+    if len(bad):
+        raise ConversionError(
+            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]!r} is beyond ±{largest:g}"
+            f" ({len(bad)} such values)",
+            "check the unit of the column, and that the file is whole",
+        )
+    return values
