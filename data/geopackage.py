@@ -50,7 +50,7 @@ class GeoPackage:
         meta = database.columns("meta", ["key", "value"])
         system = dict(zip(meta["key"], meta["value"], strict=True)).get("projectedCoordSystem")
         self.epsg = self._epsg(system)
-        self._to_metres = _transformer(self.epsg)
+        self._project = to_metres(self.epsg)
 
     def _epsg(self, system: object) -> int:
         name, _, code = str(system).lower().partition(":")
@@ -74,7 +74,7 @@ class GeoPackage:
         try:
             shapes = shapely.force_2d(shapely.from_wkb(np.array(bodies, object)))
             xy = shapely.get_coordinates(shapes)
-            x, y = self._to_metres.transform(xy[:, 0], xy[:, 1])
+            x, y = self._project.transform(xy[:, 0], xy[:, 1])
         except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
             raise DataError(
                 f"{self.path}: layer {name!r}: broken geometry: {error}", hint=MEND
@@ -102,7 +102,8 @@ class GeoPackage:
 
 
 @lru_cache(maxsize=8)
-def _transformer(epsg: int) -> pyproj.Transformer:
+def to_metres(epsg: int) -> pyproj.Transformer:
+    """From longitude and latitude to the metric system of a code."""
     try:
         return pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
     except pyproj.exceptions.CRSError as error:

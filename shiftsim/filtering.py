@@ -1,7 +1,8 @@
 """The automatic filter: drive scenarios as recorded, drop those that cannot be driven so.
 
-Rules and thresholds are those of deepplan-conversion.md §10. The verdicts lie beside the scenarios, in `filter/verdicts.parquet` of the store; the scenarios
-themselves stay as they are. Runs over a whole store use the accepted ones.
+Rules and thresholds are those of deepplan-conversion.md §10. The verdicts lie beside the scenarios,
+in `filter/verdicts.parquet` of the store; the scenarios themselves stay as they are. Runs over a
+whole store use the accepted ones.
 """
 
 import hashlib

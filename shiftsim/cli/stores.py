@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.running import Workers, worker_count
+from shiftsim.cli.running import AllScenarios, Split, Workers, worker_count
 
 if TYPE_CHECKING:
+    from shiftsim.data.store import ScenarioStore
     from shiftsim.filtering import Verdicts
 
 _EXPORT = typer.Typer(help="Write scenarios in the formats of others.")
@@ -20,6 +21,9 @@ Store = Annotated[str, typer.Argument(metavar="STORE", help="Store, by name or f
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("filter")(filter_scenarios)
+    app.command("stats")(show_stats)
+    _EXPORT.command("nuplan")(export_to_nuplan)
+    app.add_typer(_EXPORT, name="export", no_args_is_help=True)
 
 
 def filter_scenarios(
@@ -82,3 +86,124 @@ def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
 
 
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
+
+
+def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str, ...]:
+    """The scenarios of a split, or all that the filter accepted."""
+    from shiftsim.errors import DataError
+    from shiftsim.filtering import read_verdicts
+    from shiftsim.splits import find_split
+
+    if split:
+        tokens = find_split(split, store.path, store.tokens).tokens
+        lacking = sorted(set(tokens) - set(store.tokens))
+        if lacking:
+            raise DataError(
+                f"split {split!r} needs {len(tokens)} scenarios, the store lacks {len(lacking)} of"
+                f" them, such as {lacking[0]!r}",
+                hint="name the store that was converted for this split",
+            )
+        return tokens
+    verdicts = None if every else read_verdicts(store.path, store.hash)
+    return store.tokens if verdicts is None else verdicts.accepted
+
+
+def export_to_nuplan(
+    store: Store,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
+    split: Split = None,
+    all_scenarios: AllScenarios = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Write scenarios as nuPlan logs (.db) and maps (map.gpkg), one log per scenario.
+
+    nuPlan's own code opens its four city maps whatever map is asked for: put them into the folder
+    of the maps too, and merge the two index files.
+    """
+    from shiftsim.data.nuplan_export import export_nuplan
+    from shiftsim.runner import open_named_store
+
+    opened = open_named_store(store)
+    tokens = _chosen(opened, split, all_scenarios)
+    with progress_bar(quiet=quiet or as_json) as advance:
+        report = export_nuplan(opened, out, tokens=tokens, progress=advance)
+    mappings: list[dict[str, Any]] = [
+        {"type": kind, "mapping": list(mapping), "scenarios": count}
+        for (kind, mapping), count in sorted(report.mappings.items())
+    ]
+    if as_json:
+        say_json(
+            {
+                "logs": report.logs,
+                "maps": report.maps,
+                "token_file": report.token_file,
+                "tokens": report.tokens,
+                "cities": report.cities,
+                "mappings": mappings,
+                "missing_maps": report.missing_maps,
+            }
+        )
+        return
+    say(f" {plural(len(report.tokens), 'log')} → {report.logs}")
+    say(f" {plural(len(report.cities), 'map')} → {report.maps}")
+    for row in mappings:
+        say(f" scenario mapping to use: {row['type']}: {row['mapping']}")
+    if report.renamed:
+        say(f" {len(report.renamed)} tokens had another form and were replaced: --json lists them")
+    if report.missing_maps:
+        say(f" nuPlan's own code also opens the maps {', '.join(report.missing_maps)}: add them")
+    words = {",".join(f"{value:g}" for value in row["mapping"]) for row in mappings}
+    mapping = f" --mapping {words.pop()}" if len(words) == 1 else ""
+    say(
+        f" read back: shiftsim convert nuplan {report.logs} {report.maps}"
+        f" --tokens {report.token_file}{mapping} --store NAME"
+    )
+
+
+def show_stats(
+    store: Store,
+    by: Annotated[str, typer.Option(help="city or type.")] = "city",
+    style: Annotated[
+        str, typer.Option("--format", "-f", help="text, or csv with a row per scenario.")
+    ] = "text",
+    out: Annotated[Path | None, typer.Option(help="Write the table to this file.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw bars into this file (.png, .svg, .pdf).")
+    ] = None,
+    split: Split = None,
+    all_scenarios: AllScenarios = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
+    from shiftsim.config import one_of
+    from shiftsim.data.stats import store_stats
+    from shiftsim.runner import open_named_store
+    from shiftsim.stats_report import draw_stats, stats_dict, stats_table
+
+    one_of("column", by, ("city", "type"))
+    opened = open_named_store(store)
+    tokens = _chosen(opened, split, all_scenarios)
+    with progress_bar(quiet=quiet or as_json) as advance:
+        found = store_stats(
+            opened, tokens, progress=lambda done, total, token: advance(done, total, "")
+        )
+    text = stats_table(found, by=by, style=style)
+    if figure is not None:
+        name = opened.path.resolve().name
+        draw_stats(found, figure, title=f"{name}: {plural(len(tokens), 'scenario')}")
+    if as_json:
+        say_json(stats_dict(found))
+    elif out is not None:
+        out.write_text(text + "\n", "utf-8")
+        say(f"written: {out}")
+    else:
+        say(text)
+        left_out = len(opened) - len(tokens)
+        if left_out:
+            say(f" {plural(left_out, 'scenario')} of the store left out")
+    if figure is not None and not as_json:
+        say(f"written: {figure}")
