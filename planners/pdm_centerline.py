@@ -145,7 +145,8 @@ def lane_off_road(
         if np.hypot(dx, dy) > best + 1.001 * radius:
             continue
         shell = polygons.poly_ptr[lane]
-        ring = polygons.xy[polygons.ring_ptr[shell] : polygons.ring_ptr[shell + 1]]
+        # a copy, since map arrays are read-only and would need kernels of their own
+        ring = polygons.xy[polygons.ring_ptr[shell] : polygons.ring_ptr[shell + 1]].copy()
         distance = box_to_ring(footprint, ring)
         if distance < best:
             best, found = distance, lane

@@ -13,6 +13,7 @@ from shapely.ops import substring
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.planners.idm_corridor import BAND, CLEAR, HIT, OPEN, segment_distance
+from shiftsim.planners.pdm_centerline import box_to_ring
 from shiftsim.planners.pdm_forecast import NUM_FORECASTS, Occupants, centroid, ring_of
 from shiftsim.planners.pdm_path import RUN, PdmPath, project, window
 
@@ -173,17 +174,24 @@ def _side(
             if nearest <= inner:
                 return HIT
     # beyond the first and the last vertex the corridor goes on straight by half a width
+    is_open = nearest <= outer
     for last, before in ((begin, begin + 1), (end - 1, end - 2)):
         if np.hypot(x - xy[last, 0], y - xy[last, 1]) <= radius + 2.0 * outer:
-            nearest = min(nearest, _cap_distance(xy[before], xy[last], outer, ring))
-    return OPEN if nearest <= outer else CLEAR
+            if _touches_cap(xy[before], xy[last], inner, ring):
+                return HIT
+            is_open = is_open or _touches_cap(xy[before], xy[last], outer, ring)
+    return OPEN if is_open else CLEAR
 
 
 @kernel
-def _cap_distance(a: FloatArray, b: FloatArray, outer: float, ring: FloatArray) -> float:
-    """Distance from a ring to the extension of the segment a-b beyond b [m]."""
+def _touches_cap(a: FloatArray, b: FloatArray, reach: float, ring: FloatArray) -> bool:
+    """Whether a ring touches the end of the corridor beyond the segment a-b, `reach` long [m]."""
     length = np.hypot(b[0] - a[0], b[1] - a[1])
-    tip = np.empty(2)
-    tip[0] = b[0] + outer / length * (b[0] - a[0])
-    tip[1] = b[1] + outer / length * (b[1] - a[1])
-    return segment_distance(ring, b, tip)
+    along_x, along_y = reach * (b[0] - a[0]) / length, reach * (b[1] - a[1]) / length
+    cap = np.empty((4, 2))
+    for corner in range(4):
+        ahead = 1.0 if corner == 0 or corner == 3 else 0.0
+        left = 1.0 if corner < 2 else -1.0
+        cap[corner, 0] = b[0] + ahead * along_x - left * along_y
+        cap[corner, 1] = b[1] + ahead * along_y + left * along_x
+    return box_to_ring(cap, ring) == 0.0
