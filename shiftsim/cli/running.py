@@ -248,11 +248,13 @@ def demo(
     """Generate small recordings, convert them, run three planners clean and disturbed."""
     from shiftsim.config import DEFAULT_STORE, make_config, store_path
     from shiftsim.data.synthetic import demo_store
+    from shiftsim.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
-        say(f"generating and converting recordings → {folder}")
-        demo_store(folder)
+        say(f"generating and converting recordings, compiling kernels → {folder}")
+        with warm_up():
+            demo_store(folder)
     values: dict[str, Any] = {
         "planners": list(_DEMO_PLANNERS),
         "noise": list(_DEMO_NOISE),
