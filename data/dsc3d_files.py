@@ -64,7 +64,7 @@ def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise ConversionError(
-            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]!r} is not a finite number"
+            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]:g} is not a finite number"
             f" ({len(bad)} such values)",
             "mend or delete the rows; no position can be made up",
         )
@@ -72,7 +72,7 @@ def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
     bad = np.flatnonzero(np.abs(values) > largest)
     if len(bad):
         raise ConversionError(
-            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]!r} is beyond ±{largest:g}"
+            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]:g} is beyond ±{largest:g}"
             f" ({len(bad)} such values)",
             "check the unit of the column, and that the file is whole",
         )

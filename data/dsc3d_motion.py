@@ -56,7 +56,7 @@ def believed_velocities(
     if stored is None:
         count(warnings, "tracks without stored velocity (derived)", int(track[-1]) + 1)
         return derived
-    error = np.linalg.norm(derived - stored, axis=1)
+    error = np.hypot(*(derived - stored).T)
     first = np.searchsorted(track, np.arange(track[-1] + 1))
     last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
     refused = track_medians(error, track) >= _MAX_VELOCITY_ERROR
