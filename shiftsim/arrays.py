@@ -36,7 +36,8 @@ def _use_checkout_cache() -> None:
     for path in _kernel_sources():
         if b"@kernel" in (source := path.read_bytes()):
             digest.update(path.name.encode() + b"\n" + source)
-    numba.config.CACHE_DIR = str(_CHECKOUT / ".numba-cache" / digest.hexdigest()[:16])
+    folder = _CHECKOUT / ".numba-cache" / digest.hexdigest()[:16]
+    vars(numba.config)["CACHE_DIR"] = str(folder)  # a setting that numba makes at run time
 
 
 _use_checkout_cache()

@@ -30,7 +30,7 @@ ALLOWED = {
     "metrics": BASE | {"map", "layers", "log"},
     "planners": BASE | WORLD | {"plan_check"},
 }
-TOP = {"benchmarks", "cli"}
+TOP = {"benchmarks", "cli", "__main__"}
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
 SOURCES = sorted(
     path
