@@ -8,8 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shiftsim.arrays import FloatArray
+from shiftsim.data.demo_agents import SIZES
 from shiftsim.data.demo_scenes import SITES, DemoSite, Scene, traffic_of
-from shiftsim.data.demo_traffic import SIZES, Box
+from shiftsim.data.demo_traffic import DT, Box
 from shiftsim.geometry import wrap_angles
 
 _FRAME_RATE, _FRAME_DISTANCE = 25.0, 2
@@ -29,9 +31,10 @@ def _write_site(folder: Path, site: DemoSite) -> None:
     (folder / "map/map.xodr").write_text(town.network.xml(), encoding="utf-8")
     categories: set[str] = set()
     for scene in site.scenes:
-        boxes = traffic_of(scene, site.town()).record(scene.duration)
-        categories |= {box.category for box in boxes}
-        _write_recording(folder / "annotations" / scene.name, scene, boxes)
+        boxes = traffic_of(scene, town).record(scene.duration)
+        table = _annotations(boxes, town.parked())
+        categories |= set(table["category"].combine_chunks().dictionary.to_pylist())
+        _write_recording(folder / "annotations" / scene.name, scene, table)
     meta = {
         "dataset_name": f"shiftsim demo {site.name}",
         "dataset_version": "1",
@@ -52,47 +55,66 @@ def _write_site(folder: Path, site: DemoSite) -> None:
     (folder / "data_meta.json").write_text(json.dumps(meta, indent=2) + "\n", encoding="utf-8")
 
 
-def _write_recording(folder: Path, scene: Scene, boxes: list[Box]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    boxes = sorted(boxes, key=lambda box: (box.frame, box.track))
-    names = sorted({box.category for box in boxes})
-    poses = np.array([box.pose for box in boxes])
-    heading = wrap_angles(poses[:, 2])
+def _annotations(boxes: list[Box], parked: FloatArray) -> pa.Table:
+    """Rows of `annotations.parquet`, by frame and track.
+
+    Args:
+        boxes: Everybody who moves.
+        parked: (n, 3) poses of parked cars, which are there at every frame.
+    """
+    names = sorted({*(box[2] for box in boxes), *(("car", "van") if len(parked) else ())})
+    moving = np.array([(*box[:2], names.index(box[2]), *box[3:]) for box in boxes])
+    rows = np.concatenate([moving, _parked_rows(moving, parked, names)])
+    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    kinds = rows[:, 2].astype(np.int32)
+    heading = wrap_angles(rows[:, 5])
     along = np.column_stack([np.cos(heading), np.sin(heading)])
-    speed = np.array([box.speed for box in boxes])[:, None] * along
-    accel = np.array([box.accel for box in boxes])[:, None] * along
-    sizes = np.array([SIZES[box.category] for box in boxes])
-    zero = np.zeros(len(boxes))
+    speed, accel = rows[:, 6, None] * along, rows[:, 7, None] * along
+    sizes = np.array([SIZES[name] for name in names])[kinds]
+    zero = np.zeros(len(rows))
     groups = {
-        "translation": (poses[:, 0], poses[:, 1], zero + _GROUND),
+        "translation": (rows[:, 3], rows[:, 4], zero + _GROUND),
         "rotation": (zero, zero, heading),
         "dimension": (sizes[:, 0], sizes[:, 1], sizes[:, 2]),
         "velocity": (speed[:, 0], speed[:, 1], zero),
-        "angular_velocity": (zero, zero, np.array([box.yaw_rate for box in boxes])),
+        "angular_velocity": (zero, zero, rows[:, 8]),
         "acceleration": (accel[:, 0], accel[:, 1], zero),
     }
     columns = {
-        "frame_id": pa.array([_FRAME_DISTANCE * box.frame for box in boxes], pa.uint32()),
-        "track_id": pa.array([box.track for box in boxes], pa.uint32()),
-        "category": pa.DictionaryArray.from_arrays(
-            pa.array([names.index(box.category) for box in boxes], pa.int32()), names
-        ),
+        "frame_id": pa.array(_FRAME_DISTANCE * rows[:, 0].astype(np.int64), pa.uint32()),
+        "track_id": pa.array(rows[:, 1].astype(np.int64), pa.uint32()),
+        "category": pa.DictionaryArray.from_arrays(pa.array(kinds), names),
     }
     for group, values in groups.items():
         kind = pa.float32() if group in _FLOATS else pa.float64()
         for axis, column in zip("xyz", values, strict=True):
             columns[f"{group}_{axis}"] = pa.array(column, pa.float64()).cast(kind, safe=False)
-    _write(pa.table(columns), folder / "annotations.parquet")
-    frames = np.arange(max(box.frame for box in boxes) + 1)
+    return pa.table(columns)
+
+
+def _parked_rows(moving: FloatArray, parked: FloatArray, names: list[str]) -> FloatArray:
+    if not len(parked):
+        return np.zeros((0, moving.shape[1]))
+    frames = round(float(moving[:, 0].max())) + 1
+    tracks = moving[:, 1].max() + 1.0 + np.arange(len(parked))
+    kinds = np.where(np.arange(len(parked)) % 7 == 5, names.index("van"), names.index("car"))
+    still = np.column_stack([tracks, kinds, parked, np.zeros((len(parked), 3))])
+    return np.column_stack([np.repeat(np.arange(frames), len(parked)), np.tile(still, (frames, 1))])
+
+
+def _write_recording(folder: Path, scene: Scene, table: pa.Table) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(table, folder / "annotations.parquet")
+    frames = np.arange(round(scene.duration / DT) + 1)
     start = int(datetime.fromisoformat(scene.start + "+00:00").timestamp()) * 1_000_000
     stamps = start + np.rint(frames * _FRAME_DISTANCE / _FRAME_RATE * 1e6).astype(np.int64)
-    table = pa.table(
+    times = pa.table(
         {
             "frame_id": pa.array(_FRAME_DISTANCE * frames, pa.uint32()),
             "time": pa.array(stamps, pa.timestamp("us", "UTC")),
         }
     )
-    _write(table, folder / "frames.parquet")
+    _write(times, folder / "frames.parquet")
 
 
 def _write(table: pa.Table, path: Path) -> None:

@@ -164,7 +164,6 @@ class RoadNetwork:
     name: str
     roads: dict[int, RoadSpec] = field(default_factory=dict)
     links: list[Link] = field(default_factory=list)
-    junction: int = 100
 
     def xml(self) -> str:
         """The OpenDRIVE file."""
@@ -174,9 +173,10 @@ class RoadNetwork:
             f'<header revMajor="1" revMinor="7" name="{self.name}" version="1"/>',
             *(_road_xml(road) for road in self.roads.values()),
         ]
-        if self.links:
-            parts.append(f'<junction id="{self.junction}" name="{self.name}">')
-            for number, link in enumerate(self.links):
+        for junction in sorted({self.junction_of(link) for link in self.links}):
+            parts.append(f'<junction id="{junction}" name="{self.name}{junction}">')
+            inside = (link for link in self.links if self.junction_of(link) == junction)
+            for number, link in enumerate(inside):
                 parts.append(
                     f'<connection id="{number}" incomingRoad="{link.incoming}" '
                     f'connectingRoad="{link.connecting}" contactPoint="start">'
@@ -184,6 +184,10 @@ class RoadNetwork:
                 )
             parts.append("</junction>")
         return "\n".join([*parts, "</OpenDRIVE>", ""])
+
+    def junction_of(self, link: Link) -> int:
+        """Id of the junction a link belongs to."""
+        return self.roads[link.connecting].junction
 
 
 def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tuple[Piece, ...]:

@@ -1,134 +1,59 @@
 """Traffic of the demo: drivers who follow, yield and stop, pedestrians who wait and cross.
 
 Drivers keep to a path and follow what is on it (IDM), brake evenly towards places where they must
-wait, and change their acceleration gradually. A junction admits one of two conflicting connectors
-at a time; a crosswalk belongs to whoever is on it, then to pedestrians that vehicles can still stop
-for. Steps are the frames of the recording.
+wait, and change their acceleration gradually. A zone (junction, narrow place) admits one of two
+conflicting ways at a time; a crossing belongs to whoever is on it, then to pedestrians that
+vehicles can still stop for. Steps are the frames of the recording.
 """
 
 from dataclasses import dataclass, field
-from math import cos, hypot, inf, sin, sqrt
+from math import cos, inf, sin, sqrt
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.demo_towns import STEP, Path, Town, Walk
+from shiftsim.data.demo_agents import (
+    WALKING,
+    Driver,
+    Walker,
+    goes_first,
+    has_room,
+    must_queue,
+)
+from shiftsim.data.demo_network import Town
+from shiftsim.data.demo_paths import STEP, Zone, arc_at
 
 DT = 0.08  # s, 12.5 Hz
 _MAX_ACCEL, _BRAKING, _HARDEST = 1.3, 1.6, 3.2  # m/s^2
 _JERK = 1.6  # m/s^3
 _HEADWAY, _MIN_GAP = 1.5, 2.5  # s, m
 _LOOK_AHEAD = 60.0  # m
-_REQUEST = 6.0  # s before the stop line at which a driver asks to enter
+_REQUEST = 1.0  # s before braking would begin, a driver asks to enter a zone
 _EVEN = 1.15  # m/s^2, even braking towards a place to wait begins here
 _YIELDING = 1.8  # m/s^2, a driver stops for waiting pedestrians when this is enough
-_SPARE = 0.9  # m, aimed at before the place to wait
 _SIDE_MARGIN = 0.4  # m
-_WALKING = 1.35  # m/s
+_PASSED = 2.8  # m between a pedestrian who has crossed and the middle of a driver's way
 
-SIZES = {
-    "car": (4.5, 1.85, 1.5),
-    "van": (5.3, 2.0, 2.2),
-    "pickup": (5.4, 2.0, 1.9),
-    "truck": (8.2, 2.4, 3.3),
-    "bus": (11.0, 2.5, 3.1),
-    "motorcycle": (2.2, 0.8, 1.4),
-    "bicycle": (1.8, 0.6, 1.7),
-    "pedestrian": (0.6, 0.6, 1.75),
-}
-
-
-@dataclass(eq=False)
-class Driver:
-    """One vehicle or bicycle under way.
-
-    Attributes:
-        category: DSC3D category.
-        path: What it follows.
-        s: Arc length of its box centre [m].
-        v: Speed [m/s].
-        eager: Factor on the desired speed.
-        start: When it appears [s].
-        a: Acceleration [m/s^2].
-        holds: Whether it has been admitted to the junction.
-        waiting: Places it has begun to brake for.
-        patience: How long it will stand before others let it in [s].
-    """
-
-    category: str
-    path: Path
-    s: float
-    v: float
-    eager: float = 1.0
-    start: float = 0.0
-    a: float = 0.0
-    holds: bool = False
-    waiting: set[str] = field(default_factory=set)
-    patience: float = 6.0
-    token: int = 0
-
-    @property
-    def rank(self) -> int:
-        """Order of priority at the junction now, smallest first."""
-        return self.path.rank if self.patience > 0.0 else -1
-
-    @property
-    def length(self) -> float:
-        """Length of the box [m]."""
-        return SIZES[self.category][0]
-
-    @property
-    def front(self) -> float:
-        """Arc length of the front bumper [m]."""
-        return self.s + 0.5 * self.length
-
-    @property
-    def rear(self) -> float:
-        """Arc length of the rear bumper [m]."""
-        return self.s - 0.5 * self.length
-
-
-@dataclass(eq=False)
-class Walker:
-    """One pedestrian.
-
-    Attributes:
-        walk: The way.
-        start: When the pedestrian appears [s].
-        s: Arc length [m].
-        v: Speed [m/s].
-        crossing: Whether the crosswalk has been entered.
-    """
-
-    walk: Walk
-    start: float = 0.0
-    s: float = 0.0
-    v: float = _WALKING
-    crossing: bool = False
-    token: int = 0
-
-
-@dataclass(frozen=True)
-class Box:
-    """One annotated box at one frame."""
-
-    frame: int
-    track: int
-    category: str
-    pose: tuple[float, float, float]
-    speed: float
-    accel: float
-    yaw_rate: float
+Box = tuple[int, int, str, float, float, float, float, float, float]
 
 
 @dataclass
 class Traffic:
-    """Everybody in a town, and the recording so far."""
+    """Everybody in a town, and the recording so far.
+
+    Attributes:
+        town: Where.
+        drivers: In the order of their tracks.
+        walkers: The tracks after those.
+        boxes: Frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration
+            [m/s^2], yaw rate [rad/s].
+    """
 
     town: Town
     drivers: list[Driver]
     walkers: list[Walker]
     boxes: list[Box] = field(default_factory=list)
+    _passing: dict[tuple[int, int], float] = field(default_factory=dict)
 
     def record(self, duration: float) -> list[Box]:
         """Simulate from time 0 and return the boxes of all frames."""
@@ -140,40 +65,24 @@ class Traffic:
         active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):
             time = frame * DT
-            for driver in list(waiting):
-                if driver.start <= time and _has_room(driver, active):
+            for driver in [d for d in waiting if d.start <= time]:
+                if has_room(driver, active):
                     active.append(driver)
                     waiting.remove(driver)
-            walkers = [w for w in self.walkers if w.start <= time and _is_under_way(w)]
+            walkers = [w for w in self.walkers if w.start <= time and w.is_under_way]
             self._write(frame, active, walkers)
             self._step(active, walkers)
-            active = [d for d in active if d.front < d.path.length - 1.0]
+            active = [d for d in active if not d.has_arrived]
         return self.boxes
 
     def _write(self, frame: int, drivers: list[Driver], walkers: list[Walker]) -> None:
         for driver in drivers:
-            x, y, heading = driver.path.at(driver.s)
-            bend = (driver.path.at(driver.s + 0.5)[2] - driver.path.at(driver.s - 0.5)[2]) / 1.0
-            self.boxes.append(
-                Box(
-                    frame,
-                    driver.token,
-                    driver.category,
-                    (x, y, heading),
-                    driver.v,
-                    driver.a,
-                    bend * driver.v,
-                )
-            )
+            rate = driver.path.bend(driver.s) * driver.v
+            row = (frame, driver.token, driver.category, *driver.place, driver.v, driver.a, rate)
+            self.boxes.append(row)
         for walker in walkers:
-            x, y, heading = _walk_pose(walker)
-            self.boxes.append(
-                Box(frame, walker.token, "pedestrian", (x, y, heading), walker.v, 0.0, 0.0)
-            )
-        count = len(self.drivers) + len(self.walkers)
-        for number, pose in enumerate(self.town.parking, start=count + 1):
-            category = "van" if number % 7 == 0 else "car"
-            self.boxes.append(Box(frame, number, category, tuple(pose.tolist()), 0.0, 0.0, 0.0))
+            place = walker.walk.at(walker.s)
+            self.boxes.append((frame, walker.token, "pedestrian", *place, walker.v, 0.0, 0.0))
 
     def _step(self, drivers: list[Driver], walkers: list[Walker]) -> None:
         self._admit(drivers)
@@ -183,47 +92,57 @@ class Traffic:
         for driver, accel in zip(drivers, wanted, strict=True):
             driver.a += min(max(accel - driver.a, -1.5 * _JERK * DT), _JERK * DT)
             if driver.v + driver.a * DT < 0.0 or (driver.v < 0.02 and accel <= 0.0):
-                driver.a = -driver.v / DT if driver.v > 0.02 else 0.0
-                driver.s += 0.5 * driver.v * DT
-                driver.v = 0.0
-                driver.a = 0.0
+                driver.move_to(driver.s + 0.5 * driver.v * DT)
+                driver.v = driver.a = 0.0
                 continue
-            driver.s += driver.v * DT + 0.5 * driver.a * DT * DT
+            driver.move_to(driver.s + driver.v * DT + 0.5 * driver.a * DT * DT)
             driver.v += driver.a * DT
         for walker in walkers:
             walker.s += walker.v * DT
 
     def _admit(self, drivers: list[Driver]) -> None:
-        """Let drivers into the junction, by priority, where nobody in it is in their way."""
+        """Let drivers into zones, by priority, where nobody in there is in their way."""
         for driver in drivers:
-            if driver.holds and (driver.rear > driver.path.exit or _is_yielding(driver)):
-                driver.holds = False
-        asking = [d for d in drivers if d.path.connector >= 0 and not d.holds and _is_before(d)]
-        asking.sort(key=lambda d: (d.rank, _arrival(d), d.token))
-        refused: list[Driver] = []
-        for driver in asking:
-            if driver.v < 0.3 and "junction" in driver.waiting:
+            for held in driver.path.zones if driver.held else ():
+                waits = driver.is_yielding(held) or driver.is_held_up(held)
+                if driver.rear > held.exit or waits:
+                    driver.held.discard(held.id)
+        asking = [(d, zone) for d in drivers if (zone := d.next_zone())]
+        asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].token))
+        refused: list[Zone] = []
+        for driver, zone in asking:
+            if driver.v < 0.3 and _place_of(zone) in driver.waiting:
                 driver.patience -= DT
             if (
-                _arrival(driver) > _REQUEST
-                or _is_yielding(driver)
-                or _must_queue(driver, drivers)
-                or any(self._conflict(driver, d) for d in refused)
+                driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
+                or driver.is_yielding(zone)
+                or driver.is_held_up(zone)
+                or any(self._conflict(zone, other) for other in refused)
+                or must_queue(driver, zone, drivers)
             ):
                 continue
-            rivals = [d for d in drivers if self._conflict(driver, d)]
-            driver.holds = not any(d.holds or _goes_first(d, driver) for d in rivals)
-            if not driver.holds and driver.patience <= 0.0:
-                refused.append(driver)
+            if not any(self._is_in_the_way(d, driver, zone) for d in drivers if d is not driver):
+                driver.held.add(zone.id)
+                driver.patience = 6.0
+            elif driver.patience <= 0.0:
+                refused.append(zone)
 
-    def _conflict(self, a: Driver, b: Driver) -> bool:
-        return (a.path.connector, b.path.connector) in self.town.conflicts
+    def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
+        for zone in other.path.zones:
+            if self._conflict(wanted, zone) and (
+                zone.id in other.held or goes_first(other, zone, driver, wanted)
+            ):
+                return True
+        return False
+
+    def _conflict(self, a: Zone, b: Zone) -> bool:
+        return (a.id, b.id) in self.town.conflicts
 
     def _acceleration(
         self, driver: Driver, drivers: list[Driver], walkers: list[Walker], bodies: FloatArray
     ) -> float:
         index = min(int(driver.s / STEP), len(driver.path.speed) - 1)
-        target = max(driver.eager * driver.path.speed[index], 0.5)
+        target = max(driver.eager * float(driver.path.speed[index]), 0.5)
         free = _MAX_ACCEL * (1.0 - (driver.v / target) ** 4)
         accel = max(free, -1.8)
         gap, lead_speed = _leader(driver, drivers, bodies)
@@ -239,30 +158,43 @@ class Traffic:
     def _places_to_wait(self, driver: Driver, walkers: list[Walker]) -> list[tuple[str, float]]:
         places = []
         path = driver.path
-        if path.connector >= 0 and not driver.holds and _is_before(driver):
-            places.append(("junction", path.stop))
-        else:
-            driver.waiting.discard("junction")
-        for name, first, _ in path.crosswalks:
+        for zone in path.zones:
+            if zone.id not in driver.held and driver.is_before(zone):
+                places.append((_place_of(zone), zone.stop))
+            else:
+                driver.waiting.discard(_place_of(zone))
+        for name, first, _ in path.crossings:
             place = first - 1.5
             before = driver.front <= first - 0.3
             if before and self._is_claimed(driver, name, place, walkers):
                 places.append((name, place))
             else:
                 driver.waiting.discard(name)
+        if path.is_parking:
+            places.append(("end", path.length + 0.5 * driver.length + 0.9))
         return places
 
     def _is_claimed(self, driver: Driver, name: str, place: float, walkers: list[Walker]) -> bool:
-        """Whether a driver must wait before a crosswalk."""
+        """Whether a driver must wait before a crossing."""
         for walker in walkers:
-            if walker.walk.crosswalk != name or walker.s > walker.walk.across:
+            if walker.walk.crossing != name or walker.s > self._passed(driver, walker):
                 continue
             if walker.crossing:
                 return True
             near = walker.s > walker.walk.kerb - 2.5
-            if near and (name in driver.waiting or _needed(driver, place) < _YIELDING):
+            if near and (name in driver.waiting or driver.needed(place) < _YIELDING):
                 return True
         return False
+
+    def _passed(self, driver: Driver, walker: Walker) -> float:
+        """Where on its way over a crossing a pedestrian has left the way of a driver [m]."""
+        key = (id(driver.path), id(walker.walk))
+        if key not in self._passing:
+            near = (p for n, *p in driver.path.crossings if n == walker.walk.crossing)
+            x, y, _ = driver.path.at(0.5 * sum(next(near)))
+            place = arc_at(walker.walk.points, np.array([x, y]))
+            self._passing[key] = min(place + _PASSED, walker.walk.across)
+        return self._passing[key]
 
     def _let_walk(self, drivers: list[Driver], walkers: list[Walker]) -> None:
         for walker in walkers:
@@ -273,31 +205,30 @@ class Traffic:
                 continue
             if walker.s >= walk.kerb - 0.9:
                 walker.crossing = walker.s <= walk.across
-            walker.v = min(walker.v + 1.0 * DT, _WALKING)
+            walker.v = min(walker.v + 1.0 * DT, WALKING)
 
     def _may_cross(self, walker: Walker, drivers: list[Driver]) -> bool:
-        needed = (walker.walk.across - walker.walk.kerb) / _WALKING + 2.0
+        needed = (walker.walk.across - walker.walk.kerb) / WALKING + 2.0
         for driver in drivers:
-            for name, first, last in driver.path.crosswalks:
-                if name != walker.walk.crosswalk or driver.rear > last + 0.5:
+            for name, first, last in driver.path.crossings:
+                if name != walker.walk.crossing or driver.rear > last + 0.5:
                     continue
                 stands = driver.v < 0.3
                 if driver.front > first - (0.4 if stands else 1.6):
                     return False
                 far = (first - 1.5 - driver.front) / max(driver.v, 1.0) > needed
                 gentle = _YIELDING + 0.1 if name in driver.waiting else _EVEN
-                if not (stands or far or _needed(driver, first - 1.5) < gentle):
+                if not (stands or far or driver.needed(first - 1.5) < gentle):
                     return False
         return True
 
 
-def _needed(driver: Driver, place: float) -> float:
-    """Even deceleration that stops the front bumper at a place [m/s^2]."""
-    return driver.v**2 / (2.0 * max(place - _SPARE - driver.front, 0.2))
+def _place_of(zone: Zone) -> str:
+    return f"zone {zone.id}"
 
 
 def _even_braking(driver: Driver, name: str, place: float) -> float:
-    needed = _needed(driver, place)
+    needed = driver.needed(place)
     if needed < _EVEN and name not in driver.waiting:
         return _MAX_ACCEL
     driver.waiting.add(name)
@@ -306,72 +237,15 @@ def _even_braking(driver: Driver, name: str, place: float) -> float:
     return -min(needed, _HARDEST) if driver.v > 0.05 else -0.5
 
 
-def _arrival(driver: Driver) -> float:
-    """Time until the stop line at the present speed [s]."""
-    return max(driver.path.stop - driver.front, 0.0) / max(driver.v, 3.0)
-
-
-def _must_queue(driver: Driver, drivers: list[Driver]) -> bool:
-    """Whether somebody ahead still has to enter, or stands behind the junction."""
-    x, y, _ = driver.path.at(min(driver.path.exit + 6.0, driver.path.length))
-    for other in drivers:
-        if other is driver:
-            continue
-        same_start = other.path.origin == driver.path.origin
-        if same_start and driver.s < other.s and not other.holds and _is_before(other):
-            return True
-        ox, oy, _ = other.path.at(other.s)
-        if other.v < 2.0 and hypot(ox - x, oy - y) < 8.0 and other.s > other.path.exit - 4.0:
-            return True
-    return False
-
-
-def _goes_first(driver: Driver, other: Driver) -> bool:
-    """Whether a driver with priority is too near for another one to enter before it."""
-    clear = _arrival(other) + (other.path.exit - other.path.stop + other.length) / 4.5
-    return (
-        driver.rank < other.rank
-        and _is_before(driver)
-        and driver.v > 0.5
-        and _arrival(driver) < clear + 1.0
-    )
-
-
-def _is_yielding(driver: Driver) -> bool:
-    """Whether a driver waits for pedestrians before the junction."""
-    return _is_before(driver) and driver.path.crosswalks[0][0] in driver.waiting
-
-
-def _is_before(driver: Driver) -> bool:
-    """Whether a driver has not passed the stop line."""
-    return driver.front <= driver.path.stop + 2.0
-
-
-def _has_room(driver: Driver, active: list[Driver]) -> bool:
-    """Whether nobody is near the place where a driver appears."""
-    x, y, _ = driver.path.at(driver.s)
-    for other in active:
-        ox, oy, _ = other.path.at(other.s)
-        room = 0.5 * (driver.length + other.length) + 6.0 + 1.2 * driver.v
-        if hypot(ox - x, oy - y) < room and abs(_aside(driver, ox, oy)) < 2.5:
-            return False
-    return True
-
-
-def _aside(driver: Driver, x: float, y: float) -> float:
-    px, py, heading = driver.path.at(driver.s)
-    return float(-(x - px) * sin(heading) + (y - py) * cos(heading))
-
-
 def _bodies(drivers: list[Driver]) -> FloatArray:
-    """(3 n, 3) rear, middle and front of everybody, and half the width."""
+    """(n, 3, 3) rear, middle and front of everybody, and half the width."""
     out = []
     for driver in drivers:
-        x, y, heading = driver.path.at(driver.s)
+        x, y, heading = driver.place
         half = 0.5 * driver.length - 0.3
-        dx, dy, wide = half * cos(heading), half * sin(heading), 0.5 * SIZES[driver.category][1]
-        out += [(x - dx, y - dy, wide), (x, y, wide), (x + dx, y + dy, wide)]
-    return np.array(out).reshape(-1, 3)
+        dx, dy, wide = half * cos(heading), half * sin(heading), 0.5 * driver.width
+        out.append(((x - dx, y - dy, wide), (x, y, wide), (x + dx, y + dy, wide)))
+    return np.array(out).reshape(-1, 3, 3)
 
 
 def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[float, float]:
@@ -379,32 +253,36 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
     begin = int(driver.s / STEP)
     reach = min(12.0 + 4.0 * driver.v, _LOOK_AHEAD)
     points = driver.path.points[begin : begin + round(reach / STEP) : 2]
-    if len(points) < 2 or len(drivers) < 2:
+    near = [k for k, other in enumerate(drivers) if _may_lead(other, driver, reach)]
+    if len(points) < 2 or not near:
         return inf, 0.0
-    dx = bodies[:, :1] - points[:, 0]
-    dy = bodies[:, 1:2] - points[:, 1]
+    parts = bodies[near].reshape(-1, 3)
+    dx = parts[:, :1] - points[:, 0]
+    dy = parts[:, 1:2] - points[:, 1]
     square = dx * dx + dy * dy
     nearest = square.argmin(axis=1)
-    aside = np.sqrt(square[np.arange(len(square)), nearest]) - bodies[:, 2]
+    aside = np.sqrt(square[np.arange(len(square)), nearest]) - parts[:, 2]
     along = driver.s + nearest * 2 * STEP
-    own = 0.5 * SIZES[driver.category][1] + _SIDE_MARGIN
+    own = 0.5 * driver.width + _SIDE_MARGIN
     best, speed = inf, 0.0
     for part in np.flatnonzero((aside < own) & (nearest > 0)).tolist():
-        other = drivers[part // 3]
-        if other is driver:
-            continue
-        turn = other.path.at(other.s)[2] - driver.path.at(along[part])[2]
+        other = drivers[near[part // 3]]
+        turn = other.place[2] - driver.path.at(float(along[part]))[2]
         gap = float(along[part]) - 0.3 - driver.front
         if abs(cos(turn)) < 0.7:
-            gap -= bodies[part, 2]
+            gap -= parts[part, 2]
         if gap < best:
             best, speed = gap, max(0.0, other.v * cos(turn))
-    return best, speed
+    return best, float(speed)
 
 
-def _walk_pose(walker: Walker) -> tuple[float, float, float]:
-    return walker.walk.at(walker.s)
-
-
-def _is_under_way(walker: Walker) -> bool:
-    return walker.s < STEP * (len(walker.walk.points) - 1) - 0.5
+def _may_lead(other: Driver, driver: Driver, reach: float) -> bool:
+    """Whether somebody is near enough to be on the path ahead, and not behind."""
+    (x, y, heading), (ox, oy, _) = driver.place, other.place
+    dx, dy = ox - x, oy - y
+    limit = reach + 0.5 * other.length + 2.0
+    return (
+        other is not driver
+        and dx * dx + dy * dy < limit * limit
+        and dx * cos(heading) + dy * sin(heading) > -0.5 * other.length
+    )

@@ -8,29 +8,41 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from shiftsim.data.deepplan import ConversionReport, convert_dsc3d
 from shiftsim.data.demo_files import write_sites
+from shiftsim.data.store import ScenarioStore
 from shiftsim.data.synthetic_city import bench_scene
 
-__all__ = ["bench_scene", "convert_demo", "demo_store", "write_demo"]
+__all__ = ["DEMO_SPLIT", "bench_scene", "convert_demo", "demo_store", "write_demo"]
+
+DEMO_SPLIT = "demo-mini"
+_SPLIT_SIZE = 16
+_SPLIT_PATH = 40.0  # m, shortest way of the ego in a scenario of the split
 
 
 def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per site, always the same bytes.
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
 
     Args:
-        folder: Where the folders `junction` and `street` go; made if needed.
+        folder: Where the folders of the towns go; made if needed.
     """
     write_sites(folder)
 
 
 def convert_demo(recordings: Path, store: Path) -> list[ConversionReport]:
-    """Convert what `write_demo` wrote into a store, one report per site."""
-    return [
+    """Convert what `write_demo` wrote into a store, with the split `demo-mini`."""
+    reports = [
         convert_dsc3d(site, store, site=site.name)
         for site in sorted(recordings.iterdir())
         if (site / "data_meta.json").is_file()
     ]
+    tokens = _sample(ScenarioStore(store))
+    lines = [f'name = "{DEMO_SPLIT}"', "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
+    (store / "splits").mkdir(exist_ok=True)
+    (store / f"splits/{DEMO_SPLIT}.toml").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    return reports
 
 
 def demo_store(path: Path) -> Path:
@@ -51,3 +63,18 @@ def demo_store(path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(store, path)
     return path
+
+
+def _sample(store: ScenarioStore) -> list[str]:
+    """Tokens of some scenarios in which the ego gets on, by turns from every town."""
+    by_city: dict[str, list[str]] = {city: [] for city in store.cities}
+    for scene in store:
+        rows = scene.iteration_rows
+        way = np.diff(scene.ego[rows[0] : rows[-1] + 1, :2], axis=0)
+        if np.hypot(*way.T).sum() >= _SPLIT_PATH:
+            by_city[scene.city].append(scene.token)
+    turns = max(map(len, by_city.values()))
+    mixed = [
+        tokens[turn] for turn in range(turns) for tokens in by_city.values() if turn < len(tokens)
+    ]
+    return sorted(mixed[:_SPLIT_SIZE])

@@ -247,7 +247,7 @@ def demo(
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed."""
     from shiftsim.config import DEFAULT_STORE, make_config, store_path
-    from shiftsim.data.synthetic import demo_store
+    from shiftsim.data.synthetic import DEMO_SPLIT, demo_store
     from shiftsim.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)
@@ -259,6 +259,7 @@ def demo(
         "planners": list(_DEMO_PLANNERS),
         "noise": list(_DEMO_NOISE),
         "store": str(folder) if out else DEFAULT_STORE,
+        "split": DEMO_SPLIT,
         "limit": limit or 0,
         "workers": worker_count(workers),
     }
