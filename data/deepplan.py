@@ -159,7 +159,9 @@ def convert_dsc3d(
     names = source.recordings
     show = progress or (lambda done, total, name: None)
     show(0, len(names), "")
-    read = _collect(spread, partial(_moving_vehicles, source, config), names, lambda name: None)
+    last = _LastRead()
+    look = partial(_moving_vehicles, source, config, last)
+    read = _collect(spread, look, names, lambda name: None)
     skipped = {name: str(found) for name, found in read.items() if isinstance(found, _Broken)}
     if len(skipped) == len(names):
         _refuse_all(source, read)
@@ -169,7 +171,7 @@ def convert_dsc3d(
         work = store / PARTIAL / file_name(road.name)
         work.mkdir(parents=True, exist_ok=True)
         write_map(work / _MAP, road)
-        job = _Job(source, work, config, digest(work / _MAP))
+        job = _Job(source, work, config, digest(work / _MAP), last)
         good = [name for name in names if name not in skipped]
         kept = job.kept(read_report(store, road.name), good)
         staged = [name for name in good if job.is_staged(name) and name not in kept]
@@ -250,12 +252,35 @@ def _refuse_all(source: Site, read: dict[str, _Broken]) -> None:
     )
 
 
-def _moving_vehicles(source: Site, config: ConversionConfig) -> Callable[[str], Any]:
-    return partial(_moving_in, source, config)
+class _LastRead:
+    """Keeps a recording from the first reading to the second, where one process does both."""
+
+    def __init__(self) -> None:
+        self.found: tuple[str, Annotations] | None = None
+
+    def __reduce__(self) -> tuple[type["_LastRead"], tuple[()]]:
+        """Recordings do not travel between processes."""
+        return type(self), ()
+
+    def take(self, name: str) -> Annotations | None:
+        """The recording, if it is the one that was kept; nothing is kept any more."""
+        found, self.found = self.found, None
+        return found[1] if found is not None and found[0] == name else None
 
 
-def _moving_in(source: Site, config: ConversionConfig, name: str) -> FloatArray | _Broken:
+def _moving_vehicles(
+    source: Site, config: ConversionConfig, last: _LastRead
+) -> Callable[[str], Any]:
+    return partial(_moving_in, source, config, last)
+
+
+def _moving_in(
+    source: Site, config: ConversionConfig, last: _LastRead, name: str
+) -> FloatArray | _Broken:
+    last.found = None  # before the next one is read: two would not fit
     recording = _try_read(source, name, config)
+    if not isinstance(recording, _Broken):
+        last.found = name, recording
     return recording if isinstance(recording, _Broken) else moving_vehicles(recording)
 
 
@@ -334,6 +359,7 @@ class _Job:
     work: Path
     config: ConversionConfig
     map_digest: str
+    last: _LastRead
 
     def key(self, name: str) -> str:
         """Equal where the result is equal."""
@@ -382,7 +408,7 @@ class _Converter:
     def __call__(self, name: str) -> _Broken | None:
         """Convert one recording; the folder appears when it is complete."""
         job = self.job
-        recording = _try_read(job.source, name, job.config)
+        recording = job.last.take(name) or _try_read(job.source, name, job.config)
         if isinstance(recording, _Broken):
             return recording
         result = convert_recording(recording, self.road, job.source.offset[:2], job.config)

@@ -393,7 +393,7 @@ def _track_sizes(
     varying = (np.abs(sizes - sizes[first][track]) > 1e-3).any(axis=1)
     out = sizes[first].copy()
     changed = np.unique(track[varying])
-    for axis in range(sizes.shape[1]):
+    for axis in range(sizes.shape[1] if len(changed) else 0):
         out[changed, axis] = track_medians(sizes[:, axis], track)[changed]
     count(warnings, "tracks of varying size (median taken)", len(changed))
     return out

@@ -1,7 +1,8 @@
 """Conversion of a crowded recording: pytest benchmarks/speed/test_convert.py.
 
-Ten minutes at 12.5 Hz with 200 vehicles that are there all the time and move in stop-and-go: every
-one of them is an ego in every window, more scenarios than any real recording of that length has.
+Ten minutes at 12.5 Hz with 200 tracks that are there all the time: 100 vehicles in stop-and-go, 60
+parked ones and 40 pedestrians. Each moving vehicle is an ego in every window: that makes more
+scenarios than any real recording of that length has.
 """
 
 import json
@@ -67,20 +68,23 @@ def _boxes(count: int) -> pa.Table:
     frame, track = (part.ravel() for part in np.meshgrid(np.arange(count), track, indexing="ij"))
     road, side, place = track // 10, np.where(track % 2, 1.0, -1.0), track // 2 % PER_LANE
     time = frame * PERIOD
-    speed = 0.6 + 0.6 * np.sin(0.4 * time + track)
-    driven = 0.6 * time + 1.5 * (np.cos(track) - np.cos(0.4 * time + track))
+    kind = np.array([0] * 5 + [1] * 3 + [2] * 2)[track // 2 % 10]  # drives, parks, walks
+    moves = kind != 1
+    speed = moves * (0.6 + 0.6 * np.sin(0.4 * time + track))
+    driven = moves * (0.6 * time + 1.5 * (np.cos(track) - np.cos(0.4 * time + track)))
+    beside = np.array([1.75, 5.5, 8.0])[kind] * side
     along = 5.0 + GAP * place + driven
     along = np.where(side > 0, LENGTH - along, along)
     zero = np.zeros(len(track))
     columns = {
         "frame_id": pa.array(2 * frame, pa.uint32()),
         "track_id": pa.array(track, pa.uint32()),
-        "category": pa.array(np.full(len(track), "car")).dictionary_encode(),
+        "category": pa.array(np.array(["car", "car", "pedestrian"])[kind]).dictionary_encode(),
     }
     groups = {
-        "translation": (along, SPACING * road + 1.75 * side, zero),
+        "translation": (along, SPACING * road + beside, zero),
         "rotation": (zero, zero, np.where(side > 0, np.pi - 1e-9, 0.0)),
-        "dimension": (zero + 4.5, zero + 1.9, zero + 1.5),
+        "dimension": (*np.array([[4.5, 1.9], [4.5, 1.9], [0.6, 0.6]])[kind].T, zero + 1.5),
         "velocity": (-speed * side, zero, zero),
     }
     for name, values in groups.items():
