@@ -6,14 +6,9 @@ moves into the store at the end. So recordings may be spread over processes, a c
 killed goes on with those that it lacks, and the bytes are the same each time.
 """
 
-import hashlib
-import json
-import os
 import shutil
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,28 +17,33 @@ from typing import Any, Protocol
 import numpy as np
 import pyproj
 
-from shiftsim import __version__
 from shiftsim.arrays import FloatArray
-from shiftsim.data import schema
-from shiftsim.data.deepplan_recording import RecordingSummary, convert_recording
+from shiftsim.data.deepplan_parts import (
+    MAP_FILE,
+    Broken,
+    Converter,
+    Job,
+    LastRead,
+    alone_in,
+    try_read,
+)
+from shiftsim.data.deepplan_recording import RecordingSummary
 from shiftsim.data.deepplan_route import place_on_map
 from shiftsim.data.deepplan_windows import ConversionConfig
-from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site, read_recording
+from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site
 from shiftsim.data.opendrive import read_opendrive
 from shiftsim.data.opendrive_map import build_road_map
 from shiftsim.data.opendrive_records import OpenDrive
-from shiftsim.data.store import PARTIAL, StoreWriter, read_report, window_row
+from shiftsim.data.store import PARTIAL, StoreWriter, read_report
 from shiftsim.data.store_files import digest, file_name
-from shiftsim.data.store_map import read_map_file, write_map
-from shiftsim.data.store_tracks import write_ego, write_recording
-from shiftsim.errors import ConversionError, DataError
+from shiftsim.data.store_map import write_map
+from shiftsim.errors import ConversionError
 from shiftsim.map import VectorMap
 from shiftsim.state import AgentKind
 
 _MAX_FRAME_SHIFT = 0.5  # m between the map's own georeference and that of the annotations
 _MOVING = 1.0  # m/s
 _MAX_POINTS = 20_000  # of a recording that tell where the map lies
-_MAP, _PART, _FILES = "map.parquet", "part.json", "files"
 
 Progress = Callable[[int, int, str], None]
 
@@ -115,17 +115,6 @@ class ConversionReport:
         return sum(summary.accepted for summary in self.recordings)
 
 
-@dataclass(frozen=True)
-class _Broken:
-    """A recording that cannot be converted."""
-
-    reason: str
-    hint: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.reason} ({self.hint})" if self.hint else self.reason
-
-
 def convert_dsc3d(
     src: Path,
     store: Path,
@@ -159,19 +148,19 @@ def convert_dsc3d(
     names = source.recordings
     show = progress or (lambda done, total, name: None)
     show(0, len(names), "")
-    last = _LastRead()
+    last = LastRead()
     look = partial(_moving_vehicles, source, config, last)
     read = _collect(spread, look, names, lambda name: None)
-    skipped = {name: str(found) for name, found in read.items() if isinstance(found, _Broken)}
+    skipped = {name: str(found) for name, found in read.items() if isinstance(found, Broken)}
     if len(skipped) == len(names):
         _refuse_all(source, read)
     share = check_placement(road, source, [p for p in read.values() if not _is_broken(p)], config)
-    with _alone_in(store):
+    with alone_in(store):
         writer = StoreWriter(store)
         work = store / PARTIAL / file_name(road.name)
         work.mkdir(parents=True, exist_ok=True)
-        write_map(work / _MAP, road)
-        job = _Job(source, work, config, digest(work / _MAP), last)
+        write_map(work / MAP_FILE, road)
+        job = Job(source, work, config, digest(work / MAP_FILE), last)
         good = [name for name in names if name not in skipped]
         kept = job.kept(read_report(store, road.name), good)
         staged = [name for name in good if job.is_staged(name) and name not in kept]
@@ -180,7 +169,7 @@ def convert_dsc3d(
         counted = iter(range(done + 1, len(names) + 1))
         made = _collect(
             spread,
-            partial(_Converter, job),
+            partial(Converter, job),
             [name for name in good if name not in kept and name not in staged],
             lambda name: show(next(counted), len(names), name),
         )
@@ -229,19 +218,19 @@ def _collect(
     names: Sequence[str],
     seen: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Result by name, in the order of the names, `_Broken` where the process died."""
+    """Result by name, in the order of the names, `Broken` where the process died."""
     found = {}
     for outcome in spread(make, names):
-        found[outcome.task] = _Broken(outcome.death) if outcome.death else outcome.result
+        found[outcome.task] = Broken(outcome.death) if outcome.death else outcome.result
         seen(outcome.task)
     return {name: found[name] for name in names}
 
 
 def _is_broken(result: object) -> bool:
-    return isinstance(result, _Broken)
+    return isinstance(result, Broken)
 
 
-def _refuse_all(source: Site, read: dict[str, _Broken]) -> None:
+def _refuse_all(source: Site, read: dict[str, Broken]) -> None:
     name, first = next(iter(read.items()))
     if len(read) == 1:
         raise ConversionError(first.reason, first.hint)
@@ -252,45 +241,20 @@ def _refuse_all(source: Site, read: dict[str, _Broken]) -> None:
     )
 
 
-class _LastRead:
-    """Keeps a recording from the first reading to the second, where one process does both."""
-
-    def __init__(self) -> None:
-        self.found: tuple[str, Annotations] | None = None
-
-    def __reduce__(self) -> tuple[type["_LastRead"], tuple[()]]:
-        """Recordings do not travel between processes."""
-        return type(self), ()
-
-    def take(self, name: str) -> Annotations | None:
-        """The recording, if it is the one that was kept; nothing is kept any more."""
-        found, self.found = self.found, None
-        return found[1] if found is not None and found[0] == name else None
-
-
 def _moving_vehicles(
-    source: Site, config: ConversionConfig, last: _LastRead
+    source: Site, config: ConversionConfig, last: LastRead
 ) -> Callable[[str], Any]:
     return partial(_moving_in, source, config, last)
 
 
 def _moving_in(
-    source: Site, config: ConversionConfig, last: _LastRead, name: str
-) -> FloatArray | _Broken:
+    source: Site, config: ConversionConfig, last: LastRead, name: str
+) -> FloatArray | Broken:
     last.found = None  # before the next one is read: two would not fit
-    recording = _try_read(source, name, config)
-    if not isinstance(recording, _Broken):
+    recording = try_read(source, name, config)
+    if not isinstance(recording, Broken):
         last.found = name, recording
-    return recording if isinstance(recording, _Broken) else moving_vehicles(recording)
-
-
-def _try_read(source: Site, name: str, config: ConversionConfig) -> Annotations | _Broken:
-    try:
-        return read_recording(source, name, config.category_map)
-    except DataError as error:
-        return _Broken(str(error).replace(f"{source.folder}{os.sep}", ""), error.hint)
-    except MemoryError:
-        return _Broken("it does not fit into memory", "split the recording")
+    return recording if isinstance(recording, Broken) else moving_vehicles(recording)
 
 
 def moving_vehicles(recording: Annotations) -> FloatArray:
@@ -328,110 +292,9 @@ def check_placement(
     return found.share
 
 
-@contextmanager
-def _alone_in(store: Path) -> Iterator[None]:
-    """Keeps other conversions out of a store; the system ends that with this process."""
-    store.mkdir(parents=True, exist_ok=True)
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    handle = os.open(store, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise DataError(
-            f"{store}: another conversion writes to this store", "wait until it has finished"
-        ) from error
-    try:
-        yield
-    finally:
-        os.close(handle)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What the conversion of each recording of a site depends on, and where it is put."""
-
-    source: Site
-    work: Path
-    config: ConversionConfig
-    map_digest: str
-    last: _LastRead
-
-    def key(self, name: str) -> str:
-        """Equal where the result is equal."""
-        folder = self.source.folder / "annotations" / name
-        depends = {
-            "version": [__version__, schema.VERSION],
-            "site": [self.work.name, *self.source.offset.tolist()],
-            "rate": [self.source.frame_rate, self.source.frame_distance],
-            "config": asdict(self.config),
-            "map": self.map_digest,
-            "files": [digest(folder / f"{part}.parquet") for part in ("annotations", "frames")],
-        }
-        return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
-
-    def folder(self, name: str) -> Path:
-        """Where the result is until the end."""
-        return self.work / file_name(name)
-
-    def is_staged(self, name: str) -> bool:
-        """Whether an interrupted conversion left the result."""
-        try:
-            part = json.loads((self.folder(name) / _PART).read_text("utf-8"))
-            return bool(part["key"] == self.key(name)) and (self.folder(name) / _FILES).is_dir()
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
-
-    def kept(self, report: dict[str, Any], names: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """What the store holds already, by name."""
-        before = report.get("recordings", {})
-        return {n: before[n] for n in names if n in before and before[n]["key"] == self.key(n)}
-
-    def merge(self, name: str, writer: StoreWriter) -> dict[str, Any]:
-        """Move a result into the store."""
-        part = json.loads((self.folder(name) / _PART).read_text("utf-8"))
-        writer.take_recording(self.folder(name) / _FILES, part["log_name"], part["windows"])
-        return {"key": part["key"], "summary": part["summary"]}
-
-
-class _Converter:
-    """Converts recordings of one site, each into a folder of its own."""
-
-    def __init__(self, job: _Job) -> None:
-        self.job = job
-        self.road = read_map_file(job.work / _MAP)
-
-    def __call__(self, name: str) -> _Broken | None:
-        """Convert one recording; the folder appears when it is complete."""
-        job = self.job
-        recording = job.last.take(name) or _try_read(job.source, name, job.config)
-        if isinstance(recording, _Broken):
-            return recording
-        result = convert_recording(recording, self.road, job.source.offset[:2], job.config)
-        # A process that outlives a killed conversion writes beside its successor, never into it.
-        draft = Path(tempfile.mkdtemp(prefix=".", dir=job.work))
-        write_recording(draft / _FILES, result.recording)
-        for ego in result.egos:
-            write_ego(draft / _FILES, ego)
-        content = {
-            "key": job.key(name),
-            "log_name": result.recording.log_name,
-            "summary": asdict(result.summary),
-            "windows": [window_row(window, self.road.name) for window in result.windows],
-        }
-        (draft / _PART).write_text(json.dumps(content), "utf-8")
-        shutil.rmtree(job.folder(name), ignore_errors=True)
-        os.replace(draft, job.folder(name))
-        return None
-
-
 def _report_content(
     source: Site,
-    job: _Job,
+    job: Job,
     road: VectorMap,
     share: float,
     warnings: dict[str, int],
