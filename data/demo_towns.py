@@ -110,11 +110,11 @@ def avenue_town() -> Town:
             3.25, 50.0, 3, junctions=(102, 0),
         ),
         Street(
-            "north", 4, _outward(-70, 0, _NORTH, 20.0), (line(70.0),), 3.5, 30.0,
+            "north", 4, _outward(-70, 0, _NORTH, 20.0), (line(70.0),), 4.0, 30.0,
             is_main=False, junctions=(101, 0), crossings=_SQUARE, has_stop_sign=True,
         ),
         Street(
-            "south", 5, _outward(70, 0, _SOUTH, 20.0), (line(70.0),), 3.5, 30.0,
+            "south", 5, _outward(70, 0, _SOUTH, 20.0), (line(70.0),), 4.0, 30.0,
             is_main=False, junctions=(102, 0), crossings=_SQUARE, has_stop_sign=True,
         ),
     )  # fmt: skip

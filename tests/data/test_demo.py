@@ -4,23 +4,37 @@ import numpy as np
 import pytest
 
 from shiftsim.data.deepplan_windows import overlap_partners
+from shiftsim.data.demo_paths import STEP
+from shiftsim.data.demo_towns import avenue_town, parking_town
 from shiftsim.data.dsc3d import open_site, read_recording
 from shiftsim.data.store import ScenarioStore
-from shiftsim.data.synthetic import bench_scene, demo_store, write_demo
+from shiftsim.data.synthetic import bench_scene, convert_demo, demo_store, write_demo
+from shiftsim.filtering import FilterConfig, judge_scenario
 from shiftsim.metrics import compute_metrics
+from shiftsim.planners import load_planner
 from shiftsim.simulation import simulate
+from shiftsim.splits import find_split
+
+TOWNS = ("avenue", "junction", "parking", "roundabout", "shared", "street")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     write_demo(folder)
     return folder
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    return ScenarioStore(demo_store(tmp_path_factory.mktemp("store") / "demo"))
+@pytest.fixture(scope="session")
+def store(recordings, tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "demo"
+    convert_demo(recordings, path)
+    return ScenarioStore(path)
+
+
+@pytest.fixture(scope="session")
+def verdicts(store):
+    return [judge_scenario(scene, FilterConfig()) for scene in store]
 
 
 def _read_all(folder):
@@ -67,14 +81,49 @@ def test_all_kinds_of_agents_and_of_geometry_occur(recordings):
     assert all(f"<{shape}" in xml for shape in ("line", "arc", "spiral", "paramPoly3"))
 
 
-def test_log_playback_of_the_demo_scores_well_and_hits_nobody(store):
-    results = [
-        compute_metrics(simulate(scene, None, controller="log-playback"), scene.map)
-        for scene in store
+def test_most_scenarios_of_the_demo_pass_the_filter_and_none_hits_anybody(verdicts):
+    accepted = [row for row in verdicts if row["verdict"] == "accepted"]
+    reasons = {row["reason"] for row in verdicts} - {"", None}
+    assert len(accepted) >= 60
+    assert reasons <= {"path too short"}
+
+
+def test_the_small_split_samples_every_town_and_passes_the_filter(store, verdicts):
+    split = find_split("demo-mini", store.path, store.tokens)
+    accepted = {row["token"] for row in verdicts if row["verdict"] == "accepted"}
+    assert len(split.tokens) == 16
+    assert set(split.tokens) <= accepted
+    assert {store.read(token).city for token in split.tokens} == set(TOWNS) == set(store.cities)
+
+
+@pytest.mark.slow
+def test_better_planners_score_higher_in_every_demo(store):
+    tokens = find_split("demo-mini", store.path, store.tokens).tokens
+    means = [
+        np.mean(
+            [
+                compute_metrics(simulate(scene, load_planner(name)), scene.map).score
+                for scene in map(store.read, tokens)
+            ]
+        )
+        for name in ("log-future", "idm", "constant-velocity")
     ]
-    assert 12 <= len(results) <= 24
-    assert np.mean([result.score for result in results]) > 0.9
-    assert all(result.scores["no_ego_at_fault_collisions"] == 1.0 for result in results)
+    assert means[0] > means[1] > means[2] + 0.3
+
+
+@pytest.mark.parametrize("way", ["west1>2-mid-east", "east3-mid-west", "west1-mid>2-east"])
+def test_a_way_is_smooth_and_keeps_to_the_lanes_it_names(way):
+    path = avenue_town().path(way)
+    assert np.abs(np.diff(path.points[:, 2])).max() < 0.05
+    np.testing.assert_allclose(np.hypot(*np.diff(path.points[:, :2], axis=0).T), STEP, atol=0.01)
+    assert [zone.entry < zone.exit for zone in path.zones] == [True, True]
+
+
+def test_a_way_into_a_parking_space_ends_there():
+    town = parking_town()
+    end = town.path("west1-lot@4").points[-1]
+    np.testing.assert_allclose(end[:2], town.bays["lot"][4][:2], atol=0.6)
+    assert abs(end[2] - town.bays["lot"][4][2]) < 0.15
 
 
 def test_every_demo_route_has_two_blocks(store):
