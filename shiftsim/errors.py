@@ -33,6 +33,10 @@ class MapError(DataError):
     """The map lacks what is needed here."""
 
 
+class TrafficError(ShiftsimError):
+    """A traffic model cannot go on with a scenario."""
+
+
 class PlannerError(ShiftsimError):
     """A planner failed or returned something invalid."""
 

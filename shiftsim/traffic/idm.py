@@ -2,7 +2,9 @@
 
 Equal to nuPlan's IDM agents, oddities included (nuplan-simulation.md §10): bicycles, late vehicles
 and vehicles off the lanes vanish, replayed objects count as standing, gaps are measured between
-footprints that reach 1.5 s ahead, and agents react to the ego of the iteration before.
+footprints that reach 1.5 s ahead, and agents react to the ego of the iteration before. Where
+nuPlan's simulation fails, this one raises a TrafficError: an agent is outside of the corridor along
+its own path (§12 Q13), or starts on a baseline too short to be a path.
 """
 
 from dataclasses import dataclass
@@ -80,7 +82,13 @@ class IdmTraffic:
                 geometry.boxes_to_corners(center_poses(ego[None, :3]), _EGO_SIZE[None]),
             ]
         )
-        starts = place_agents(scenario.map, poses[vehicles], sizes[vehicles], taken)
+        starts = place_agents(
+            scenario.map,
+            poses[vehicles],
+            sizes[vehicles],
+            taken,
+            skip_short=parameters.replay_rest,
+        )
         placed = [start for start in starts if start is not None]
         agents = vehicles[np.array([start is not None for start in starts], np.bool_)]
         velocity = tracks.velocities[row, agents]
@@ -90,14 +98,16 @@ class IdmTraffic:
         others = np.ones(len(kinds), np.bool_)
         others[agents] = False
         replayed = others if parameters.replay_rest else open_loop
-        self._scene = make_scene(
-            scenario,
-            fleet,
-            placed,
-            agents,
-            np.flatnonzero(replayed),
-            moving=parameters.replay_rest,
+        driving = Driving(
+            parameters.min_gap,
+            parameters.headway,
+            parameters.accel_max,
+            parameters.decel_max,
+            parameters.min_path_length,
+            parameters.radius,
+            mended=parameters.replay_rest,
         )
+        self._scene = make_scene(scenario, fleet, placed, agents, np.flatnonzero(replayed), driving)
         forget(tracks, row, ~replayed)
         self._scene.write(tracks, row)
 
@@ -105,10 +115,7 @@ class IdmTraffic:
         """Move the agents; replayed objects and lights are those of the next iteration."""
         if self._scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
-        p = self.parameters
-        driving = Driving(p.min_gap, p.headway, p.accel_max, p.decel_max)
-        self._scene.advance(iteration, ego, tracks, row, driving, p.min_path_length, p.radius)
-        self._scene.write(tracks, row)
+        self._scene.advance(iteration, ego, tracks, row)
 
     @property
     def routes(self) -> dict[int, list[int]]:

@@ -11,6 +11,7 @@ import shapely
 
 from shiftsim import geometry
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.errors import TrafficError
 from shiftsim.map import VectorMap
 from shiftsim.traffic.idm_paths import (
     MAX_ROUTE,
@@ -79,6 +80,8 @@ def place_agents(
     poses: FloatArray,
     sizes: FloatArray,
     taken: FloatArray,
+    *,
+    skip_short: bool = False,
 ) -> list[Start | None]:
     """Starts of vehicles that can be simulated, in order; None for the others.
 
@@ -87,22 +90,31 @@ def place_agents(
         poses: (N, 3) logged box centres x [m], y [m], heading [rad].
         sizes: (N, 2) length, width [m].
         taken: (M, 4, 2) corners of boxes that must stay free, such as the ego's [m].
+        skip_short: Whether a vehicle on a baseline too short to be a path is dropped.
 
     Returns:
         N starts. A start whose box touches a taken box, or that of an earlier agent, is dropped.
+
+    Raises:
+        TrafficError: A vehicle starts on a baseline too short to be a path.
     """
     occupied = list(taken)
     out: list[Start | None] = []
     for pose, size in zip(poses, sizes, strict=True):
         start = find_start(road, pose)
+        corners = geometry.boxes_to_corners(pose if start is None else start.pose, size)
+        if start is not None and any(geometry.convex_intersect(corners, o) for o in occupied):
+            start = None
         if start is not None and len(road.baselines.at(start.edge)) < _MIN_VERTICES:
-            start = None  # nuPlan: the simulation fails
+            if not skip_short:
+                raise TrafficError(
+                    f"map {road.name}: the baseline of {road.edges.ids[start.edge]}, on which a "
+                    f"vehicle starts, has fewer than {_MIN_VERTICES} vertices",
+                    hint="nuPlan fails here as well; --traffic reactive-fixed goes on",
+                )
+            start = None
         if start is not None:
-            corners = geometry.boxes_to_corners(start.pose, size)
-            if any(geometry.convex_intersect(corners, other) for other in occupied):
-                start = None
-            else:
-                occupied.append(corners)
+            occupied.append(corners)
         out.append(start)
     return out
 

@@ -41,7 +41,7 @@ def buffer_curve(line: FloatArray, size: int, distance: float, keep: BoolArray, 
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
     """
-    count = 0
+    count = np.int64(0)  # not a literal, for which kernels would be compiled a second time
     for side in range(2):
         _simplify(line, size, distance * _SIMPLIFY, side == 0, keep)
         count = _offset_side(line, size, distance, side == 0, keep, out, count)
@@ -63,7 +63,7 @@ def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: B
     changed = True
     while changed:
         changed = False
-        index = _next_kept(keep, size, 0)
+        index = _next_kept(keep, size, np.int64(0))
         middle = _next_kept(keep, size, index)
         last = _next_kept(keep, size, middle)
         while last < size:

@@ -5,33 +5,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.errors import TrafficError
 from shiftsim.layers import Polygons
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
-from shiftsim.state import (
-    HEADING,
-    PACIFICA,
-    VX,
-    VY,
-    LightStatus,
-    Tracks,
-    center_poses,
-)
+from shiftsim.state import LightStatus, Tracks
 from shiftsim.traffic.idm_agents import Start, more_room
 from shiftsim.traffic.idm_buffer import curve_room
+from shiftsim.traffic.idm_footprints import Obstacles, Scratch, move_agent, set_box
 from shiftsim.traffic.idm_paths import Fleet, Roads
 from shiftsim.traffic.idm_shapes import PIECE
 from shiftsim.traffic.idm_step import (
+    DONE,
+    LONGER_CURVES,
+    LONGER_PATHS,
+    STRAYED,
     Driving,
-    Obstacles,
-    Scratch,
-    extend_routes,
-    move_agent,
-    place_replayed,
-    remove_far,
-    set_box,
-    set_speeds,
-    step_agents,
+    Row,
+    advance,
     write_agents,
 )
 
@@ -55,7 +46,7 @@ class Scene:
         lights: (T, C) LightStatus codes at the iterations.
         status: (E,) LightStatus codes of the present step.
         spans: (T - 1,) length of each step [s].
-        moving: Whether agents know the speed of replayed tracks.
+        driving: Parameters.
     """
 
     fleet: Fleet
@@ -69,82 +60,67 @@ class Scene:
     lights: IntArray
     status: IntArray
     spans: FloatArray
-    moving: bool
+    driving: Driving
 
-    def advance(
-        self,
-        iteration: int,
-        ego: FloatArray,
-        tracks: Tracks,
-        row: int,
-        driving: Driving,
-        min_path_length: float,
-        radius: float,
-    ) -> None:
-        """Move the agents from one iteration to the next.
+    def advance(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move the agents from one iteration to the next and write where they are.
 
         Args:
             iteration: The iteration that ends.
             ego: (11,) ego state at that iteration.
             tracks: Holds the replayed tracks.
             row: Row of `tracks` of the next iteration.
-            driving: Parameters of the policy.
-            min_path_length: Path kept ahead at standstill [m].
-            radius: Agents farther from the ego are removed [m].
+
+        Raises:
+            TrafficError: An agent is outside of its own corridor.
         """
         # nuPlan: the ego is one step old, lights and replayed objects are one step ahead (§12 Q11)
-        center = center_poses(ego[None, : HEADING + 1])[0]
-        count = self._place(ego, center, tracks, row)
-        remove_far(self.fleet, self.obstacles, center[0], center[1], radius)
         self.status[self.light_edges] = self.lights[iteration + 1]
-        while needed := extend_routes(
-            self.fleet, self.roads, self.status, min_path_length, driving.headway
-        ):
-            self.fleet = more_room(self.fleet, needed)
-            self.scratch = make_scratch(self.fleet, len(self.obstacles.present))
-        agent = -1
-        while (agent := self._step(agent + 1, count, iteration, driving)) < len(self.agents):
-            while move_agent(self.fleet, agent, self.obstacles, self.scratch, driving.headway) < 0:
+        first = 0
+        while True:
+            end, what = self._try_step(iteration, ego, row_of(tracks, row), first)
+            if end == DONE:
+                return
+            if end == STRAYED:
+                raise TrafficError(
+                    f"reactive agent {tracks.tokens[self.agents[what]]} is outside of its own path "
+                    f"at iteration {iteration + 1}",
+                    hint="nuPlan fails here as well; --traffic reactive-fixed goes on",
+                )
+            if end == LONGER_PATHS:
+                self.fleet = more_room(self.fleet, what)
+                self.scratch = make_scratch(self.fleet, self.stops, len(self.obstacles.present))
+            while end == LONGER_CURVES and self._move(what) < 0:
                 self.obstacles = _longer_curves(self.obstacles)
+            first = what + 1 if end == LONGER_CURVES else 0
 
-    def _step(self, first: int, count: int, iteration: int, driving: Driving) -> int:
-        agent: int = step_agents(
+    def _try_step(self, iteration: int, ego: FloatArray, row: Row, first: int) -> tuple[int, int]:
+        end: tuple[int, int] = advance(
             self.fleet,
+            self.agents,
+            self.replayed,
             self.obstacles,
-            count,
             self.roads,
             self.stops,
             self.status,
-            driving,
+            self.driving,
+            ego,
+            row,
             self.spans[iteration],
             self.scratch,
             first,
         )
-        return agent
+        return end
 
-    def _place(self, ego: FloatArray, center: FloatArray, tracks: Tracks, row: int) -> int:
-        """Put ego and replayed tracks among the obstacles; returns how many obstacles count."""
-        obstacles, first = self.obstacles, len(self.agents) + 1
-        set_box(obstacles, first - 1, *center, PACIFICA.length, PACIFICA.width)
-        obstacles.speed[first - 1] = np.hypot(ego[VX], ego[VY])
-        valid, velocities = tracks.valid[row], tracks.velocities[row]
-        count: int = place_replayed(
-            obstacles, first, self.replayed, valid, tracks.poses[row], tracks.sizes[row]
+    def _move(self, agent: int) -> int:
+        made: int = move_agent(
+            self.fleet, agent, self.obstacles, self.scratch, self.driving.headway
         )
-        if self.moving:
-            set_speeds(obstacles, first, self.replayed, valid, velocities)
-        return count
+        return made
 
     def write(self, tracks: Tracks, row: int) -> None:
         """Write the agents into a row; those that are gone are not valid there."""
-        write_agents(
-            self.fleet,
-            self.agents,
-            tracks.valid[row],
-            tracks.poses[row],
-            tracks.velocities[row],
-            tracks.sizes[row],
-        )
+        write_agents(self.fleet, self.agents, row_of(tracks, row))
 
 
 def make_scene(
@@ -153,8 +129,7 @@ def make_scene(
     starts: list[Start],
     agents: IntArray,
     replayed: IntArray,
-    *,
-    moving: bool,
+    driving: Driving,
 ) -> Scene:
     """The scene at iteration 0.
 
@@ -164,7 +139,7 @@ def make_scene(
         starts: Where they are on the map.
         agents: (A,) their tracks.
         replayed: (R,) tracks that are replayed from the log.
-        moving: Whether agents know the speed of replayed tracks.
+        driving: Parameters.
     """
     road, count = scenario.map, len(agents)
     obstacles = _make_obstacles(count, count + 1 + len(replayed))
@@ -183,13 +158,18 @@ def make_scene(
         roads=roads_of(road),
         stops=road.stop_polygons.polygons,
         obstacles=obstacles,
-        scratch=make_scratch(fleet, len(obstacles.present)),
+        scratch=make_scratch(fleet, road.stop_polygons.polygons, len(obstacles.present)),
         light_edges=np.array(edges, np.int64),
         lights=lights.status[scenario.iteration_rows][:, known].astype(np.int64),
         status=np.full(len(road.edges), LightStatus.ABSENT, np.int64),
         spans=np.diff(seconds),
-        moving=moving,
+        driving=driving,
     )
+
+
+def row_of(tracks: Tracks, row: int) -> Row:
+    """One row of tracks as kernels take it."""
+    return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
 
 
 def roads_of(road: VectorMap) -> Roads:
@@ -203,7 +183,7 @@ def roads_of(road: VectorMap) -> Roads:
     )
 
 
-def make_scratch(fleet: Fleet, num_obstacles: int) -> Scratch:
+def make_scratch(fleet: Fleet, stops: Polygons, num_obstacles: int) -> Scratch:
     """Room for the kernels, enough for the longest path of the fleet."""
     points = fleet.path.shape[1] + _EXTRA_POINTS
     return Scratch(
@@ -212,6 +192,9 @@ def make_scratch(fleet: Fleet, num_obstacles: int) -> Scratch:
         pieces=np.zeros((points // PIECE + 1, 4)),
         corridor=np.zeros((curve_room(points), 2)),
         hits=np.zeros(num_obstacles, np.int64),
+        apart=np.zeros(num_obstacles),
+        stop=np.zeros((np.diff(stops.ring_ptr).max(initial=0), 2)),
+        stop_bounds=np.zeros(4),
     )
 
 

@@ -148,12 +148,36 @@ def _edge_gap(
         ):
             if segments_meet(px, py, qx, qy, rx, ry, sx, sy):
                 return 0.0
-            best = min(best, point_segment_distance(px, py, rx, ry, sx, sy))
-            best = min(best, point_segment_distance(qx, qy, rx, ry, sx, sy))
-            best = min(best, point_segment_distance(rx, ry, px, py, qx, qy))
-            best = min(best, point_segment_distance(sx, sy, px, py, qx, qy))
+            best = _nearer(px, py, rx, ry, sx, sy, best)
+            best = _nearer(qx, qy, rx, ry, sx, sy, best)
+            best = _nearer(rx, ry, px, py, qx, qy, best)
+            best = _nearer(sx, sy, px, py, qx, qy, best)
         rx, ry = sx, sy
     return best
+
+
+@kernel
+def _nearer(x: float, y: float, ax: float, ay: float, bx: float, by: float, best: float) -> float:
+    """Distance from a point to the segment a-b where it is less than `best`, else `best` [m]."""
+    if _square_distance(x, y, ax, ay, bx, by) * (1.0 - 1e-9) >= best * best:
+        return best  # most often, and without a root
+    distance = point_segment_distance(x, y, ax, ay, bx, by)
+    return distance if distance < best else best
+
+
+@kernel
+def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
+    """Square of the distance from a point to the segment a-b, up to rounding [m^2]."""
+    dx, dy = bx - ax, by - ay
+    ex, ey = x - ax, y - ay
+    along = ex * dx + ey * dy
+    if along <= 0.0:
+        return ex * ex + ey * ey
+    square = dx * dx + dy * dy
+    if along >= square:
+        return (x - bx) * (x - bx) + (y - by) * (y - by)
+    cross = ex * dy - ey * dx
+    return cross * cross / square
 
 
 @kernel
@@ -166,10 +190,13 @@ def bound_pieces(line: FloatArray, size: int, pieces: FloatArray) -> None:
         pieces: (C, 4) min x, min y, max x, max y of `PIECE` segments each [m].
     """
     for piece in range(num_pieces(size)):
-        bounds = pieces[piece]
-        bounds[0], bounds[1], bounds[2], bounds[3] = np.inf, np.inf, -np.inf, -np.inf
-        first = piece * PIECE
-        ring_bounds(line[first:], min(PIECE + 1, size - first), bounds)
+        low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+        for vertex in range(piece * PIECE, min((piece + 1) * PIECE + 1, size)):
+            x, y = line[vertex, 0], line[vertex, 1]
+            low_x, low_y = min(low_x, x), min(low_y, y)
+            high_x, high_y = max(high_x, x), max(high_y, y)
+        pieces[piece, 0], pieces[piece, 1] = low_x, low_y
+        pieces[piece, 2], pieces[piece, 3] = high_x, high_y
 
 
 @kernel
@@ -264,7 +291,7 @@ def _touches_segment(
     low_x, high_x = min(px, qx) - outer, max(px, qx) + outer
     low_y, high_y = min(py, qy) - outer, max(py, qy) + outer
     dx, dy = qx - px, qy - py
-    square = dx * dx + dy * dy
+    square, limit = dx * dx + dy * dy, outer * outer
     answer = APART
     rx, ry = ring[size - 1, 0], ring[size - 1, 1]
     for vertex in range(size):
@@ -278,12 +305,12 @@ def _touches_segment(
             if segments_meet(px, py, qx, qy, rx, ry, sx, sy):
                 return MEETING
             along = (sx - px) * dx + (sy - py) * dy
-            distance = point_segment_distance(sx, sy, px, py, qx, qy)
-            if distance < inner and 0.0 < along < square:
+            nearest = _square_distance(sx, sy, px, py, qx, qy)
+            if nearest < inner * inner and 0.0 < along < square:
                 return MEETING  # beside the segment, within its part of the buffer
-            distance = min(distance, point_segment_distance(px, py, rx, ry, sx, sy))
-            distance = min(distance, point_segment_distance(qx, qy, rx, ry, sx, sy))
-            if distance < outer:
+            near_p = _square_distance(px, py, rx, ry, sx, sy)
+            near_q = _square_distance(qx, qy, rx, ry, sx, sy)
+            if nearest < limit or near_p < limit or near_q < limit:
                 answer = UNSURE
         rx, ry = sx, sy
     return answer
