@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks, straight_road
 
+from shiftsim.errors import TrafficError
+from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.scenario import Scenario
 from shiftsim.state import AgentKind, Tracks
 from shiftsim.traffic import make_traffic
@@ -20,6 +23,8 @@ from shiftsim.verify.report import Report
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "idm_worlds"
 VEHICLE, BICYCLE = AgentKind.VEHICLE, AgentKind.BICYCLE
 PEDESTRIAN, CONE = AgentKind.PEDESTRIAN, AgentKind.TRAFFIC_CONE
+TURNED = [VEHICLE, VEHICLE, VEHICLE, PEDESTRIAN, CONE]
+SIDES = {"left": 1.75, "middle": 0.0, "right": -1.75}  # of a lane, m
 ROWS = 60 + 2 * 150 + 1 + 160  # of a cruise scenario
 
 
@@ -176,6 +181,79 @@ def test_translation_of_the_world_moves_the_agents_along(offset: tuple[float, fl
 
     np.testing.assert_array_equal(here.valid, there.valid)
     np.testing.assert_allclose(there.poses - np.array([*offset, 0.0]), here.poses, atol=1e-6)
+
+
+def turned(points: np.ndarray, angle: float) -> np.ndarray:
+    """Points (..., 2) turned around the origin."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, sin], [-sin, cos]])
+
+
+def turned_road(angle: float, *, spacing: float = 1.0) -> VectorMap:
+    """One lane of 300 m in the direction `angle`; no two lanes overlap, so no heading decides."""
+    x = np.arange(0.0, 300.0 + spacing / 2, spacing)
+    sides = {name: turned(np.c_[x, np.full_like(x, y)], angle) for name, y in SIDES.items()}
+    area = shapely.Polygon(np.concatenate([sides["left"], sides["right"][::-1]]))
+    lane = EdgeSpec(
+        id="1",
+        is_connector=False,
+        polygon=area,
+        baseline=sides["middle"],
+        block_id="9",
+        incoming=[],
+        outgoing=[],
+        left=sides["left"],
+        right=sides["right"],
+        speed_limit=15.0,
+        lane_index=0,
+        left_lane=None,
+        right_lane=None,
+        intersection_id=None,
+    )
+    block = BlockSpec(id="9", is_connector=False, polygon=area, incoming=[], outgoing=[])
+    areas = [AreaSpec("90", area)]
+    return build_map("turned", edges=[lane], blocks=[block], intersections=[], drivable_areas=areas)
+
+
+def turned_scene(angle: float) -> Scenario:
+    """Three vehicles, a pedestrian beside them and a cone ahead, in the direction `angle`."""
+    poses = np.array([(40.0, 0.2, 0.0), (60.0, 0.1, 0.0), (90.0, -0.2, 0.0), (75.0, 2.4, 0.5)])
+    poses = np.concatenate([poses, [(140.0, 0.3, 1.0)]])
+    tracks = standing_tracks(ROWS, np.c_[turned(poses[:, :2], angle), poses[:, 2] + angle], TURNED)
+    tracks.velocities[:] += 4.0 * np.array([np.cos(angle), np.sin(angle)])
+    start = (10.0 * np.cos(angle), 10.0 * np.sin(angle), angle)
+    return cruise_scenario(speed=0.0, tracks=tracks, road=turned_road(angle), start=start)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.5, -2.2])
+def test_turning_the_world_turns_the_agents(angle: float) -> None:
+    here, there = drive(turned_scene(0.0)), drive(turned_scene(angle))
+
+    np.testing.assert_array_equal(here.valid, there.valid)
+    moved = turned(here.poses[..., :2], angle)
+    np.testing.assert_allclose(there.poses[..., :2], moved, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*there.velocities.T), np.hypot(*here.velocities.T))
+
+
+def test_start_on_a_baseline_too_short_for_a_path_fails_the_scenario() -> None:
+    scenario = scene([(40.0, 0.0, 0.0)], [VEHICLE])
+    scenario = replace(scenario, map=turned_road(0.0, spacing=300.0))
+
+    with pytest.raises(TrafficError, match="baseline of 1"):
+        drive(scenario, steps=1)
+
+    assert drive(scenario, steps=1, traffic=FixedIdmTraffic()).valid[1].all()
+
+
+def test_agent_outside_of_its_own_corridor_fails_the_scenario() -> None:
+    scenario = scene([(250.0, 0.0, 0.0)], [VEHICLE])
+    scenario = replace(scenario, map=turned_road(0.0, spacing=100.0))
+    scenario = replace(scenario, ego=scenario.ego + np.eye(11)[0] * 200.0)
+
+    with pytest.raises(TrafficError, match="outside of its own path at iteration 1"):
+        drive(scenario, steps=1)
+
+    assert drive(scenario, steps=3, traffic=FixedIdmTraffic()).valid[3].all()
 
 
 @given(st.permutations([3, 4, 5, 6]))
