@@ -141,7 +141,9 @@ CHANGES: list[tuple[str, str, Callable[[Any], Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("table", "column", "new"), CHANGES, ids=lambda value: str(value)[:24])
+@pytest.mark.parametrize(
+    ("table", "column", "new"), CHANGES, ids=[f"{table}-{column}" for table, column, _ in CHANGES]
+)
 def test_a_changed_value_turns_the_report_red(
     copy: Path, maps: dict[str, VectorMap], table: str, column: str, new: Callable[[Any], Any]
 ) -> None:
