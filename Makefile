@@ -27,7 +27,7 @@ types: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s --benchmark-disable-gc --benchmark-columns=median,iqr
+	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s -p no:cacheprovider --benchmark-disable-gc --benchmark-columns=median,iqr
 
 verify: install
 	for folder in ../shared/reference/*/; do $(BIN)/shiftsim verify $$folder || exit 1; done

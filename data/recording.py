@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.data.track_order import order_of_columns
+from shiftsim.data.track_order import copy_columns, order_of_columns
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
 from shiftsim.state import Tracks, TrafficLights
@@ -125,11 +125,24 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     seen: BoolArray = np.any(tracks.valid, axis=0)
     if without in tracks.tokens:
         seen[tracks.tokens.index(without)] = False
-    if not seen.all():
-        tracks = tracks.select(seen)
-    order = order_of_columns(np.ascontiguousarray(tracks.valid), tracks.kinds)
-    unchanged = (order == np.arange(len(order))).all()
-    return tracks if unchanged else tracks.select(order)
+    index = np.flatnonzero(seen)
+    valid = tracks.valid if seen.all() else tracks.valid[:, index]
+    index = index[order_of_columns(np.ascontiguousarray(valid), tracks.kinds[index])]
+    if len(index) == len(seen) and (index == np.arange(len(seen))).all():
+        return tracks
+    shape = (len(valid), len(index))
+    chosen = Tracks(
+        np.empty(shape, np.bool_),
+        np.empty((*shape, 3)),
+        np.empty((*shape, 2)),
+        np.empty((*shape, 2)),
+        tracks.kinds[index],
+        tuple(tracks.tokens[i] for i in index.tolist()),
+    )
+    arrays = (chosen.valid, chosen.poses, chosen.velocities, chosen.sizes)
+    sources = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
+    copy_columns(index, *map(np.ascontiguousarray, sources), *arrays)
+    return chosen
 
 
 def listed_lights(lights: TrafficLights) -> TrafficLights:

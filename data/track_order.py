@@ -7,7 +7,7 @@ from a longer recording is ordered as if it had been read alone.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 
 
 def order_tracks(frame: IntArray, track: IntArray, kinds: IntArray) -> IntArray:
@@ -37,12 +37,39 @@ def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
 
 
 @kernel
+def copy_columns(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
+    index: IntArray,
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    out_valid: BoolArray,
+    out_poses: FloatArray,
+    out_velocities: FloatArray,
+    out_sizes: FloatArray,
+):
+    """Copy the tracks `index` (N',) of dense arrays (R, N, …) into others (R, N', …)."""
+    for row in range(valid.shape[0]):
+        for to in range(len(index)):
+            track = index[to]
+            out_valid[row, to] = valid[row, track]
+            out_poses[row, to, 0] = poses[row, track, 0]
+            out_poses[row, to, 1] = poses[row, track, 1]
+            out_poses[row, to, 2] = poses[row, track, 2]
+            out_velocities[row, to, 0] = velocities[row, track, 0]
+            out_velocities[row, to, 1] = velocities[row, track, 1]
+            out_sizes[row, to, 0] = sizes[row, track, 0]
+            out_sizes[row, to, 1] = sizes[row, track, 1]
+
+
+@kernel
 def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) -> None:
     """Mark neighbours of one kind in a frame: `before[a, b]` when b directly follows a."""
     last = np.full(16, -1)
     for box in range(len(frame)):
         if box == 0 or frame[box] != frame[box - 1]:
-            last[:] = -1
+            for kind in range(len(last)):
+                last[kind] = -1
         kind = kinds[track[box]]
         if last[kind] >= 0 and last[kind] != track[box]:
             before[last[kind], track[box]] = True
@@ -53,7 +80,8 @@ def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) 
 def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: IntArray) -> None:
     last = np.full(16, -1)
     for frame in range(valid.shape[0]):
-        last[:] = -1
+        for kind in range(len(last)):
+            last[kind] = -1
         for track in range(valid.shape[1]):
             if not valid[frame, track]:
                 continue

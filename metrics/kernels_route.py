@@ -7,6 +7,7 @@ is the largest number of edges that can hold one point. Lanes come before connec
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry import boundary_distance_below
 from shiftsim.layers import Lists, Polygons, containing, contains, distance_to, in_any
 
 _KEEP_DISTANCE = 5.0  # m, how far a connector is kept for inside an intersection
@@ -328,6 +329,7 @@ def corner_violations(
         distances: (K, 4) written: distance of an outside corner to the nearest drivable area or
             edge of the centre, 0 for the others [m].
     """
+    found = np.full(4, -1)  # nearest drivable area of each corner in the sample before
     for i in range(len(corners)):
         for corner in range(4):
             x, y = corners[i, corner, 0], corners[i, corner, 1]
@@ -336,16 +338,56 @@ def corner_violations(
             if outside[i, corner]:
                 best = np.inf
                 for index in range(counts[i]):
-                    best = min(best, distance_to(edges, lists[i, index], x, y))
-                distances[i, corner] = _distance_below(drivable, x, y, best)
+                    best = _distance_below(edges, lists[i, index], x, y, best)
+                if found[corner] >= 0:
+                    best = _distance_below(drivable, found[corner], x, y, best)
+                if best == np.inf:
+                    distances[i, corner] = _scan(drivable, x, y, found, corner)
+                else:
+                    distances[i, corner] = _scan_near(drivable, x, y, best, found, corner)
 
 
 @kernel
-def _distance_below(polygons: Polygons, x: float, y: float, limit: float) -> float:
-    best = limit
+def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) -> float:
+    """Distance of a point from the nearest polygon, whose index goes to `found[corner]` [m]."""
+    best = np.inf
     for poly in range(len(polygons.bounds)):
-        dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
-        dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
-        if dx * dx + dy * dy < best * best:
-            best = min(best, distance_to(polygons, poly, x, y))
+        distance = _distance_below(polygons, poly, x, y, best)
+        if distance < best:
+            best, found[corner] = distance, poly
+    return best
+
+
+@kernel
+def _scan_near(
+    polygons: Polygons, x: float, y: float, limit: float, found: IntArray, corner: int
+) -> float:
+    """The same where the nearest polygon is known to be no farther than `limit`: by the grid."""
+    best = limit
+    x0, y0, cell = polygons.grid[0], polygons.grid[1], polygons.grid[2]
+    first = max(int(np.floor((x - limit - x0) / cell)), 0)
+    last = min(int(np.floor((x + limit - x0) / cell)), polygons.shape[0] - 1)
+    low = max(int(np.floor((y - limit - y0) / cell)), 0)
+    high = min(int(np.floor((y + limit - y0) / cell)), polygons.shape[1] - 1)
+    for ix in range(first, last + 1):
+        for iy in range(low, high + 1):
+            at = ix * polygons.shape[1] + iy
+            for entry in range(polygons.cell_ptr[at], polygons.cell_ptr[at + 1]):
+                poly = polygons.cell_items[entry]
+                distance = _distance_below(polygons, poly, x, y, best)
+                if distance < best:
+                    best, found[corner] = distance, poly
+    return best
+
+
+@kernel
+def _distance_below(polygons: Polygons, poly: int, x: float, y: float, limit: float) -> float:
+    """Distance of a point outside polygon `poly` from it, or `limit` where it is not below [m]."""
+    dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
+    dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
+    best = limit
+    if dx * dx + dy * dy < best * best:
+        for ring in range(polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]):
+            start, stop = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
+            best = boundary_distance_below(polygons.xy, start, stop, x, y, best)
     return best

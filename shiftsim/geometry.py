@@ -220,6 +220,35 @@ def polygon_distance(
 
 
 @kernel
+def boundary_distance_below(
+    xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
+) -> float:
+    """Distance from a point to the edges of a ring, or `limit` where that is not below it [m].
+
+    Args:
+        xy: (V, 2) vertices of all rings [m].
+        start: First vertex of the ring.
+        stop: One past its last vertex.
+        x: Point [m].
+        y: Point [m].
+        limit: Distance of interest [m]; edges beyond it cost a comparison each.
+    """
+    best = limit
+    ax, ay = xy[stop - 1, 0] - x, xy[stop - 1, 1] - y
+    for index in range(start, stop):
+        bx, by = xy[index, 0] - x, xy[index, 1] - y
+        if (
+            min(ax, bx) < best
+            and max(ax, bx) > -best
+            and min(ay, by) < best
+            and max(ay, by) > -best
+        ):
+            best = min(best, point_segment_distance(0.0, 0.0, ax, ay, bx, by))
+        ax, ay = bx, by
+    return best
+
+
+@kernel
 def ring_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between two convex rings (V, 2), counter-clockwise; 0 when they share a point."""
     if convex_intersect(a, b):

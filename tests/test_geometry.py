@@ -204,3 +204,23 @@ def test_wrapped_angles_lie_in_the_half_open_range(angle):
     wrapped = geometry.wrap_angle(angle + 6 * np.pi)
     assert -np.pi <= wrapped < np.pi
     assert abs(np.sin(wrapped - angle)) < 1e-12
+
+
+@kernel
+def boundary_distances(xy, points, limit):
+    out = np.empty(len(points))
+    for index in range(len(points)):
+        out[index] = geometry.boundary_distance_below(
+            xy, 0, len(xy), points[index, 0], points[index, 1], limit
+        )
+    return out
+
+
+@pytest.mark.parametrize("limit", [1.0, 4.0, np.inf])
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_distances_to_a_boundary_are_capped_at_the_limit(rng, offset, limit):
+    ring = polygon_with_hole(offset)[0][:6]
+    points = grid_points(rng, 20_000, offset, reach=12.0)
+    expected = shapely.distance(shapely.LinearRing(ring), shapely.points(points))
+    ours = boundary_distances(ring, points, limit)
+    np.testing.assert_allclose(ours, np.minimum(expected, limit), rtol=0, atol=1e-9)

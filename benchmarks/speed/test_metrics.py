@@ -13,7 +13,7 @@ from shiftsim.metrics import measure as measure_rollout
 from shiftsim.state import Tracks
 from shiftsim.verify.metric_worlds import read_world
 
-GOLDEN = Path(__file__).parents[2] / "tests" / "golden" / "metric_worlds"
+GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "metric_worlds"
 BOUND = 5e-3  # s, all metrics of one 15 s rollout
 
 

@@ -61,7 +61,7 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_whole_scenario(measure, runner, name):
-    task = Task(name, "constant-velocity", "none", 0)
+    task = Task(token=name, planner="constant-velocity", noise="none", seed=0)
 
     def whole():
         runner._last = None  # read the scenario again each time
@@ -103,7 +103,7 @@ def test_help_against_importing_numpy_and_numba():
 def test_peak_memory_of_a_worker(runner):
     """Peak memory of a process that reads, drives and scores the city scene."""
     code = (
-        "import resource, sys\n"
+        "import re, sys\n"
         "from shiftsim.data.store import open_store\n"
         "from shiftsim.metrics import compute_metrics\n"
         "from shiftsim.planners import load_planner\n"
@@ -111,7 +111,8 @@ def test_peak_memory_of_a_worker(runner):
         "scene = open_store(sys.argv[1]).read('bench_scene_100')\n"
         "log = simulate(scene, load_planner('constant-velocity', {}))\n"
         "compute_metrics(log, scene.map)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+        "status = open('/proc/self/status').read()\n"  # ru_maxrss would be inherited
+        "print(int(re.search(r'VmHWM:\\s*(\\d+)', status)[1]) / 1024)\n"
     )
     command = [sys.executable, "-c", code, str(runner.store)]
     out = subprocess.run(command, check=True, capture_output=True, text=True)
