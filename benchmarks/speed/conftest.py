@@ -43,9 +43,17 @@ def calibration_seconds() -> float:
 
 @pytest.fixture
 def measure(benchmark, calibration_seconds):
-    """Benchmark a call and note its median in µs and as a ratio to the calibration kernel."""
+    """Benchmark a call: median in µs, as a ratio to the calibration kernel, against a target [s].
 
-    def run(function: Callable[..., object], *arguments: object, calls: int = 100) -> float:
+    A missed target is printed, not an error: machines differ.
+    """
+
+    def run(
+        function: Callable[..., object],
+        *arguments: object,
+        calls: int = 100,
+        target: float | None = None,
+    ) -> float:
         benchmark.pedantic(
             function, args=arguments, rounds=ROUNDS, iterations=calls, warmup_rounds=3
         )
@@ -55,6 +63,9 @@ def measure(benchmark, calibration_seconds):
         benchmark.extra_info["ratio"] = round(ratio, 4)
         name = benchmark.name.removeprefix("test_")
         print(f"\n{name}: {median * 1e6:.2f} µs, {ratio:.3f} of the calibration", end="")
+        if target is not None:
+            verdict = "met" if median <= target else "NOT MET"
+            print(f", target {target * 1e6:g} µs {verdict}", end="")
         return median
 
     return run

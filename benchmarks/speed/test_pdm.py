@@ -31,7 +31,7 @@ def ready(scenario):
 
 def test_step(measure, ready):
     planner, observation = ready
-    measure(planner.plan, observation, calls=3)
+    measure(planner.plan, observation, calls=3, target=6e-3)
 
 
 def test_scenario(benchmark, scenario):
