@@ -27,15 +27,17 @@ _KINDS = ("refline.parquet", "lanes.parquet", "topology.parquet", "summary.json"
 _CROSSCHECK = "crosscheck_libopendrive.json"
 
 
-def verify_opendrive(folder: Path, report: Report, maps: Path) -> None:
+def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> None:
     """Compare our reading of the maps with every reference file of a folder.
 
     Args:
         folder: Reference files, named `<map>.<kind>`.
         report: Takes the comparisons.
-        maps: Folder with the .xodr files, at any depth.
+        maps: Folder with the .xodr files, at any depth; by default the folder `maps` beside the
+            parent of `folder`.
     """
-    by_name = {path.stem: path for path in sorted(maps.rglob("*.xodr"))}
+    place = maps or folder.resolve().parent.parent / "maps"
+    by_name = {path.stem: path for path in sorted(place.rglob("*.xodr"))}
     files: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in sorted(folder.iterdir()):
         name, _, kind = path.name.partition(".")
