@@ -1,7 +1,9 @@
 """The nuplan folder: importer, planners, simulation and metrics against the official stack."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+from shiftsim.errors import ShiftsimError
 from shiftsim.verify.nuplan_import import load_scenes, verify_nuplan_import
 from shiftsim.verify.nuplan_metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan_planners import verify_planners
@@ -19,9 +21,18 @@ def verify_nuplan(folder: Path, report: Report, mode: str | None = None) -> None
         mode: Only runs of this challenge (`NR`, `R`, `PT`); the importer is compared always.
     """
     scenes = load_scenes(folder)
-    verify_nuplan_import(folder, report)
-    verify_planners(folder, report, scenes, mode)
-    if mode in (None, "R"):
-        verify_nuplan_reactive(folder, report, scenes)
-    verify_simulation(folder, report, scenes, mode)
-    verify_nuplan_metrics(folder, report, {s.city: s.map for s in scenes.values()}, mode)
+    maps = {scene.city: scene.map for scene in scenes.values()}
+    parts: dict[str, Callable[[], None]] = {
+        "importer": lambda: verify_nuplan_import(folder, report),
+        "planners": lambda: verify_planners(folder, report, scenes, mode),
+        "reactive traffic": lambda: verify_nuplan_reactive(folder, report, scenes),
+        "simulation": lambda: verify_simulation(folder, report, scenes, mode),
+        "metrics": lambda: verify_nuplan_metrics(folder, report, maps, mode),
+    }
+    if mode not in (None, "R"):
+        del parts["reactive traffic"]
+    for name, verify in parts.items():
+        try:
+            verify()
+        except ShiftsimError as error:  # nuPlan got through, so this is a difference
+            report.fail(name, str(folder), str(error))

@@ -6,6 +6,7 @@ import numpy as np
 
 from shiftsim import state
 from shiftsim.arrays import FloatArray
+from shiftsim.errors import ShiftsimError
 from shiftsim.metrics import judge, measure
 from shiftsim.planners import load_planner
 from shiftsim.scenario import Scenario
@@ -57,12 +58,16 @@ def verify_simulation(
         if challenge not in CONTROLLERS or scene not in scenes:
             report.fail("simulation", where, "no such challenge or scene")
             continue
-        log = simulate(
-            scenes[scene],
-            load_planner(*reference_planner(planner, folder)),
-            controller=CONTROLLERS[challenge],
-            traffic=TRAFFIC[challenge],
-        )
+        try:
+            log = simulate(
+                scenes[scene],
+                load_planner(*reference_planner(planner, folder)),
+                controller=CONTROLLERS[challenge],
+                traffic=TRAFFIC[challenge],
+            )
+        except ShiftsimError as error:  # nuPlan got through, so this is a difference
+            report.fail("simulation", where, str(error))
+            continue
         compare_ego(report, where, log.time_us, log.ego, rows)
         measurements = measure(log, scenes[scene].map)
         for thresholds, profile in PROFILES.items():
