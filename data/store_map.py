@@ -4,12 +4,9 @@ Arrays are stored as they are, grids included, so that reading a city costs litt
 reading its bytes.
 """
 
-import json
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from shiftsim.data.store_files import MEND, Table, write_blocks
@@ -159,18 +156,3 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
     parts.update({name: items[column] for name, column in _ARRAYS.items()})
     pairs = zip(items["left_boundary_ids"], items["right_boundary_ids"], strict=True)
     return VectorMap(boundary_ids=tuple(pairs), **parts, **footer)
-
-
-def same_map(a: VectorMap, b: VectorMap) -> bool:
-    """Whether two maps are equal to the last bit."""
-    return all(_same(getattr(a, f.name), getattr(b, f.name)) for f in fields(VectorMap))
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, Layer):
-        return a.ids == b.ids and _same(a.polygons, b.polygons)
-    if isinstance(a, tuple) and hasattr(a, "_fields"):
-        return all(_same(x, y) for x, y in zip(a, b, strict=True))
-    if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    return bool(json.dumps(a) == json.dumps(b))

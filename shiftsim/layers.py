@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.geometry import INTERIOR, arc_lengths, locate_in_polygon, polygon_distance
 
 _MIN_CELL, _MAX_CELL = 4.0, 64.0  # m
@@ -231,14 +231,6 @@ def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, 
         if distance < best and distance <= limit:
             best, found = distance, poly
     return found, best
-
-
-@kernel
-def _contains_points(polygons: Polygons, poly: int, points: FloatArray) -> BoolArray:
-    out = np.empty(len(points), np.bool_)
-    for index in range(len(points)):
-        out[index] = contains(polygons, poly, points[index, 0], points[index, 1])
-    return out
 
 
 @dataclass(frozen=True)

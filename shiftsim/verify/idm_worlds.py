@@ -32,17 +32,6 @@ _OBJECT_KEYS = {"token", "type", "length", "width", "frames"}
 _EXPECTED_KEYS = {"vehicles", "vehicle_columns", "order_frame0"}
 
 
-def verify_idm_worlds(folder: Path, report: Report) -> None:
-    """Compare every `idm_world_*.json` of a folder.
-
-    Args:
-        folder: The folder.
-        report: Receives the comparisons.
-    """
-    for path in sorted(folder.glob("idm_world_*.json")):
-        verify_idm_world(path, report)
-
-
 def verify_idm_world(path: Path, report: Report) -> None:
     """Compare the vehicles of one world after every step, their routes and their order."""
     try:
