@@ -6,7 +6,7 @@ iterations: the state reached after the last planner call is never stored (nupla
 
 from dataclasses import dataclass
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.state import Tracks, TrafficLights
 
 
@@ -29,6 +29,7 @@ class SimulationLog:
         plans: (K, P, 3) poses of the plan over its first second, from the moment of planning on
             (P = 11 at 0.1 s); NaN where a command was returned.
         planning_seconds: (K,) time the planner took for each call [s].
+        degraded: (K,) whether the plan was a makeshift by the planner's own account.
     """
 
     token: str
@@ -43,3 +44,4 @@ class SimulationLog:
     noise: FloatArray
     plans: FloatArray
     planning_seconds: FloatArray
+    degraded: BoolArray

@@ -3,6 +3,7 @@
 A planner is any object with `reset(scene)` and `plan(observation)`; nothing needs to be subclassed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -33,6 +34,7 @@ class SceneInfo:
         vehicle: Dimensions of the ego.
         token: Id of the scenario.
         expert: The whole recorded scenario. Only oracles (log-future) may look at it.
+        seed: Seed of the task; what a planner samples is keyed with it and the token.
     """
 
     map: VectorMap
@@ -42,6 +44,7 @@ class SceneInfo:
     token: str
     expert: Scenario
     vehicle: VehicleParameters = PACIFICA
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +96,30 @@ class Observation:
 
 @runtime_checkable
 class Planner(Protocol):
-    """What the simulator asks of a planner. Subclassing is not required."""
+    """What the simulator asks of a planner. Subclassing is not required.
+
+    Optional are `close()`, `name`, and `degraded`: a text that says why the plan just returned is a
+    makeshift, empty when it is not. Such steps are counted, or fail a strict run.
+    """
 
     def reset(self, scene: SceneInfo) -> None:
         """Prepare for a new scenario: route, goal, map. Called once before the first plan."""
 
     def plan(self, observation: Observation) -> Trajectory | Command:
         """Return poses from the current ego pose on, or the command itself (no tracker runs)."""
+
+
+@runtime_checkable
+class BatchPlanner(Planner, Protocol):
+    """A planner that can answer for several scenarios with one forward pass."""
+
+    def fork(self) -> "BatchPlanner":
+        """A planner for one more scenario that shares the network with this one."""
+
+    def plan_batch(
+        self, planners: Sequence["BatchPlanner"], observations: Sequence[Observation]
+    ) -> list[Trajectory | Command | Exception]:
+        """Plans of forks that are in lock step, one per observation.
+
+        An exception in place of a plan ends that scenario and no other.
+        """

@@ -23,7 +23,7 @@ from shiftsim.log import SimulationLog
 from shiftsim.rollouts import Task, complete_rollout, describe, rollout_table
 from shiftsim.scenario import Scenario
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 ROLLOUTS_PER_PART = 256
 WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
@@ -53,6 +53,8 @@ TASKS_SCHEMA = pa.schema(
         ("read_seconds", pa.float64()),
         ("simulate_seconds", pa.float64()),
         ("planner_seconds", pa.float64()),
+        ("planning_ms_mean", pa.float64()),
+        ("planning_ms_p95", pa.float64()),
         ("metrics_seconds", pa.float64()),
         ("rollout_part", pa.int64()),
         ("rollout_row_group", pa.int64()),
@@ -87,7 +89,7 @@ class TaskResult:
         error: What went wrong, empty for `ok`.
         hint: What to do about it.
         traceback: Where it went wrong.
-        seconds: Durations by column name of `tasks.parquet` [s].
+        seconds: Durations by column name of `tasks.parquet` [s], or [ms] where the name says so.
         scores: The row of `scores.parquet` beyond the key; empty unless `ok`.
         metrics: The rows of `metrics.parquet` beyond the key.
         log: The rollout, when it is to be stored.
@@ -204,13 +206,14 @@ def _scores_table(results: Sequence[TaskResult]) -> pa.Table:
     labels = ("scenario_type", "city", "log_name", "traffic")
     profile = dict(_PROFILE)
     named = {"cls": None} | {name: None for row in rows for name in row}
-    known = {*dict(_KEY), *labels, *profile}
+    known = {*dict(_KEY), *labels, "degraded_steps", *profile}
     numbers = [name for name in named if name not in known]
     schema = pa.schema(
         [
             *_KEY,
             *((name, pa.string()) for name in labels),
             *((name, pa.float64()) for name in numbers),
+            ("degraded_steps", pa.int64()),
             *_PROFILE,
         ]
     )

@@ -79,6 +79,7 @@ def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Ta
     ):
         columns |= {name: values[:, i].copy() for i, name in enumerate(names)}
     columns["planning_seconds"] = log.planning_seconds
+    columns["degraded"] = log.degraded
     columns["plan_poses"] = _lists(log.plans, pa.float64())
     if with_tracks:
         arrays = (log.tracks.valid, log.tracks.poses, log.tracks.velocities, log.tracks.sizes)
@@ -128,6 +129,7 @@ def complete_rollout(table: pa.Table, scenario: Scenario) -> SimulationLog:
         noise=_stack(table, _NOISE_COLUMNS),
         plans=_from_lists(table["plan_poses"], (-1, 3)),
         planning_seconds=np.array(table["planning_seconds"].to_numpy()),
+        degraded=np.array(table["degraded"].to_numpy()),
     )
 
 

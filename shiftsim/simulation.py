@@ -6,8 +6,10 @@ planner is asked T - 1 times; its last answer is never executed, and the state a
 reached nor stored.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import cast
 
 import numpy as np
 
@@ -15,11 +17,11 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.dynamics.bicycle import command_and_step
 from shiftsim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.dynamics.perfect import follow_perfectly, sample_poses
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, PlannerError
 from shiftsim.log import SimulationLog
 from shiftsim.noise import NoiseModel, sample_noise
 from shiftsim.plan_check import validate_plan
-from shiftsim.planner import History, Observation, Planner, SceneInfo
+from shiftsim.planner import BatchPlanner, History, Observation, Planner, SceneInfo
 from shiftsim.scenario import Scenario
 from shiftsim.state import (
     NUM_STATE,
@@ -63,6 +65,127 @@ class _Buffer:
         return Observation(iteration, int(self.time_us[row]), history, lights)
 
 
+class Rollout:
+    """One scenario on its way through the closed loop.
+
+    `simulate` and `simulate_together` drive it: see what the planner sees, advance by its answer,
+    until it is done.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        planner: Planner | None,
+        *,
+        noise: str | NoiseModel = "none",
+        seed: int = 0,
+        traffic: str | Traffic = "nonreactive",
+        controller: str = "lqr",
+        strict: bool = False,
+    ) -> None:
+        """Prepare a scenario and its planner; the arguments and errors are those of `simulate`."""
+        if controller not in CONTROLLERS or (planner is None and controller != "log-playback"):
+            raise ConfigError(
+                f"controller {controller!r} with planner {planner!r} is not possible",
+                hint=f"controllers: {', '.join(CONTROLLERS)}; only log-playback needs no planner",
+            )
+        if scenario.num_iterations < MIN_ITERATIONS:
+            raise DataError(
+                f"scenario {scenario.token!r} (log {scenario.log_name!r}) has "
+                f"{scenario.num_iterations} iterations; at least {MIN_ITERATIONS} are needed",
+                hint="convert it with a longer duration, or leave it out",
+            )
+        self.scenario = scenario
+        self.planner = planner
+        self.iteration = 0
+        self.num_samples = scenario.num_iterations - 1
+        self._controller = controller
+        self._strict = strict
+        self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
+        self._noise = sample_noise(
+            noise, seed=seed, token=scenario.token, num_steps=self.num_samples
+        )
+        self._times = scenario.iteration_times
+        self._buffer = _make_buffer(scenario)
+        self._traffic.start(scenario, self._buffer.tracks, self._buffer.start)
+        self._commands = np.full((self.num_samples, 2), np.nan)
+        self._plans = np.full((self.num_samples, PLAN_SAMPLES, 3), np.nan)
+        self._seconds = np.zeros(self.num_samples)
+        self._degraded = np.zeros(self.num_samples, np.bool_)
+        if planner is not None:
+            planner.reset(_scene_info(scenario, seed))
+
+    @property
+    def done(self) -> bool:
+        """Whether every sample is there."""
+        return self.iteration == self.num_samples
+
+    def observe(self) -> Observation:
+        """What the planner sees now."""
+        return self._buffer.observation(self.iteration)
+
+    def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
+        """Store this sample, and move the ego and the traffic to the next one.
+
+        Args:
+            plan: The planner's answer; None only under log playback without a planner.
+            seconds: How long it took [s].
+        """
+        iteration, buffer = self.iteration, self._buffer
+        row = buffer.start + iteration
+        self._seconds[iteration] = seconds
+        if plan is not None:
+            plan = self._checked(plan)
+        if iteration + 1 < self.num_samples:
+            if self._controller == "log-playback":
+                rows = self.scenario.iteration_rows
+                buffer.ego[row + 1] = self.scenario.ego[rows[iteration + 1]]
+            else:
+                noise, command = self._noise[iteration], self._commands[iteration]
+                _advance(self._controller, buffer, row, plan, noise, command)
+            self._traffic.step(iteration, buffer.ego[row], buffer.tracks, row + 1)
+        self.iteration += 1
+
+    def _checked(self, plan: Trajectory | Command) -> Trajectory | Command:
+        """The plan in log time; its first second and whether it is a makeshift are noted."""
+        now_us = int(self._buffer.time_us[self._buffer.start + self.iteration])
+        next_us = int(self._times[self.iteration + 1])
+        if reason := getattr(self.planner, "degraded", ""):
+            if self._strict:
+                raise PlannerError(
+                    f"the planner fell back at iteration {self.iteration}: {reason}",
+                    hint="without --strict it continues, and the step is counted as degraded",
+                )
+            self._degraded[self.iteration] = True
+        if not isinstance(plan, Trajectory):
+            validate_plan(plan, now_us, next_us)
+            return plan
+        plan = plan.starting_at(now_us)
+        validate_plan(plan, now_us, next_us)
+        sample_poses(plan.time_us, plan.states, now_us, self._plans[self.iteration])
+        return plan
+
+    def log(self) -> SimulationLog:
+        """The finished rollout."""
+        buffer = self._buffer
+        samples = slice(buffer.start, buffer.start + self.num_samples)
+        return SimulationLog(
+            token=self.scenario.token,
+            time_us=buffer.time_us[samples],
+            ego=buffer.ego[samples],
+            tracks=buffer.tracks.rows(samples),
+            traffic_lights=buffer.lights.rows(samples),
+            expert_time_us=self._times,
+            expert_ego=self.scenario.expert,
+            route=self.scenario.route,
+            commands=self._commands,
+            noise=self._noise,
+            plans=self._plans,
+            planning_seconds=self._seconds,
+            degraded=self._degraded,
+        )
+
+
 def simulate(
     scenario: Scenario,
     planner: Planner | None,
@@ -71,6 +194,7 @@ def simulate(
     seed: int = 0,
     traffic: str | Traffic = "nonreactive",
     controller: str = "lqr",
+    strict: bool = False,
 ) -> SimulationLog:
     """Drive one scenario in closed loop.
 
@@ -78,10 +202,11 @@ def simulate(
         scenario: The scenario.
         planner: The planner; None only with `log-playback`, which needs none.
         noise: Actuation noise, by name or model; added to the command before the motion model.
-        seed: Seed of the noise.
+        seed: Seed of the noise, and of planners that sample.
         traffic: `nonreactive`, `reactive`, or a traffic model.
         controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan
             says) or `log-playback` (the ego is where the recording was; plans are ignored).
+        strict: Fail where the planner falls back to a makeshift instead of counting the step.
 
     Returns:
         The rollout, K = T - 1 samples.
@@ -91,64 +216,62 @@ def simulate(
         DataError: The scenario has fewer than three iterations.
         PlannerError: The planner returned something that cannot be executed.
     """
-    if controller not in CONTROLLERS or (planner is None and controller != "log-playback"):
-        raise ConfigError(
-            f"controller {controller!r} with planner {planner!r} is not possible",
-            hint=f"controllers: {', '.join(CONTROLLERS)}; only log-playback needs no planner",
-        )
-    num_samples = scenario.num_iterations - 1
-    if scenario.num_iterations < MIN_ITERATIONS:
-        raise DataError(
-            f"scenario {scenario.token!r} (log {scenario.log_name!r}) has "
-            f"{scenario.num_iterations} iterations; at least {MIN_ITERATIONS} are needed",
-            hint="convert it with a longer duration, or leave it out",
-        )
-    model = make_traffic(traffic) if isinstance(traffic, str) else traffic
-    added = sample_noise(noise, seed=seed, token=scenario.token, num_steps=num_samples)
-    buffer = _make_buffer(scenario)
-    expert_time_us = scenario.iteration_times
-    model.start(scenario, buffer.tracks, buffer.start)
-    commands = np.full((num_samples, 2), np.nan)
-    plans = np.full((num_samples, PLAN_SAMPLES, 3), np.nan)
-    planning_seconds = np.zeros(num_samples)
-    if planner is not None:
-        planner.reset(_scene_info(scenario))
-    for iteration in range(num_samples):
-        plan = None
+    rollout = Rollout(
+        scenario,
+        planner,
+        noise=noise,
+        seed=seed,
+        traffic=traffic,
+        controller=controller,
+        strict=strict,
+    )
+    while not rollout.done:
+        plan, seconds = None, 0.0
         if planner is not None:
-            observation = buffer.observation(iteration)
+            observation = rollout.observe()
             began = perf_counter()
             plan = planner.plan(observation)
-            planning_seconds[iteration] = perf_counter() - began
-            next_us = int(expert_time_us[iteration + 1])
-            if isinstance(plan, Trajectory):
-                plan = plan.starting_at(observation.time_us)
-                validate_plan(plan, observation.time_us, next_us)
-                sample_poses(plan.time_us, plan.states, observation.time_us, plans[iteration])
-            else:
-                validate_plan(plan, observation.time_us, next_us)
-        if iteration + 1 < num_samples:
-            row = buffer.start + iteration
-            if controller == "log-playback":
-                buffer.ego[row + 1] = scenario.ego[scenario.iteration_rows[iteration + 1]]
-            else:
-                _advance(controller, buffer, row, plan, added[iteration], commands[iteration])
-            model.step(iteration, buffer.ego[row], buffer.tracks, row + 1)
-    samples = slice(buffer.start, buffer.start + num_samples)
-    return SimulationLog(
-        token=scenario.token,
-        time_us=buffer.time_us[samples],
-        ego=buffer.ego[samples],
-        tracks=buffer.tracks.rows(samples),
-        traffic_lights=buffer.lights.rows(samples),
-        expert_time_us=expert_time_us,
-        expert_ego=scenario.expert,
-        route=scenario.route,
-        commands=commands,
-        noise=added,
-        plans=plans,
-        planning_seconds=planning_seconds,
-    )
+            seconds = perf_counter() - began
+        rollout.advance(plan, seconds)
+    return rollout.log()
+
+
+def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
+    """Drive several scenarios in lock step, so that their planners share one forward pass.
+
+    Args:
+        rollouts: Fresh rollouts, each with a planner of its own; the planners are forks of one
+            `BatchPlanner`.
+
+    Returns:
+        Per rollout its log, or the error that ended it; the others go on.
+    """
+    ended: dict[int, SimulationLog | Exception] = {}
+    while len(ended) < len(rollouts):
+        active = [i for i in range(len(rollouts)) if i not in ended]
+        planners = [cast(BatchPlanner, rollouts[i].planner) for i in active]
+        observations = [rollouts[i].observe() for i in active]
+        began = perf_counter()
+        plans = planners[0].plan_batch(planners, observations)
+        share = (perf_counter() - began) / len(active)
+        for index, plan in zip(active, plans, strict=True):
+            outcome = _advanced(rollouts[index], plan, share)
+            if outcome is not None:
+                ended[index] = outcome
+    return [ended[i] for i in range(len(rollouts))]
+
+
+def _advanced(
+    rollout: Rollout, plan: Trajectory | Command | Exception, seconds: float
+) -> SimulationLog | Exception | None:
+    """How a rollout ended with this step; None while it goes on."""
+    if isinstance(plan, Exception):
+        return plan
+    try:
+        rollout.advance(plan, seconds)
+    except Exception as error:  # one scenario fails, its neighbours in the batch do not
+        return error
+    return rollout.log() if rollout.done else None
 
 
 def _advance(
@@ -200,7 +323,7 @@ def _make_buffer(scenario: Scenario) -> _Buffer:
     )
 
 
-def _scene_info(scenario: Scenario) -> SceneInfo:
+def _scene_info(scenario: Scenario, seed: int) -> SceneInfo:
     return SceneInfo(
         map=scenario.map,
         route=scenario.route,
@@ -209,4 +332,5 @@ def _scene_info(scenario: Scenario) -> SceneInfo:
         token=scenario.token,
         expert=scenario,
         vehicle=PACIFICA,
+        seed=seed,
     )

@@ -17,6 +17,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
+import numpy as np
+
 from shiftsim.config import Value
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.log import SimulationLog
@@ -191,7 +193,7 @@ class TaskRunner:
             scenario = self._read(task.token)
         with _measured(seconds, "simulate_seconds"):
             log = self._simulate(scenario, task)
-        seconds["planner_seconds"] = float(log.planning_seconds.sum())
+        seconds |= planning_times(log)
         with _measured(seconds, "metrics_seconds"):
             scores, metrics = score_rollout(
                 scenario,
@@ -259,6 +261,16 @@ def attempt(task: Task, work: Callable[[dict[str, float], TaskResult], TaskResul
         )
 
 
+def planning_times(log: SimulationLog) -> dict[str, float]:
+    """What `tasks.parquet` says of the planner's speed: its total [s], mean and p95 [ms]."""
+    per_step = log.planning_seconds * 1e3
+    return {
+        "planner_seconds": float(log.planning_seconds.sum()),
+        "planning_ms_mean": float(per_step.mean()),
+        "planning_ms_p95": float(np.percentile(per_step, 95)),
+    }
+
+
 def score_rollout(
     scenario: Scenario,
     log: SimulationLog,
@@ -277,6 +289,7 @@ def score_rollout(
         "traffic": traffic,
         "cls": result.score,
         **{name: result.scores[name] for name in SHORT_NAMES if name != "score"},
+        "degraded_steps": int(log.degraded.sum()),
         **profile,
     }
     start_us = int(log.time_us[0])

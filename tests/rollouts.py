@@ -53,6 +53,7 @@ def rollout(
         noise=np.zeros((count, 2)),
         plans=np.full((count, 11, 3), np.nan),
         planning_seconds=np.zeros(count),
+        degraded=np.zeros(count, np.bool_),
     )
 
 

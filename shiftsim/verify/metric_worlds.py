@@ -111,6 +111,7 @@ def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
         noise=np.zeros((count, 2)),
         plans=np.full((count, 11, 3), np.nan),
         planning_seconds=np.zeros(count),
+        degraded=np.zeros(count, np.bool_),
     )
     return log, road
 

@@ -189,6 +189,7 @@ def _rollout(run: tuple[str, ...], rows: Group, expert: Group, tables: _Tables) 
         noise=np.zeros((count, 2)),
         plans=np.full((count, 11, 3), np.nan),
         planning_seconds=np.zeros(count),
+        degraded=np.zeros(count, np.bool_),
     )
 
 
