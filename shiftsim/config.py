@@ -237,6 +237,12 @@ def store_path(name: str) -> Path:
     return path if (path / "store.json").is_file() and not below.exists() else below
 
 
+def checkpoint_folder() -> Path:
+    """Folder where checkpoints are found by name: `SHIFTSIM_CHECKPOINTS`, or below the cache."""
+    default = "~/.cache/shiftsim/checkpoints"
+    return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
+
+
 def default_workers() -> int:
     """Worker processes when nothing is said: one per core that this process may use."""
     if hasattr(os, "sched_getaffinity"):
