@@ -49,6 +49,15 @@ KINDS = (
         ("mode", "scenes"),
     ),
     Kind(
+        "nets",
+        (
+            "state_dict.json|route_correction_*.json|plantf|pluto|diffusion_planner|carl|"
+            "route_correction",
+        ),
+        "nets:verify_nets",
+        ("scenes",),
+    ),
+    Kind(
         "dynamics",
         (
             "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",
