@@ -15,11 +15,9 @@ from shiftsim.geometry import (
     BOUNDARY,
     EXTERIOR,
     INTERIOR,
-    locate_in_polygon,
     ray_crossings,
-    segments_intersect,
 )
-from shiftsim.layers import Lists, Polygons, index_polygons
+from shiftsim.layers import Lists, Polygons, index_polygons, meets_convex, square_around
 from shiftsim.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
@@ -125,6 +123,7 @@ def _admit(
     out: IntArray,
 ) -> int:
     count = 0
+    square = square_around(x, y, half_width)
     for layer in range(2):
         layer_polygons = blocks if layer == 0 else polygons
         bounds = layer_polygons.bounds
@@ -134,7 +133,7 @@ def _admit(
                 or bounds[index, 2] < x - half_width
                 or bounds[index, 1] > y + half_width
                 or bounds[index, 3] < y - half_width
-                or not touches_square(layer_polygons, index, x, y, half_width)
+                or not meets_convex(layer_polygons, index, square)
             ):
                 continue
             if layer == 1:
@@ -145,35 +144,6 @@ def _admit(
                 out[count] = block_edges.items[entry]
                 count += 1
     return count
-
-
-@kernel
-def touches_square(polygons: Polygons, poly: int, x: float, y: float, half_width: float) -> bool:
-    """Whether a polygon shares a point with the axis-parallel square around (x, y).
-
-    Their bounds must overlap.
-    """
-    square = np.empty((4, 2))
-    for corner in range(4):
-        square[corner, 0] = x + half_width if corner == 0 or corner == 3 else x - half_width
-        square[corner, 1] = y + half_width if corner < 2 else y - half_width
-    first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
-    xy = polygons.xy
-    for vertex in range(polygons.ring_ptr[first], polygons.ring_ptr[last]):
-        if abs(xy[vertex, 0] - x) <= half_width and abs(xy[vertex, 1] - y) <= half_width:
-            return True
-    for corner in range(4):
-        sx, sy = square[corner]
-        if locate_in_polygon(xy, polygons.ring_ptr, first, last, sx, sy) != EXTERIOR:
-            return True
-    for ring in range(first, last):
-        before = polygons.ring_ptr[ring + 1] - 1
-        for vertex in range(polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]):
-            for corner in range(4):
-                if segments_intersect(xy[before], xy[vertex], square[corner - 1], square[corner]):
-                    return True
-            before = vertex
-    return False
 
 
 @kernel

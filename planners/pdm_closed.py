@@ -13,6 +13,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry import boxes_to_corners
+from shiftsim.layers import square_around
 from shiftsim.map import VectorMap
 from shiftsim.planner import Observation, SceneInfo
 from shiftsim.planners.pdm_areas import Areas, admit, covering, index_ranks, make_areas
@@ -26,11 +27,12 @@ from shiftsim.planners.pdm_forecast import (
 )
 from shiftsim.planners.pdm_parameters import STEP_US, STEPS, FollowingModel, PdmParameters
 from shiftsim.planners.pdm_path import PdmPath, make_path, offset_poses
-from shiftsim.planners.pdm_route import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.pdm_scorer import Road
 from shiftsim.planners.pdm_step import Step, plan_step
+from shiftsim.planners.route_correction import Start, correct_route, find_start, known_blocks
 from shiftsim.state import NUM_STATE, LightStatus, Trajectory
 
+START_HALF_WIDTH = 1.0  # m, of the square around the rear axle that is searched for the start
 MAX_COVERING = 64  # areas over one point
 
 
@@ -118,7 +120,7 @@ class PdmClosed:
         Raises:
             PlannerError: The route is empty or unknown to the map.
         """
-        known_blocks(scene.map, scene.route, scene.token)
+        known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
         self._paths, self.collided = [], []
         self.route = self.centerline = self.seen = None
@@ -195,8 +197,9 @@ def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str
     Raises:
         PlannerError: The route is empty, unknown to the map, or has no lanes.
     """
-    blocks = known_blocks(road, ids, token)
-    start = find_start(road, blocks, ego[:3])
+    blocks = known_blocks(road, ids, token, PdmClosed.name)
+    square = square_around(float(ego[0]), float(ego[1]), START_HALF_WIDTH)
+    start = find_start(road, blocks, ego[:3], square)
     corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
     lanes = [edge for block in corrected for edge in road.block_edges.at(block).tolist()]
     if not lanes:

@@ -12,7 +12,15 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
-from shiftsim.geometry import INTERIOR, arc_lengths, locate_in_polygon, polygon_distance
+from shiftsim.geometry import (
+    EXTERIOR,
+    INTERIOR,
+    arc_lengths,
+    locate_in_polygon,
+    polygon_distance,
+    segments_intersect,
+)
+from shiftsim.predicates import orientation
 
 _MIN_CELL, _MAX_CELL = 4.0, 64.0  # m
 _CELLS_PER_POLYGON = 4
@@ -220,8 +228,16 @@ def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, 
 
     The first one in the order of the layer on ties.
     """
+    return nearest_of(polygons, 0, len(polygons.bounds), x, y, limit)
+
+
+@kernel
+def nearest_of(
+    polygons: Polygons, first: int, stop: int, x: float, y: float, limit: float
+) -> tuple[int, float]:
+    """As `nearest`, among the polygons `first` … `stop` - 1."""
     best, found = np.inf, -1
-    for poly in range(len(polygons.bounds)):
+    for poly in range(first, stop):
         dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
         dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
         reach = min(best, limit)
@@ -231,6 +247,69 @@ def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, 
         if distance < best and distance <= limit:
             best, found = distance, poly
     return found, best
+
+
+@kernel
+def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
+    """Whether polygon `poly` shares a point with a convex ring (V, 2), counter-clockwise [m]."""
+    first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
+    xy, ring_ptr = polygons.xy, polygons.ring_ptr
+    for vertex in range(ring_ptr[first], ring_ptr[last]):
+        if _in_convex(ring, xy[vertex, 0], xy[vertex, 1]):
+            return True
+    for corner in range(len(ring)):
+        x, y = ring[corner, 0], ring[corner, 1]
+        if locate_in_polygon(xy, ring_ptr, first, last, x, y) != EXTERIOR:
+            return True
+    for chain in range(first, last):
+        before = ring_ptr[chain + 1] - 1
+        for vertex in range(ring_ptr[chain], ring_ptr[chain + 1]):
+            for corner in range(len(ring)):
+                if segments_intersect(xy[before], xy[vertex], ring[corner - 1], ring[corner]):
+                    return True
+            before = vertex
+    return False
+
+
+@kernel
+def _in_convex(ring: FloatArray, x: float, y: float) -> bool:
+    """Whether a point lies in a convex ring (V, 2), counter-clockwise, or on it."""
+    for corner in range(len(ring)):
+        ax, ay = ring[corner - 1, 0], ring[corner - 1, 1]
+        if orientation(ax, ay, ring[corner, 0], ring[corner, 1], x, y) < 0:
+            return False
+    return True
+
+
+@kernel
+def meeting(polygons: Polygons, ring: FloatArray) -> IntArray:
+    """Polygons that share a point with a convex ring (V, 2), counter-clockwise, ascending."""
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for corner in range(len(ring)):
+        low_x, high_x = min(low_x, ring[corner, 0]), max(high_x, ring[corner, 0])
+        low_y, high_y = min(low_y, ring[corner, 1]), max(high_y, ring[corner, 1])
+    bounds = polygons.bounds
+    out = np.empty(len(bounds), np.int64)
+    found = 0
+    for poly in range(len(bounds)):
+        if (
+            bounds[poly, 0] <= high_x
+            and bounds[poly, 2] >= low_x
+            and bounds[poly, 1] <= high_y
+            and bounds[poly, 3] >= low_y
+            and meets_convex(polygons, poly, ring)
+        ):
+            out[found] = poly
+            found += 1
+    return out[:found].copy()
+
+
+@kernel
+def square_around(x: float, y: float, half_width: float) -> FloatArray:
+    """(4, 2) corners of an axis-parallel square, counter-clockwise [m]."""
+    low_x, low_y, high_x, high_y = x - half_width, y - half_width, x + half_width, y + half_width
+    corners = (high_x, high_y, low_x, high_y, low_x, low_y, high_x, low_y)
+    return np.array(corners).reshape(4, 2)
 
 
 @dataclass(frozen=True)
@@ -277,16 +356,7 @@ class Layer:
 
     def within_box(self, x: float, y: float, half_width: float) -> IntArray:
         """Indices of the polygons that share a point with an axis-parallel square around (x, y)."""
-        bounds = self.polygons.bounds
-        near = np.flatnonzero(
-            (bounds[:, 0] <= x + half_width)
-            & (bounds[:, 2] >= x - half_width)
-            & (bounds[:, 1] <= y + half_width)
-            & (bounds[:, 3] >= y - half_width)
-        )
-        square = shapely.box(x - half_width, y - half_width, x + half_width, y + half_width)
-        kept = [i for i in near.tolist() if shapely.intersects(self.shape(i), square)]
-        return np.array(kept, np.int64)
+        return meeting(self.polygons, square_around(x, y, half_width))
 
 
 def make_layer(ids: Iterable[str], polygons: Sequence[shapely.Polygon]) -> Layer:

@@ -17,8 +17,8 @@ from shiftsim.planners.pdm_emergency import brake_poses
 from shiftsim.planners.pdm_parameters import DEFAULT, DT, SCORED
 from shiftsim.planners.pdm_path import interpolate, make_path, offset_poses, project, window
 from shiftsim.planners.pdm_proposals import follow_many
-from shiftsim.planners.pdm_route import search
 from shiftsim.planners.pdm_tracker import simulate_proposals
+from shiftsim.planners.route_correction import search
 from shiftsim.state import NUM_STATE, PACIFICA, center_poses
 from shiftsim.verify.array_file import EXACT, ArrayFile
 from shiftsim.verify.nuplan_import import read_json

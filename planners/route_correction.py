@@ -1,6 +1,7 @@
-"""Route correction of PDM-Closed, once per scenario (pdm-closed.md §3).
+"""Route correction, which PDM-Closed and the learned planners share (pdm-closed.md §3).
 
-The route may lack blocks at its start, have gaps, or cross itself. nuPlan's searches keep no set of
+They differ in where they look for the block the ego starts on, and in how often they correct. The
+route may lack blocks at its start, have gaps, or cross itself. nuPlan's searches keep no set of
 visited blocks; here each level of a search holds a block once, ordered by its first and by its last
 appearance, which decides the same things at linear cost.
 """
@@ -8,19 +9,19 @@ appearance, which decides the same things at linear cost.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
-from shiftsim.layers import distance_to
+from shiftsim.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
 from shiftsim.map import NONE, VectorMap
 from shiftsim.planners.pdm_centerline import nearest_vertex
 
 MAX_HEADING_ERROR = np.pi / 4.0  # rad
 MAX_DISPLACEMENT = 3.0  # m
-PROXIMITY = 1.0  # m, half side of the square around the rear axle
 BACKWARD_DEPTH, FORWARD_DEPTH = 15, 30  # blocks
 NUM_GOALS = 3  # route blocks that a search forward may reach
 MAX_OVERLAP = 1.0  # m^2, of two roadblock connectors of a route without loops
@@ -39,25 +40,60 @@ class Start:
     candidates: list[int]
 
 
-def known_blocks(road: VectorMap, route: Sequence[str], token: str) -> list[int]:
+def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str) -> list[int]:
     """Block indices of a route, each once.
+
+    Args:
+        road: The map.
+        route: Roadblock ids.
+        token: Id of the scenario, for messages.
+        planner: Name of the planner, for messages.
 
     Raises:
         PlannerError: The route is empty or names a block that the map does not have.
     """
     if not route:
         raise PlannerError(
-            f"pdm-closed: the route of scenario {token!r} is empty",
+            f"{planner}: the route of scenario {token!r} is empty",
             hint="correct the route of the scenario, or leave it out",
         )
     for name in route:
         if name not in road.blocks.index:
             raise PlannerError(
-                f"pdm-closed: map {road.name!r} has no roadblock {name!r}, which is on the route "
+                f"{planner}: map {road.name!r} has no roadblock {name!r}, which is on the route "
                 f"of scenario {token!r}",
                 hint="correct the route of the scenario, or leave it out",
             )
     return [road.blocks.index[name] for name in dict.fromkeys(route)]
+
+
+class RouteCorrector:
+    """Corrects the route of one scenario as often as asked.
+
+    The result depends on the start alone, and where the start is on the route not even on that, so
+    what was once found is kept.
+    """
+
+    def __init__(self, road: VectorMap, blocks: list[int], half_width: float) -> None:
+        """Take a route.
+
+        Args:
+            road: The map.
+            blocks: The route, each block once (`known_blocks`).
+            half_width: Of the square around the rear axle that is searched for the start [m].
+        """
+        self._road, self._blocks, self._half_width = road, blocks, half_width
+        self._on_route = set(blocks)
+        self._known: dict[tuple[int, ...], tuple[int, ...]] = {}
+
+    def at(self, rear_axle: FloatArray) -> tuple[int, ...]:
+        """The route corrected for a rear axle (3,); blocks may repeat."""
+        square = square_around(float(rear_axle[0]), float(rear_axle[1]), self._half_width)
+        start = find_start(self._road, self._blocks, rear_axle, square)
+        key = (start.block, *start.candidates) if start.block not in self._on_route else ()
+        if key not in self._known:
+            self._known[key] = tuple(correct_route(self._road, self._blocks, start))
+        return self._known[key]
 
 
 def correct_route(road: VectorMap, route: list[int], start: Start) -> list[int]:
@@ -68,41 +104,98 @@ def correct_route(road: VectorMap, route: list[int], start: Start) -> list[int]:
     return _cut_loops(road, _fill_gaps(road, blocks))
 
 
-def find_start(road: VectorMap, route: Iterable[int], rear_axle: FloatArray) -> Start:
-    """The block under the rear axle (3,) that fits its heading best, preferably on the route.
+def find_start(
+    road: VectorMap, route: Sequence[int], rear_axle: FloatArray, area: FloatArray
+) -> Start:
+    """The block near the rear axle that fits its heading best, preferably on the route.
+
+    Args:
+        road: The map.
+        route: Blocks.
+        rear_axle: (3,) x [m], y [m], heading [rad].
+        area: (4, 2) corners of the box that blocks must touch, counter-clockwise [m]; where none
+            does, the nearest of either kind are taken.
 
     Raises:
         PlannerError: The map has no blocks.
     """
-    allowed = set(route)
-    x, y = float(rear_axle[0]), float(rear_axle[1])
-    nearby = road.blocks.within_box(x, y, PROXIMITY).tolist() or _nearest_blocks(road, x, y)
-    on_route: list[tuple[float, int]] = []
-    others: list[tuple[float, int]] = []
-    closest: list[tuple[float, int]] = []
-    for block in nearby:
+    found = _candidates(
+        road.blocks.polygons,
+        road.num_roadblocks,
+        road.block_edges,
+        road.baselines,
+        np.array(route, np.int64),
+        np.asarray(rear_axle[:3], np.float64),
+        area,
+    )
+    if not len(found.blocks):
+        raise PlannerError(f"map {road.name!r} has no roadblocks")
+    return Start(int(found.blocks[found.best]), found.blocks.tolist())
+
+
+class _Found(NamedTuple):
+    """Blocks that may be the start, and which of them is."""
+
+    blocks: IntArray
+    best: int
+
+
+@kernel
+def _candidates(
+    blocks: Polygons,
+    num_roadblocks: int,
+    block_edges: Lists,
+    baselines: Polylines,
+    route: IntArray,
+    rear_axle: FloatArray,
+    area: FloatArray,
+) -> _Found:
+    """Blocks that touch the area, once per lane that qualifies; those on the route if any do."""
+    x, y, heading = rear_axle[0], rear_axle[1], rear_axle[2]
+    near = meeting(blocks, area)
+    if len(near) == 0:
+        near = _nearest_blocks(blocks, num_roadblocks, x, y)
+    room = 0
+    for block in near:
+        room += block_edges.ptr[block + 1] - block_edges.ptr[block] + 1
+    names, distances = np.empty((3, room), np.int64), np.empty((3, room))
+    counts = np.zeros(3, np.int64)  # on the route, beside it, all
+    for block in near:
+        kind = 1
+        for name in route:
+            if name == block:
+                kind = 0
         least = np.inf
-        for edge in road.block_edges.at(block).tolist():
-            displacement, error = nearest_vertex(road.baselines, edge, x, y, float(rear_axle[2]))
+        for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
+            edge = block_edges.items[entry]
+            displacement, error = nearest_vertex(baselines, edge, x, y, heading)
             least = min(least, displacement)
             if error < MAX_HEADING_ERROR and displacement < MAX_DISPLACEMENT:
-                (on_route if block in allowed else others).append((displacement, block))
-        closest.append((least, block))
-    if not closest:
-        raise PlannerError(f"pdm-closed: map {road.name!r} has no roadblocks")
-    chosen = on_route or others or closest
-    best = min(chosen, key=lambda pair: pair[0])  # the first one on ties
-    return Start(best[1], [block for _, block in chosen])
+                names[kind, counts[kind]], distances[kind, counts[kind]] = block, displacement
+                counts[kind] += 1
+        names[2, counts[2]], distances[2, counts[2]] = block, least
+        counts[2] += 1
+    kind = 0 if counts[0] > 0 else (1 if counts[1] > 0 else 2)
+    best = 0  # the first one on ties
+    for index in range(counts[kind]):
+        if distances[kind, index] < distances[kind, best]:
+            best = index
+    return _Found(names[kind, : counts[kind]].copy(), best)
 
 
-def _nearest_blocks(road: VectorMap, x: float, y: float) -> list[int]:
+@kernel
+def _nearest_blocks(blocks: Polygons, num_roadblocks: int, x: float, y: float) -> IntArray:
     """The nearest roadblock and the nearest roadblock connector."""
-    out = []
-    for first, last in ((0, road.num_roadblocks), (road.num_roadblocks, len(road.blocks))):
-        distances = [distance_to(road.blocks.polygons, block, x, y) for block in range(first, last)]
-        if distances:
-            out.append(first + int(np.argmin(distances)))
-    return out
+    out = np.empty(2, np.int64)
+    count = 0
+    for kind in range(2):
+        first = 0 if kind == 0 else num_roadblocks
+        stop = num_roadblocks if kind == 0 else len(blocks.bounds)
+        found = nearest_of(blocks, first, stop, x, y, np.inf)[0]
+        if found >= 0:
+            out[count] = found
+            count += 1
+    return out[:count].copy()
 
 
 def _lead_in(road: VectorMap, blocks: list[int], start: Start) -> list[int]:
