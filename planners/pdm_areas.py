@@ -147,7 +147,7 @@ def _admit(
 
 
 @kernel
-def _locate(
+def locate(
     slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
     first: int,
     last: int,
@@ -206,7 +206,7 @@ def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray
             or found == len(out)
         ):
             continue
-        if _locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
+        if locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
             out[found] = area
             found += 1
     return found
@@ -295,7 +295,7 @@ def _find_holder(
             bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
         ):
             continue  # also where a coordinate is NaN
-        if _locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) == INTERIOR:
+        if locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) == INTERIOR:
             return area
     return -1
 

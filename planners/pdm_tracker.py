@@ -81,7 +81,7 @@ def simulate_proposals(
         dt: Time between poses [s].
         speeds: (P, T - 1) receives the reference speeds [m/s].
         curvatures: (P, T - 1) receives the reference curvatures [1/m].
-        states: (P, T, 11) receives the driven states.
+        states: (P, S, 11) receives the driven states, S <= T.
     """
     last = poses.shape[1] - 2
     ahead = np.empty(params.horizon)
@@ -90,7 +90,7 @@ def simulate_proposals(
         fit_curvature(poses[row], speeds[row], dt, params.curvature_rate_penalty, curvatures[row])
         for column in range(len(ego)):
             states[row, 0, column] = ego[column]
-        for step in range(last + 1):
+        for step in range(states.shape[1] - 1):
             state, pose = states[row, step], poses[row, step]
             for index in range(params.horizon):
                 ahead[index] = curvatures[row, min(step + index, last)]
