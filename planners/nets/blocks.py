@@ -1,0 +1,311 @@
+"""Blocks that the networks of PlanTF and PLUTO share; names and shapes as in their checkpoints.
+
+Only inference is meant: no dropout, no drop path. A mask `keep` is true for what takes part.
+Attention runs through torch's fused kernel. What the official code computes and then throws away is
+not computed here: the ego's own history, and all but the last step of an agent's.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+DIM = 128
+NUM_AGENT_KINDS = 4
+HISTORY_CHANNELS = 9
+_WIDTHS, _HEADS, _WINDOWS = (32, 64, 128), (2, 4, 8), (3, 3, 5)
+_MLP_RATIO = 3  # of the history encoder
+
+
+class Attention(nn.Module):
+    """Multi-head attention with biased projections; tensors of torch's `MultiheadAttention`."""
+
+    def __init__(self, dim: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.in_proj_weight = nn.Parameter(torch.zeros(3 * dim, dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
+        self.out_proj = nn.Linear(dim, dim)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, keep: Tensor | None) -> Tensor:
+        """Attend from (B, Q, D) to (B, N, D); `keep` (B, N) may be None."""
+        dim = query.shape[-1]
+        weights, biases = self.in_proj_weight, self.in_proj_bias
+        if query is key and key is value:
+            q, k, v = functional.linear(query, weights, biases).chunk(3, dim=-1)
+        else:
+            parts = zip((query, key, value), weights.split(dim), biases.split(dim), strict=True)
+            q, k, v = (functional.linear(*part) for part in parts)
+        mask = None if keep is None else keep[:, None, None, :]
+        heads = [x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x in (q, k, v)]
+        mixed = functional.scaled_dot_product_attention(*heads, attn_mask=mask)
+        out: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))
+        return out
+
+
+class Mlp(nn.Module):
+    """Two linear layers with an exact GELU between them."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.fc2 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., D) to (..., D)."""
+        out: Tensor = self.fc2(functional.gelu(self.fc1(x)))
+        return out
+
+
+class EncoderBlock(nn.Module):
+    """Pre-norm transformer block."""
+
+    def __init__(self, dim: int, num_heads: int, mlp_ratio: int = 4) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = Attention(dim, num_heads)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, mlp_ratio * dim)
+
+    def forward(self, x: Tensor, keep: Tensor, num_queries: int | None = None) -> Tensor:
+        """Tokens (B, N, D) after the block; the first `num_queries` of them where that is given."""
+        normed = self.norm1(x)
+        if num_queries is None:
+            x = x + self.attn(normed, normed, normed, keep)
+        else:
+            x = x[:, :num_queries] + self.attn(normed[:, :num_queries], normed, normed, keep)
+        out: Tensor = x + self.mlp(self.norm2(x))
+        return out
+
+
+class NeighborhoodAttention(nn.Module):
+    """Attention along a sequence to the `window` nearest positions; windows shift at the ends."""
+
+    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+        super().__init__()
+        self.num_heads, self.window = num_heads, window
+        self.rpb = nn.Parameter(torch.zeros(num_heads, 2 * window - 1))
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(A, L, D) to (A, L, D)."""
+        qkv = self.qkv(x).unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
+        bias = self._bias(x.shape[1])
+        mixed = functional.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2], attn_mask=bias)
+        out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
+        return out
+
+    def _bias(self, length: int) -> Tensor:
+        """(heads, L, L) logits added for a pair of positions, -inf outside of the window."""
+        positions = torch.arange(length, device=self.rpb.device)
+        first = (positions - self.window // 2).clamp(0, length - self.window)
+        ahead = positions[None, :] - first[:, None]
+        inside = (ahead >= 0) & (ahead < self.window)
+        offset = positions[None, :] - positions[:, None] + self.window - 1
+        bias = self.rpb[:, offset.clamp(0, 2 * self.window - 2)]
+        return bias.masked_fill(~inside, -torch.inf)
+
+
+class _HistoryBlock(nn.Module):
+    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = NeighborhoodAttention(dim, num_heads, window)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, _MLP_RATIO * dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attn(self.norm1(x))
+        out: Tensor = x + self.mlp(self.norm2(x))
+        return out
+
+
+class _Downsample(nn.Module):
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.reduction = nn.Conv1d(dim, 2 * dim, 3, stride=2, padding=1, bias=False)
+        self.norm = nn.LayerNorm(2 * dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.norm(self.reduction(x.transpose(1, 2)).transpose(1, 2))
+        return out
+
+
+class _Level(nn.Module):
+    def __init__(self, index: int) -> None:
+        super().__init__()
+        dim, heads, window = _WIDTHS[index], _HEADS[index], _WINDOWS[index]
+        self.blocks = nn.ModuleList(_HistoryBlock(dim, heads, window) for _ in range(2))
+        self.downsample = _Downsample(dim) if index + 1 < len(_WIDTHS) else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        for block in self.blocks:
+            x = block(x)
+        return x
+
+
+class _Embed(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.proj = nn.Conv1d(HISTORY_CHANNELS, _WIDTHS[0], 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.proj(x.transpose(1, 2)).transpose(1, 2)
+        return out
+
+
+class HistoryEncoder(nn.Module):
+    """One vector per agent from 20 steps of its history: a feature pyramid, read at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.embed = _Embed()
+        self.levels = nn.ModuleList(_Level(index) for index in range(len(_WIDTHS)))
+        for index, width in enumerate(_WIDTHS):
+            self.add_module(f"norm{index}", nn.LayerNorm(width))
+        self.lateral_convs = nn.ModuleList(nn.Conv1d(width, DIM, 3, padding=1) for width in _WIDTHS)
+        self.fpn_conv = nn.Conv1d(DIM, DIM, 3, padding=1)
+
+    def forward(self, steps: Tensor) -> Tensor:
+        """(A, 20, 9) to (A, 128)."""
+        x = self.embed(steps)
+        ends = []
+        for index, level in enumerate(self.levels):
+            x = level(x)
+            normed = self.get_submodule(f"norm{index}")(x[:, -3:])
+            ends.append(_last_two(self.lateral_convs[index], normed.transpose(1, 2)))
+            if level.downsample is not None:
+                x = level.downsample(x)
+        merged = ends[2]
+        for end in (ends[1], ends[0]):
+            merged = end + _upsampled_end(merged)
+        return _last(self.fpn_conv, merged)
+
+
+def _last_two(conv: nn.Module, end: Tensor) -> Tensor:
+    """(A, C', 2) the last two steps of a padded convolution, of the last three steps (A, C, 3)."""
+    return functional.conv1d(functional.pad(end, (0, 1)), conv.weight, conv.bias)
+
+
+def _last(conv: nn.Conv1d, end: Tensor) -> Tensor:
+    """(A, C') the last step of a padded convolution, of the last two steps (A, C, 2)."""
+    return functional.linear(end.flatten(1), conv.weight[:, :, :2].flatten(1), conv.bias)
+
+
+def _upsampled_end(end: Tensor) -> Tensor:
+    """The last two steps of a sequence upsampled linearly by 2, of its last two steps."""
+    before, last = end[..., 0], end[..., 1]
+    return torch.stack([0.25 * before + 0.75 * last, last], dim=-1)
+
+
+class EgoStateEncoder(nn.Module):
+    """One vector from the scalars of the ego state: a learned query attends to a token for each."""
+
+    def __init__(self, num_scalars: int, dim: int = DIM, num_heads: int = 4) -> None:
+        super().__init__()
+        self.linears = nn.ModuleList(nn.Linear(1, dim) for _ in range(num_scalars))
+        self.attn = Attention(dim, num_heads)
+        self.pos_embed = nn.Parameter(torch.zeros(1, num_scalars, dim))
+        self.query = nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """(B, scalars) to (B, D)."""
+        weight = torch.stack([linear.weight[:, 0] for linear in self.linears])
+        bias = torch.stack([linear.bias for linear in self.linears])
+        tokens = state[:, :, None] * weight + bias + self.pos_embed
+        query = self.query.expand(len(state), -1, -1)
+        out: Tensor = self.attn(query, tokens, tokens, None)[:, 0]
+        return out
+
+
+class AgentEncoder(nn.Module):
+    """Tokens of the ego and the agents, without their poses."""
+
+    def __init__(self, num_scalars: int) -> None:
+        super().__init__()
+        self.history_encoder = HistoryEncoder()
+        self.ego_state_emb = EgoStateEncoder(num_scalars)
+        self.type_emb = nn.Embedding(NUM_AGENT_KINDS, DIM)
+        self.num_scalars = num_scalars
+
+    def forward(
+        self, steps: Tensor, known: Tensor, category: Tensor, current_state: Tensor
+    ) -> Tensor:
+        """Encode rows of agents; row 0 is the ego.
+
+        Args:
+            steps: (B, A, 20, 9) of `history_steps`.
+            known: (B, A) whether any sample of the row is valid.
+            category: (B, A) indices of kinds.
+            current_state: (B, >= scalars) ego state.
+
+        Returns:
+            (B, A, 128)
+        """
+        ego = self.ego_state_emb(current_state[:, : self.num_scalars])
+        tokens = steps.new_zeros(*known.shape, DIM)
+        others = known.clone()
+        others[:, 0] = False  # the ego's history is not used
+        if others.any():
+            tokens[others] = self.history_encoder(steps[others])
+        tokens[:, 0] = ego
+        out: Tensor = tokens + self.type_emb(category)
+        return out
+
+
+def history_steps(
+    position: Tensor, heading: Tensor, velocity: Tensor, shape: Tensor, valid: Tensor
+) -> Tensor:
+    """(B, A, H - 1, 9) what changed in each step, from H samples per agent.
+
+    Changes count only between valid samples; the shape does not ask (planner-plantf.md §3.2).
+
+    Args:
+        position: (B, A, H, 2)
+        heading: (B, A, H)
+        velocity: (B, A, H, 2)
+        shape: (B, A, H, 2)
+        valid: (B, A, H)
+    """
+    both = valid[..., 1:] & valid[..., :-1]
+    moved = position.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    faster = velocity.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    turned = heading.diff(dim=2).masked_fill(~both, 0.0)
+    parts = [moved, faster, torch.stack([turned.cos(), turned.sin()], -1), shape[:, :, 1:]]
+    return torch.cat([*parts, both[..., None].to(position.dtype)], dim=-1)
+
+
+class PointsEncoder(nn.Module):
+    """One vector per polyline from its valid points; rows of invalid points count as zeros."""
+
+    def __init__(self, channels: int, out: int = DIM) -> None:
+        super().__init__()
+        self.first_mlp = nn.Sequential(
+            nn.Linear(channels, 128), nn.BatchNorm1d(128), nn.ReLU(), nn.Linear(128, 256)
+        )
+        self.second_mlp = nn.Sequential(
+            nn.Linear(512, 256), nn.BatchNorm1d(256), nn.ReLU(), nn.Linear(256, out)
+        )
+
+    def forward(self, points: Tensor, keep: Tensor) -> Tensor:
+        """(B, M, K, channels) with `keep` (B, M, K) to (B, M, out)."""
+        lines, line = points.flatten(0, 1), keep.flatten(0, 1)
+        batch, count = points.shape[:2]
+        row, _ = torch.nonzero(line, as_tuple=True)
+        first = self.first_mlp(lines[line])
+        pooled = _scattered_max(first, line)
+        # Linear([point, pooled]) in two parts: that of the line is the same for all its points
+        widen, norm, relu, narrow = self.second_mlp
+        half = first.shape[1]
+        of_line = functional.linear(pooled, widen.weight[:, half:], widen.bias)
+        mixed = functional.linear(first, widen.weight[:, :half]) + of_line[row]
+        out = _scattered_max(narrow(relu(norm(mixed))), line)
+        return out.unflatten(0, (batch, count))
+
+
+def _scattered_max(values: Tensor, keep: Tensor) -> Tensor:
+    """(M, C) maximum over the points of each line; points without a value count as zero."""
+    dense = values.new_zeros(*keep.shape, values.shape[1])
+    dense[keep] = values
+    out: Tensor = dense.amax(dim=1)
+    return out
