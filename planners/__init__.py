@@ -5,6 +5,7 @@ Nothing is imported before it is asked for.
 
 import hashlib
 import importlib
+import importlib.util
 import inspect
 import sys
 import types
@@ -14,9 +15,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim.config import one_of
-from shiftsim.errors import ConfigError
+from shiftsim.config import checkpoint_folder, one_of
+from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.planner import Planner
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A checkpoint as its authors publish it.
+
+    Attributes:
+        file: What is published.
+        project: Name of the project that publishes it.
+        name: File or folder in the folder of checkpoints, where it is found by itself.
+    """
+
+    file: str
+    project: str
+    name: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +41,11 @@ class PlannerEntry:
 
     Attributes:
         name: Its name everywhere.
-        kind: `rule-based`, `oracle` (looks at the recording) or `replay`.
+        kind: `rule-based`, `oracle` (looks at the recording), `replay` or `learned`.
         target: `package.module:Class`.
         description: One line.
         arguments: Names of the arguments it takes.
+        checkpoint: What a learned planner loads; it also needs the extra `learned`.
     """
 
     name: str
@@ -36,14 +53,37 @@ class PlannerEntry:
     target: str
     description: str
     arguments: tuple[str, ...] = ()
+    checkpoint: Published | None = None
 
 
 _ENTRIES = (
+    PlannerEntry(
+        "carl",
+        "learned",
+        "shiftsim.planners.carl:Carl",
+        "a policy trained by reinforcement learning on a raster of the surroundings",
+        ("checkpoint", "device"),
+        Published(
+            "nuPlan/checkpoints/nuplan_51892_1B/model_best.pth",
+            "autonomousvision/CaRL",
+            "nuplan_51892_1B",
+        ),
+    ),
     PlannerEntry(
         "constant-velocity",
         "rule-based",
         "shiftsim.planners.constant_velocity:ConstantVelocity",
         "keeps heading and speed",
+    ),
+    PlannerEntry(
+        "diffusion-planner",
+        "learned",
+        "shiftsim.planners.diffusion_planner:DiffusionPlanner",
+        "samples the future of ego and neighbours with a diffusion transformer",
+        ("checkpoint", "device"),
+        Published(
+            "model.pth and args.json", "ZhengYinan-AIR/Diffusion-Planner", "diffusion-planner"
+        ),
     ),
     PlannerEntry(
         "idm",
@@ -75,6 +115,22 @@ _ENTRIES = (
         ),
     ),
     PlannerEntry(
+        "plantf",
+        "learned",
+        "shiftsim.planners.plantf:PlanTF",
+        "imitation with a transformer over agents and map",
+        ("checkpoint", "device"),
+        Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt"),
+    ),
+    PlannerEntry(
+        "pluto",
+        "learned",
+        "shiftsim.planners.pluto:Pluto",
+        "imitation with contrastive learning, and a choice among its plans by rules",
+        ("checkpoint", "device"),
+        Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt"),
+    ),
+    PlannerEntry(
         "scripted",
         "replay",
         "shiftsim.planners.scripted:Scripted",
@@ -102,11 +158,16 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
             current directory.
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
+    A learned planner without a `checkpoint` takes its published file from the folder of
+    checkpoints.
+
     Raises:
         ConfigError: The name, the module, the class or an argument is wrong.
+        CheckpointError: A learned planner has no checkpoint, or the wrong one.
+        MissingExtraError: A learned planner needs PyTorch.
     """
     factory = planner_factory(spec)
-    values = _bind(spec, factory, arguments or {})
+    values = _bind(spec, factory, _completed(spec, arguments or {}))
     planner = factory(**values)
     _require_methods(spec, planner)
     return planner
@@ -149,15 +210,25 @@ def planner_factory(spec: str) -> Any:
 def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """All that tells one planner from another, as JSON values.
 
-    Own planners carry the hash of their module's source, file arguments that of the file; what
-    else they depend on is not seen.
+    Own planners carry the hash of their module's source, file arguments that of the file, learned
+    planners that of their checkpoint and the kind of their device; what else they depend on is not
+    seen.
 
     Raises:
         ConfigError: The planner or an argument is wrong.
+        CheckpointError: A learned planner has no checkpoint.
+        MissingExtraError: A learned planner needs PyTorch.
     """
     entry = PLANNERS.get(spec)
     factory = planner_factory(spec)
-    values = _bind(spec, factory, arguments or {})
+    values = _bind(spec, factory, _completed(spec, arguments or {}))
+    learned = {}
+    if entry is not None and entry.checkpoint is not None:
+        from shiftsim.planners.checkpoint import checkpoint_fingerprint
+        from shiftsim.planners.device import resolve_device
+
+        learned["checkpoint"] = checkpoint_fingerprint(values.pop("checkpoint"), spec)
+        values["device"] = resolve_device(values.get("device", "cpu")).partition(":")[0]
     out: dict[str, Any] = {
         "planner": spec,
         "target": spec if entry is None else entry.target,
@@ -165,6 +236,7 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
             name: str(value) if isinstance(value, Path) else value
             for name, value in sorted(values.items())
         },
+        **learned,
     }
     files = {n: v for n, v in values.items() if isinstance(v, Path)}
     if files:
@@ -173,6 +245,33 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
     if source is not None:
         out["source"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
     return out
+
+
+def readiness(entry: PlannerEntry) -> str:
+    """What is missing to run a planner without further ado, in one line; empty where nothing."""
+    if entry.checkpoint is None:
+        return ""
+    if importlib.util.find_spec("torch") is None:
+        return "needs PyTorch: pip install 'shiftsim[learned]'"
+    path = checkpoint_folder() / entry.checkpoint.name
+    return "" if path.exists() else f"no checkpoint: give one, or put it at {path}"
+
+
+def _completed(spec: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Arguments with the published checkpoint where a learned planner is given none."""
+    entry = PLANNERS.get(spec)
+    if entry is None or entry.checkpoint is None:
+        return arguments
+    from shiftsim.planners.checkpoint import how_to_get
+    from shiftsim.planners.device import require_torch
+
+    require_torch(f"planner {spec!r}")
+    if arguments.get("checkpoint"):
+        return arguments
+    path = checkpoint_folder() / entry.checkpoint.name
+    if not path.exists():
+        raise CheckpointError(f"planner {spec!r} needs a checkpoint", hint=how_to_get(spec))
+    return {**arguments, "checkpoint": str(path)}
 
 
 def _hash_file(path: Path, spec: str, argument: str) -> str:

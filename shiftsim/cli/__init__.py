@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from shiftsim.cli import convert, reading, running, stores
+from shiftsim.cli import checkpoint, convert, reading, running, stores
 from shiftsim.errors import DataError, ShiftsimError
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
@@ -45,6 +45,7 @@ running.register(app)
 reading.register(app)
 convert.register(app)
 stores.register(app)
+checkpoint.register(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

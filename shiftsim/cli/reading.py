@@ -24,7 +24,8 @@ def register(app: typer.Typer) -> None:
     app.command()(doctor)
     _PLANNERS.command("list")(list_planners)
     _PLANNERS.command("check")(check_one_planner)
-    app.add_typer(_PLANNERS, name="planners", no_args_is_help=True)
+    _PLANNERS.callback(invoke_without_command=True)(planners)
+    app.add_typer(_PLANNERS, name="planners")
 
 
 def report(
@@ -118,18 +119,38 @@ def check(
         raise typer.Exit(_DATA)
 
 
-def list_planners(as_json: Json = False, debug: Debug = False) -> None:
-    """The planners that come with shiftsim."""
-    from shiftsim.planners import PLANNERS
+def planners(context: typer.Context, as_json: Json = False, debug: Debug = False) -> None:
+    """The planners that come with shiftsim, and whether they are ready to run."""
+    if context.invoked_subcommand is None:
+        list_planners(as_json)
 
+
+def list_planners(as_json: Json = False, debug: Debug = False) -> None:
+    """The planners that come with shiftsim, and whether they are ready to run."""
+    from dataclasses import asdict
+
+    from shiftsim.planners import PLANNERS, readiness
+
+    missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
     if as_json:
-        names = ("name", "kind", "description", "arguments")
-        say_json([{n: getattr(entry, n) for n in names} for entry in PLANNERS.values()])
+        say_json(
+            [
+                {**asdict(entry), "ready": not missing[name], "missing": missing[name]}
+                for name, entry in PLANNERS.items()
+            ]
+        )
         return
-    for entry in PLANNERS.values():
-        say(f" {entry.name:18} {entry.kind:11} {entry.description}")
+    for name, entry in PLANNERS.items():
+        say(f" {name:18} {entry.kind:11} {entry.description}")
+        if entry.checkpoint is not None:
+            published = f"{entry.checkpoint.file}, of the project {entry.checkpoint.project}"
+            say(f" {'':18} checkpoint  {published}")
         if entry.arguments:
-            say(f" {'':18} {'':11} --planner-arg {', '.join(entry.arguments)}")
+            say(f" {'':18} arguments   --planner-arg {', '.join(entry.arguments)}")
+        if missing[name]:
+            say(f" {'':18} not ready   {missing[name]}")
+    ready = sum(not text for text in missing.values())
+    say(f" {ready} of {len(missing)} are ready to run")
 
 
 def check_one_planner(
