@@ -28,18 +28,27 @@ class Attention(nn.Module):
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, keep: Tensor | None) -> Tensor:
         """Attend from (B, Q, D) to (B, N, D); `keep` (B, N) may be None."""
-        dim = query.shape[-1]
         weights, biases = self.in_proj_weight, self.in_proj_bias
         if query is key and key is value:
             q, k, v = functional.linear(query, weights, biases).chunk(3, dim=-1)
         else:
-            parts = zip((query, key, value), weights.split(dim), biases.split(dim), strict=True)
-            q, k, v = (functional.linear(*part) for part in parts)
-        mask = None if keep is None else keep[:, None, None, :]
-        heads = [x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x in (q, k, v)]
-        mixed = functional.scaled_dot_product_attention(*heads, attn_mask=mask)
+            q, k, v = (
+                functional.linear(x, weight, bias)
+                for x, weight, bias in zip(
+                    (query, key, value), weights.chunk(3), biases.chunk(3), strict=True
+                )
+            )
+        mixed = functional.scaled_dot_product_attention(
+            self._heads(q),
+            self._heads(k),
+            self._heads(v),
+            attn_mask=None if keep is None else keep[:, None, None, :],
+        )
         out: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))
         return out
+
+    def _heads(self, x: Tensor) -> Tensor:
+        return x.reshape(*x.shape[:2], self.num_heads, -1).transpose(1, 2)
 
 
 class Mlp(nn.Module):
@@ -89,21 +98,22 @@ class NeighborhoodAttention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(A, L, D) to (A, L, D)."""
-        qkv = self.qkv(x).unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
-        bias = self._bias(x.shape[1])
+        count, length, _ = x.shape
+        qkv = self.qkv(x).reshape(count, length, 3, self.num_heads, -1).permute(2, 0, 3, 1, 4)
+        bias = self._bias(length)
         mixed = functional.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2], attn_mask=bias)
         out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
         return out
 
     def _bias(self, length: int) -> Tensor:
-        """(heads, L, L) logits added for a pair of positions, -inf outside of the window."""
+        """(1, heads, L, L) logits added to a pair of positions, -inf outside of the window."""
         positions = torch.arange(length, device=self.rpb.device)
         first = (positions - self.window // 2).clamp(0, length - self.window)
         ahead = positions[None, :] - first[:, None]
         inside = (ahead >= 0) & (ahead < self.window)
         offset = positions[None, :] - positions[:, None] + self.window - 1
         bias = self.rpb[:, offset.clamp(0, 2 * self.window - 2)]
-        return bias.masked_fill(~inside, -torch.inf)
+        return bias.masked_fill(~inside, -torch.inf)[None]
 
 
 class _HistoryBlock(nn.Module):
@@ -127,7 +137,7 @@ class _Downsample(nn.Module):
         self.norm = nn.LayerNorm(2 * dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = self.norm(self.reduction(x.transpose(1, 2)).transpose(1, 2))
+        out: Tensor = self.norm(_convolved(self.reduction, functional.pad(x, (0, 0, 1, 1)), 2))
         return out
 
 
@@ -150,8 +160,7 @@ class _Embed(nn.Module):
         self.proj = nn.Conv1d(HISTORY_CHANNELS, _WIDTHS[0], 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = self.proj(x.transpose(1, 2)).transpose(1, 2)
-        return out
+        return _convolved(self.proj, functional.pad(x, (0, 0, 1, 1)))
 
 
 class HistoryEncoder(nn.Module):
@@ -161,41 +170,43 @@ class HistoryEncoder(nn.Module):
         super().__init__()
         self.embed = _Embed()
         self.levels = nn.ModuleList(_Level(index) for index in range(len(_WIDTHS)))
-        for index, width in enumerate(_WIDTHS):
-            self.add_module(f"norm{index}", nn.LayerNorm(width))
+        self.norm0, self.norm1, self.norm2 = (nn.LayerNorm(width) for width in _WIDTHS)
         self.lateral_convs = nn.ModuleList(nn.Conv1d(width, DIM, 3, padding=1) for width in _WIDTHS)
         self.fpn_conv = nn.Conv1d(DIM, DIM, 3, padding=1)
 
     def forward(self, steps: Tensor) -> Tensor:
         """(A, 20, 9) to (A, 128)."""
         x = self.embed(steps)
+        norms = (self.norm0, self.norm1, self.norm2)
         ends = []
-        for index, level in enumerate(self.levels):
+        for level, norm, lateral in zip(self.levels, norms, self.lateral_convs, strict=True):
+            assert isinstance(level, _Level)
             x = level(x)
-            normed = self.get_submodule(f"norm{index}")(x[:, -3:])
-            ends.append(_last_two(self.lateral_convs[index], normed.transpose(1, 2)))
+            ends.append(_end(lateral, norm(x[:, -3:])))
             if level.downsample is not None:
                 x = level.downsample(x)
         merged = ends[2]
         for end in (ends[1], ends[0]):
             merged = end + _upsampled_end(merged)
-        return _last(self.fpn_conv, merged)
+        return _end(self.fpn_conv, merged)[:, 0]
 
 
-def _last_two(conv: nn.Module, end: Tensor) -> Tensor:
-    """(A, C', 2) the last two steps of a padded convolution, of the last three steps (A, C, 3)."""
-    return functional.conv1d(functional.pad(end, (0, 1)), conv.weight, conv.bias)
+def _convolved(conv: nn.Module, x: Tensor, stride: int = 1) -> Tensor:
+    """Convolution of width 3 without padding, (A, L, C) to (A, L', C'), as one product."""
+    assert isinstance(conv, nn.Conv1d)
+    windows = x.unfold(1, 3, stride).flatten(2)
+    return functional.linear(windows, conv.weight.flatten(1), conv.bias)
 
 
-def _last(conv: nn.Conv1d, end: Tensor) -> Tensor:
-    """(A, C') the last step of a padded convolution, of the last two steps (A, C, 2)."""
-    return functional.linear(end.flatten(1), conv.weight[:, :, :2].flatten(1), conv.bias)
+def _end(conv: nn.Module, end: Tensor) -> Tensor:
+    """The last k - 1 steps of a padded convolution, of the last k steps before it (A, k, C)."""
+    return _convolved(conv, functional.pad(end, (0, 0, 0, 1)))
 
 
 def _upsampled_end(end: Tensor) -> Tensor:
     """The last two steps of a sequence upsampled linearly by 2, of its last two steps."""
-    before, last = end[..., 0], end[..., 1]
-    return torch.stack([0.25 * before + 0.75 * last, last], dim=-1)
+    before, last = end[:, 0], end[:, 1]
+    return torch.stack([0.25 * before + 0.75 * last, last], dim=1)
 
 
 class EgoStateEncoder(nn.Module):
@@ -210,9 +221,8 @@ class EgoStateEncoder(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, scalars) to (B, D)."""
-        weight = torch.stack([linear.weight[:, 0] for linear in self.linears])
-        bias = torch.stack([linear.bias for linear in self.linears])
-        tokens = state[:, :, None] * weight + bias + self.pos_embed
+        embedded = [linear(state[:, i, None]) for i, linear in enumerate(self.linears)]
+        tokens = torch.stack(embedded, dim=1) + self.pos_embed
         query = self.query.expand(len(state), -1, -1)
         out: Tensor = self.attn(query, tokens, tokens, None)[:, 0]
         return out
@@ -280,32 +290,45 @@ class PointsEncoder(nn.Module):
 
     def __init__(self, channels: int, out: int = DIM) -> None:
         super().__init__()
-        self.first_mlp = nn.Sequential(
-            nn.Linear(channels, 128), nn.BatchNorm1d(128), nn.ReLU(), nn.Linear(128, 256)
-        )
-        self.second_mlp = nn.Sequential(
-            nn.Linear(512, 256), nn.BatchNorm1d(256), nn.ReLU(), nn.Linear(256, out)
-        )
+        self.first_mlp = _points_mlp(channels, 128, 256)
+        self.second_mlp = _points_mlp(512, 256, out)
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, out)."""
-        lines, line = points.flatten(0, 1), keep.flatten(0, 1)
-        batch, count = points.shape[:2]
-        row, _ = torch.nonzero(line, as_tuple=True)
-        first = self.first_mlp(lines[line])
-        pooled = _scattered_max(first, line)
+        (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
+        line = row // keep.shape[2]
+        weight, bias, last = _folded(self.first_mlp)
+        rows = points.flatten(0, 2)[row]
+        first = last(functional.linear(rows, weight, bias).relu_())
+        pooled = _pooled(first, row, keep)
         # Linear([point, pooled]) in two parts: that of the line is the same for all its points
-        widen, norm, relu, narrow = self.second_mlp
+        weight, bias, last = _folded(self.second_mlp)
         half = first.shape[1]
-        of_line = functional.linear(pooled, widen.weight[:, half:], widen.bias)
-        mixed = functional.linear(first, widen.weight[:, :half]) + of_line[row]
-        out = _scattered_max(narrow(relu(norm(mixed))), line)
-        return out.unflatten(0, (batch, count))
+        of_line = functional.linear(pooled, weight[:, half:], bias)
+        mixed = torch.addmm(of_line[line], first, weight[:, :half].t()).relu_()
+        return _pooled(last(mixed), row, keep).reshape(*keep.shape[:2], -1)
 
 
-def _scattered_max(values: Tensor, keep: Tensor) -> Tensor:
-    """(M, C) maximum over the points of each line; points without a value count as zero."""
-    dense = values.new_zeros(*keep.shape, values.shape[1])
-    dense[keep] = values
-    out: Tensor = dense.amax(dim=1)
-    return out
+def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, outputs)
+    )
+
+
+def _folded(mlp: nn.Sequential) -> tuple[Tensor, Tensor, nn.Module]:
+    """Weight and bias of the first layer with the normalisation in them, and the last layer."""
+    linear, norm, _, last = mlp
+    assert isinstance(linear, nn.Linear)
+    assert isinstance(norm, nn.BatchNorm1d)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    bias = (linear.bias - norm.running_mean) * scale + norm.bias
+    return linear.weight * scale[:, None], bias, last
+
+
+def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
+    """(B M, C) maximum over the points of each line; points without a value count as zero."""
+    dense = values.new_zeros(keep.numel(), values.shape[1])
+    dense.index_copy_(0, row, values)
+    return dense.reshape(-1, keep.shape[2], values.shape[1]).amax(dim=1)

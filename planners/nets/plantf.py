@@ -16,10 +16,11 @@ from shiftsim.planners.nets.blocks import (
 )
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
+STATE_CHANNELS = POLYGON_CHANNELS = 6
 RELEASED = {
     "dim": DIM,
-    "state_channel": 6,
-    "polygon_channel": 6,
+    "state_channel": STATE_CHANNELS,
+    "polygon_channel": POLYGON_CHANNELS,
     "history_channel": 9,
     "history_steps": 21,
     "future_steps": 80,
@@ -140,8 +141,9 @@ class TrajectoryDecoder(nn.Module):
 
     def forward(self, ego: Tensor) -> tuple[Tensor, Tensor]:
         """Trajectories (B, modes, steps, 4) and logits (B, modes) from (B, 128)."""
-        modes = self.multimodal_proj(ego).unflatten(-1, (self.num_modes, DIM))
-        return self.loc(modes).unflatten(-1, (self.future_steps, 4)), self.pi(modes)[..., 0]
+        modes = self.multimodal_proj(ego).reshape(len(ego), self.num_modes, DIM)
+        trajectories = self.loc(modes).reshape(len(ego), self.num_modes, self.future_steps, 4)
+        return trajectories, self.pi(modes)[..., 0]
 
 
 def _head(outputs: int, *, bias: bool = True) -> nn.Sequential:
@@ -159,8 +161,8 @@ class PlanTfNetwork(nn.Module):
     def __init__(self, encoder_depth: int, num_heads: int, num_modes: int, steps: int) -> None:
         super().__init__()
         self.pos_emb = nn.Sequential(nn.Linear(4, DIM), nn.ReLU(), nn.Linear(DIM, DIM))
-        self.agent_encoder = AgentEncoder(RELEASED["state_channel"])
-        self.map_encoder = MapEncoder(RELEASED["polygon_channel"])
+        self.agent_encoder = AgentEncoder(STATE_CHANNELS)
+        self.map_encoder = MapEncoder(POLYGON_CHANNELS)
         self.encoder_blocks = nn.ModuleList(
             EncoderBlock(DIM, num_heads) for _ in range(encoder_depth)
         )
@@ -185,8 +187,11 @@ class PlanTfNetwork(nn.Module):
             x = block(x, keep, wanted if index == last else None)
         x = self.norm(x)
         trajectory, probability = self.trajectory_decoder(x[:, 0])
-        prediction = self.agent_predictor(x[:, 1:]).unflatten(-1, (-1, 2)) if predict else None
-        return Outputs(trajectory, probability, prediction)
+        if not predict:
+            return Outputs(trajectory, probability, None)
+        prediction = self.agent_predictor(x[:, 1:])
+        shape = (*prediction.shape[:2], -1, 2)
+        return Outputs(trajectory, probability, prediction.reshape(shape))
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:
