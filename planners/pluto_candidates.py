@@ -1,0 +1,97 @@
+"""What PLUTO's network proposes, in the map frame (planner-pluto.md §3.3, §4)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+
+MAX_CANDIDATES = 20  # that compete by their logits
+REFERENCE_FREE_SCORE = 0.25
+STEPS = 80  # of a trajectory
+
+
+class Output(NamedTuple):
+    """What the network says about one scenario, in the ego frame. All float32.
+
+    Attributes:
+        trajectory: (R, 12, 80, 6) x, y [m], cos, sin of the heading, velocity [m/s].
+        probability: (R, 12) logits.
+        prediction: (A, 80, 6) of the agents, relative to their present poses; columns likewise.
+        ref_free_trajectory: (80, 4) x, y [m], cos, sin of the heading.
+    """
+
+    trajectory: np.ndarray
+    probability: np.ndarray
+    prediction: np.ndarray
+    ref_free_trajectory: np.ndarray
+
+
+def headings_of(trajectory: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) float32 from columns x, y, cos, sin."""
+    poses: np.ndarray = np.concatenate(
+        [trajectory[..., :2], np.arctan2(trajectory[..., 3:4], trajectory[..., 2:3])], -1
+    )
+    return poses
+
+
+def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
+    """Poses (..., 3) of the ego frame in the map frame; headings are not wrapped."""
+    cos, sin = np.cos(rear[2]), np.sin(rear[2])
+    local = poses.astype(np.float64)
+    out = np.empty_like(local)
+    out[..., 0] = local[..., 0] * cos - local[..., 1] * sin + rear[0]
+    out[..., 1] = local[..., 0] * sin + local[..., 1] * cos + rear[1]
+    out[..., 2] = local[..., 2] + rear[2]
+    return out
+
+
+def candidates(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The trajectories that are scored, best logit first and the reference-free one last.
+
+    Args:
+        output: Of the network; at least one reference line.
+        rear: (3,) rear axle x [m], y [m], heading [rad].
+
+    Returns:
+        Poses (P, 81, 3) and scores (P,). nuPlan: the pose of 0.1 s is also that of 0 s.
+    """
+    logits = output.probability.reshape(-1)
+    # nuPlan: NumPy's default sort, and a softmax over what it keeps
+    best = np.argsort(-logits)[:MAX_CANDIDATES]
+    powers = np.exp(logits[best] - logits[best].max())
+    scores = np.append((powers / powers.sum()).astype(np.float64), REFERENCE_FREE_SCORE)
+    kept = output.trajectory.reshape(-1, STEPS, output.trajectory.shape[-1])[best]
+    free = output.ref_free_trajectory[None]
+    local = np.concatenate([headings_of(kept), headings_of(free)])
+    return repeat_first(to_map(local, rear)), scores
+
+
+def repeat_first(poses: FloatArray) -> FloatArray:
+    """Trajectories (P, 81, 3) from (P, 80, 3), the first pose twice."""
+    return np.concatenate([poses[:, :1], poses], axis=1)
+
+
+def predicted_agents(
+    output: Output, present: FloatArray, velocity: FloatArray, rear: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where the agents will be.
+
+    Args:
+        output: Of the network.
+        present: (A, 3) poses now, in the ego frame.
+        velocity: (A, 2) velocities now [m/s].
+        rear: (3,) rear axle x [m], y [m], heading [rad].
+
+    Returns:
+        Poses (A, 81, 3) in the map frame and speeds (A, 81) from now on, every 0.1 s.
+    """
+    motion = output.prediction
+    poses = np.empty((len(present), STEPS + 1, 3))
+    poses[:, 0] = present
+    poses[:, 1:] = headings_of(motion)
+    poses[:, 1:] += present[:, None]
+    speeds = np.empty((len(present), STEPS + 1))
+    speeds[:, 0] = np.hypot(velocity[:, 0], velocity[:, 1])
+    speeds[:, 1:] = np.hypot(motion[..., 4], motion[..., 5])
+    return to_map(poses, rear), speeds
