@@ -1,0 +1,216 @@
+"""Lines and areas on a pixel grid, with the pixels that OpenCV sets (planner-carl.md §2.1).
+
+Vertices are whole pixels; x is the column, y the row. Three rules make the picture:
+
+* A line is Bresenham's, 8-connected, walked from the left end to the right one. One that leaves the
+  picture is cut at its borders first, and the cut ends are rounded towards the first one.
+* An area is its outline, and in every row the pixels between the first and the second crossing of
+  the outline, between the third and the fourth, and so on. An edge crosses the rows from its upper
+  end on, its lower end not counted, at columns with 16 fractional bits, to the nearest pixel.
+* An edge of a general area that leaves the picture goes through its cut ends, and its columns are
+  rounded down. Edges of a box are not cut.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import IntArray, kernel
+
+_ONE, _HALF = 1 << 16, 1 << 15  # a pixel, and half of one, in fixed point
+
+Picture = NDArray[np.uint8]
+
+
+@kernel
+def draw_polyline(picture: Picture, xy: IntArray, value: int) -> None:
+    """Draw an open line through pixels (K, 2), of which there must be two at least."""
+    for index in range(1, len(xy)):
+        draw_line(
+            picture, xy[index - 1, 0], xy[index - 1, 1], xy[index, 0], xy[index, 1], value
+        )
+
+
+@kernel
+def draw_line(picture: Picture, x0: int, y0: int, x1: int, y1: int, value: int) -> None:
+    """Draw a line between two pixels, both included."""
+    height, width = picture.shape
+    if not (_within(x0, y0, width, height) and _within(x1, y1, width, height)):
+        visible, x0, y0, x1, y1 = _cut(x0, y0, x1, y1, width, height)
+        if not visible:
+            return
+    if x1 < x0:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    run, rise, down = x1 - x0, abs(y1 - y0), 1 if y1 > y0 else -1
+    steep = rise > run
+    long, short = (rise, run) if steep else (run, rise)
+    error = long - 2 * short
+    x, y = x0, y0
+    picture[y, x] = value
+    for _ in range(long):
+        aside = error < 0
+        error += 2 * (long - short) if aside else -2 * short
+        if steep:
+            y += down
+            x += aside
+        else:
+            x += 1
+            if aside:
+                y += down
+        picture[y, x] = value
+
+
+@kernel
+def _within(x: int, y: int, width: int, height: int) -> bool:
+    return 0 <= x < width and 0 <= y < height
+
+
+@kernel
+def _side(at: int, size: int) -> int:
+    """Where a coordinate is: -1 before the picture, 1 behind it, 0 in it."""
+    return -1 if at < 0 else (1 if at >= size else 0)
+
+
+@kernel
+def _cut(
+    x0: int, y0: int, x1: int, y1: int, width: int, height: int
+) -> tuple[bool, int, int, int, int]:
+    """Cut a line at the borders: whether it can be seen, and its ends as far as they were cut."""
+    sx0, sy0, sx1, sy1 = _side(x0, width), _side(y0, height), _side(x1, width), _side(y1, height)
+    if _apart(sx0, sx1) or _apart(sy0, sy1):
+        return False, x0, y0, x1, y1
+    if sy0 != 0:
+        border = 0 if sy0 < 0 else height - 1
+        x0 += int(float(border - y0) * (x1 - x0) / (y1 - y0))
+        y0 = border
+        sx0 = _side(x0, width)
+    if sy1 != 0:
+        border = 0 if sy1 < 0 else height - 1
+        x1 += int(float(border - y1) * (x1 - x0) / (y1 - y0))
+        y1 = border
+        sx1 = _side(x1, width)
+    if _apart(sx0, sx1):
+        return False, x0, y0, x1, y1
+    if sx0 != 0:
+        border = 0 if sx0 < 0 else width - 1
+        y0 += int(float(border - x0) * (y1 - y0) / (x1 - x0))
+        x0 = border
+    if sx1 != 0:
+        border = 0 if sx1 < 0 else width - 1
+        y1 += int(float(border - x1) * (y1 - y0) / (x1 - x0))
+        x1 = border
+    return True, x0, y0, x1, y1
+
+
+@kernel
+def _apart(side0: int, side1: int) -> bool:
+    """Whether both ends lie beyond the same border."""
+    return side0 * side1 > 0
+
+
+@kernel
+def _quotient(dividend: int, divisor: int) -> int:
+    """Whole quotient, rounded towards zero; the divisor is positive."""
+    return dividend // divisor if dividend >= 0 else -(-dividend // divisor)
+
+
+class Crossings(NamedTuple):
+    """Room for the columns at which an outline crosses the rows.
+
+    Attributes:
+        columns: (H, V) columns of each row; an area of up to V vertices can be filled.
+        counts: (H,) how many of them are used; all 0 between two areas.
+    """
+
+    columns: NDArray[np.int32]
+    counts: IntArray
+
+
+def make_crossings(height: int, max_vertices: int) -> Crossings:
+    """Room for pictures of a given height, and areas of so many vertices at most."""
+    return Crossings(
+        np.empty((height, max(max_vertices, 4)), np.int32), np.zeros(height, np.int64)
+    )
+
+
+@kernel
+def fill_area(picture: Picture, xy: IntArray, value: int, crossings: Crossings) -> None:
+    """Fill the area within a ring of pixels (V, 2), by the even-odd rule."""
+    height, width = picture.shape
+    top, bottom = height, -1
+    bx, by = xy[-1, 0], xy[-1, 1]
+    for index in range(len(xy)):
+        ax, ay = bx, by
+        bx, by = xy[index, 0], xy[index, 1]
+        top, bottom = min(top, by), max(bottom, by)
+        draw_line(picture, ax, ay, bx, by, value)
+        if ay == by or max(ay, by) <= 0 or min(ay, by) >= height:
+            continue
+        cx, cy, dx, dy = ax, ay, bx, by
+        shift = _HALF
+        if not (_within(ax, ay, width, height) and _within(bx, by, width, height)):
+            _, cx, cy, dx, dy = _cut(ax, ay, bx, by, width, height)
+            shift = 0
+            if cy == dy:
+                cx, cy, dx, dy = ax, ay, bx, by
+        if dy < cy:
+            cx, cy, dx, dy = dx, dy, cx, cy
+        slope = _quotient((dx - cx) * _ONE, dy - cy)
+        first = min(ay, by)
+        _cross(crossings, first, max(ay, by), cx * _ONE + shift + (first - cy) * slope, slope)
+    _fill_rows(picture, max(top, 0), min(bottom, height - 1), value, crossings)
+
+
+@kernel
+def fill_box(picture: Picture, xy: IntArray, value: int, crossings: Crossings) -> None:
+    """Fill a convex ring of pixels (4, 2)."""
+    height = picture.shape[0]
+    top, bottom = height, -1
+    bx, by = xy[-1, 0], xy[-1, 1]
+    for index in range(len(xy)):
+        ax, ay = bx, by
+        bx, by = xy[index, 0], xy[index, 1]
+        top, bottom = min(top, by), max(bottom, by)
+        draw_line(picture, ax, ay, bx, by, value)
+        if ay == by or max(ay, by) <= 0 or min(ay, by) >= height:
+            continue
+        cx, cy, dx, dy = (ax, ay, bx, by) if ay < by else (bx, by, ax, ay)
+        slope = _quotient(2 * (dx - cx) * _ONE + (dy - cy), 2 * (dy - cy))
+        _cross(crossings, cy, dy, cx * _ONE + _HALF, slope)
+    _fill_rows(picture, max(top, 0), min(bottom, height - 1), value, crossings)
+
+
+@kernel
+def _cross(crossings: Crossings, first: int, stop: int, start: int, slope: int) -> None:
+    """Note where an edge crosses the rows `first` … `stop` - 1.
+
+    Args:
+        crossings: Receives the columns.
+        first: Row of the upper end.
+        stop: Row of the lower end.
+        start: Column in the first row, fixed point.
+        slope: Columns per row, fixed point.
+    """
+    for row in range(max(first, 0), min(stop, len(crossings.counts))):
+        count = crossings.counts[row]
+        crossings.columns[row, count] = (start + (row - first) * slope) >> 16
+        crossings.counts[row] = count + 1
+
+
+@kernel
+def _fill_rows(picture: Picture, top: int, bottom: int, value: int, crossings: Crossings) -> None:
+    """Fill the rows between the noted columns, and forget these."""
+    width = picture.shape[1]
+    for row in range(top, bottom + 1):
+        count, columns = crossings.counts[row], crossings.columns[row]
+        crossings.counts[row] = 0
+        for index in range(1, count):  # few and nearly sorted
+            column, place = columns[index], index
+            while place > 0 and columns[place - 1] > column:
+                columns[place] = columns[place - 1]
+                place -= 1
+            columns[place] = column
+        for index in range(0, count - 1, 2):
+            for column in range(max(columns[index], 0), min(columns[index + 1] + 1, width)):
+                picture[row, column] = value
