@@ -171,7 +171,7 @@ class SceneEncoder(nn.Module):
         split = [part.shape[1] for part in used]
         rows = [agents[used[0]], objects[used[1]], lanes[used[2]]]
         for out, where, token in zip(
-            tokens.split(split, dim=1),
+            torch.split(tokens, split, dim=1),
             used,
             (
                 self.neighbor_encoder(rows[0]) + self.pos_emb(_positions(rows[0][:, -1], 0)),

@@ -1,4 +1,4 @@
-"""Building blocks of the Diffusion Planner's network, with the parameter names of its checkpoint."""
+"""Building blocks of the Diffusion Planner's network, with the names of its checkpoint."""
 
 import torch
 from torch import Tensor, nn
@@ -124,4 +124,4 @@ class Attention(nn.Module):
         return self._split(query), self._split(keys), self._split(values)
 
     def _split(self, x: Tensor) -> Tensor:
-        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        return x.view(*x.shape[:-1], self.heads, -1).transpose(1, 2)

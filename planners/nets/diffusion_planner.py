@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.nets.diffusion_decoder import DiT, Prepared
-from shiftsim.planners.nets.diffusion_encoder import AGENT_COLUMNS, SceneEncoder
+from shiftsim.planners.nets.diffusion_encoder import SceneEncoder
 from shiftsim.planners.nets.diffusion_sampler import SCHEDULE, STATE, sample
 
 PREFIXES = ("module.",)  # of the official file; left by distributed training

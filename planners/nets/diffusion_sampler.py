@@ -114,4 +114,4 @@ def sample(network: Callable[[Tensor, int], Tensor], current: Tensor, noise: Ten
         x[..., :STATE] = current
     x = network(x, STEPS)
     x[..., :STATE] = current
-    return x.unflatten(-1, (-1, STATE))
+    return x.view(*x.shape[:-1], -1, STATE)
