@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from shiftsim.cli import checkpoint, convert, reading, running, stores
+from shiftsim.cli import checkpoint, convert, reading, running, stores, viewing
 from shiftsim.errors import DataError, ShiftsimError
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
@@ -43,6 +43,7 @@ def _options(
 
 running.register(app)
 reading.register(app)
+viewing.register(app)
 convert.register(app)
 stores.register(app)
 checkpoint.register(app)

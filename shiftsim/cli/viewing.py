@@ -1,0 +1,128 @@
+"""Commands that show: view, plot."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from shiftsim.cli.common import Debug, Quiet, plural, progress_bar, say
+
+if TYPE_CHECKING:
+    from shiftsim.viewer.build import Gallery
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
+Others = Annotated[
+    list[Path] | None,
+    typer.Option("--with", help="Another run on the same store, shown together; repeatable."),
+]
+Planners = Annotated[
+    list[str] | None, typer.Option("--planner", "-p", help="Only this planner; repeatable.")
+]
+Noises = Annotated[
+    list[str] | None, typer.Option("--noise", "-n", help="Only this noise; repeatable.")
+]
+Seeds = Annotated[
+    list[int] | None, typer.Option("--seed", help="Only this seed; repeatable. [the first]")
+]
+Store = Annotated[
+    str | None, typer.Option("--store", "-s", help="Name or folder. [the manifest's]")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command()(view)
+    app.command()(plot)
+
+
+def view(
+    run: RunFolder,
+    token: Annotated[
+        str | None, typer.Argument(metavar="[TOKEN]", help="A scenario. [all of them]")
+    ] = None,
+    others: Others = None,
+    planner: Planners = None,
+    noise: Noises = None,
+    seed: Seeds = None,
+    store: Store = None,
+    limit: Annotated[int, typer.Option(help="Only the N with the lowest scores, 0 for all.")] = 200,
+    out: Annotated[Path | None, typer.Option(help="Folder to write to. [RUN/view]")] = None,
+    browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
+    ] = True,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Replay rollouts in the browser: pages that need no server and no network."""
+    from shiftsim.viewer.build import page_name
+
+    gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
+    folder = out or run / "view"
+    if token is not None:
+        token = gallery.find(token)
+        folder.mkdir(parents=True, exist_ok=True)
+        page = folder / page_name(token)
+        page.write_text(gallery.page(token), encoding="utf-8")
+    else:
+        with progress_bar(quiet=quiet) as advance:
+            tokens = gallery.write(
+                folder, limit=limit, on_progress=lambda done, total: advance(done, total, "")
+            )
+        left = len(gallery.tokens) - len(tokens)
+        say(f"{plural(len(tokens), 'replay')}{f', {left} more with --limit 0' if left else ''}")
+        page = folder / "index.html"
+    say(f"written: {page}")
+    if browser:
+        _open(page)
+
+
+def plot(
+    run: RunFolder,
+    token: Annotated[str, typer.Argument(metavar="TOKEN", help="A scenario.")],
+    at: Annotated[float, typer.Option(help="Time of a still from the start [s].")] = 0.0,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg, or a film: .mp4 or .gif.")
+    ] = Path("figure.pdf"),
+    others: Others = None,
+    planner: Planners = None,
+    noise: Noises = None,
+    seed: Seeds = None,
+    store: Store = None,
+    debug: Debug = False,
+) -> None:
+    """The driven paths of several rollouts over the map, as a still or a film."""
+    from shiftsim.viewer.figure import save_figure
+
+    gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
+    token = gallery.find(token)
+    scenario = gallery.store.read(token)
+    save_figure(out, scenario, gallery.shown(token, scenario), at=at)
+    say(f"written: {out}")
+
+
+def _gallery(
+    runs: list[Path],
+    planner: list[str] | None,
+    noise: list[str] | None,
+    seed: list[int] | None,
+    store: str | None,
+) -> "Gallery":
+    from shiftsim.results import open_run
+    from shiftsim.runner import open_named_store
+    from shiftsim.viewer.build import Choice, Gallery
+
+    opened = [open_run(path) for path in runs]
+    found = open_named_store(store or opened[0].manifest["store"])
+    choice = Choice(tuple(planner or ()), tuple(noise or ()), tuple(seed or ()))
+    return Gallery(opened, found, choice)
+
+
+def _open(page: Path) -> None:
+    """Show the page, where there is a screen."""
+    import os
+    import sys
+    import webbrowser
+
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if screen or sys.platform != "linux":
+        webbrowser.open(page.resolve().as_uri())

@@ -1,0 +1,103 @@
+"use strict";
+// The list of scenarios: sorted, filtered, each row a link into its replay at the first violation.
+
+const byId = (id) => document.getElementById(id);
+const rows = JSON.parse(byId("data-rows").textContent);
+const PAGE = 200;
+let sorting = { key: "cls", up: true };
+let room = PAGE;
+
+for (const row of rows) {
+  const times = Object.values(row.violated).filter((t) => t !== null);
+  row.first = times.length ? Math.min(...times) : Infinity;
+}
+
+function options(id, values) {
+  for (const value of [...new Set(values)].sort()) {
+    const option = document.createElement("option");
+    option.value = value;
+    option.textContent = value;
+    byId(id).append(option);
+  }
+}
+
+function matches(row) {
+  for (const name of ["city", "planner", "noise"]) {
+    if (byId(name).value && row[name] !== byId(name).value) return false;
+  }
+  const violated = byId("violated").value;
+  if (violated && !(violated in row.violated)) return false;
+  const score = row.cls === null ? 0 : 100 * row.cls;
+  if (score < Number(byId("low").value) || score > Number(byId("high").value)) return false;
+  const wanted = byId("find").value.trim().toLowerCase();
+  return !wanted || row.token.toLowerCase().includes(wanted) || row.type.toLowerCase().includes(wanted);
+}
+
+function compare(a, b) {
+  const [x, y] = [a[sorting.key], b[sorting.key]];
+  const order = x === y ? 0 : x === null || x < y ? -1 : 1;
+  return sorting.up ? order : -order;
+}
+
+function violatedText(row) {
+  const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
+  return parts.map(([name, t]) => (t === null ? name : `${name} ${t.toFixed(1)} s`)).join(" · ");
+}
+
+function linkOf(row) {
+  const at = Number.isFinite(row.first) ? `t=${row.first.toFixed(2)}&` : "";
+  return `${row.page}#${at}focus=${row.index + 1}`;
+}
+
+function line(row) {
+  const tr = document.createElement("tr");
+  const link = document.createElement("a");
+  link.href = linkOf(row);
+  link.textContent = row.token;
+  const score = row.cls === null ? "–" : (100 * row.cls).toFixed(2);
+  const seed = row.noise === "none" ? "" : row.seed;
+  const cells = [link, row.type, row.city, row.planner, row.noise, seed, score, violatedText(row)];
+  for (const [i, content] of cells.entries()) {
+    const td = document.createElement("td");
+    if (i === 6) td.className = "number";
+    td.append(content);
+    tr.append(td);
+  }
+  return tr;
+}
+
+function show() {
+  const found = rows.filter(matches).sort(compare);
+  byId("list").tBodies[0].replaceChildren(...found.slice(0, room).map(line));
+  byId("count").textContent = `${found.length} of ${rows.length} rollouts`;
+  byId("more").hidden = found.length <= room;
+  for (const th of byId("list").tHead.rows[0].cells) {
+    if (th.dataset.key === sorting.key) th.ariaSort = sorting.up ? "ascending" : "descending";
+    else th.ariaSort = null;
+  }
+}
+
+options("city", rows.map((row) => row.city));
+options("planner", rows.map((row) => row.planner));
+options("noise", rows.map((row) => row.noise));
+options("violated", rows.flatMap((row) => Object.keys(row.violated)));
+for (const id of ["city", "planner", "noise", "violated", "low", "high", "find"]) {
+  byId(id).addEventListener("input", () => {
+    room = PAGE;
+    show();
+  });
+}
+for (const th of byId("list").tHead.rows[0].cells) {
+  th.tabIndex = 0;
+  const sort = () => {
+    sorting = { key: th.dataset.key, up: th.dataset.key === sorting.key ? !sorting.up : true };
+    show();
+  };
+  th.addEventListener("click", sort);
+  th.addEventListener("keydown", (event) => event.key === "Enter" && sort());
+}
+byId("more").addEventListener("click", () => {
+  room += PAGE;
+  show();
+});
+show();

@@ -1,0 +1,611 @@
+"use strict";
+// The page: what is shown, at which time, and how the user moves through it.
+
+const MAX_SCALE = 60; // pixels per metre
+const MIN_SCALE = 0.5;
+const SMALL = 680; // pixels of window height below which only the speed is drawn as a curve
+const CLEAN = [];
+const NOISY = [7, 5];
+const EXPERT = "#6e6e6e";
+
+const byId = (id) => document.getElementById(id);
+const meta = JSON.parse(byId("data-meta").textContent);
+
+const state = {
+  t: 0,
+  playing: false,
+  rate: 1,
+  focus: 0,
+  shown: meta.rollouts.map(() => true),
+  follow: true,
+  side: false,
+  expert: true,
+  plans: true,
+  scale: 6,
+  centre: null,
+};
+const rollouts = meta.rollouts.map(() => null); // fields, once decoded
+let scene, map, times, strips, panels, highlighted = -1;
+
+const canvas = byId("scene");
+const context = canvas.getContext("2d", { alpha: false });
+const dashOf = (rollout) => (rollout.noise === "none" ? CLEAN : NOISY);
+const labelOf = (rollout) =>
+  rollout.noise === "none" ? rollout.planner : `${rollout.planner} ${rollout.noise} #${rollout.seed}`;
+const duration = () => times[times.length - 1];
+
+// ---- time ----
+
+function sampleAt(t) {
+  let row = Math.min(Math.floor((t / duration()) * (times.length - 1)), times.length - 1);
+  while (row > 0 && times[row] > t + 1e-6) row--;
+  while (row + 1 < times.length && times[row + 1] <= t + 1e-6) row++;
+  const next = Math.min(row + 1, times.length - 1);
+  const span = times[next] - times[row];
+  return { row, next, share: span > 0 ? Math.min(Math.max((t - times[row]) / span, 0), 1) : 0 };
+}
+
+function seek(t) {
+  state.t = Math.min(Math.max(t, 0), duration());
+  draw();
+  byId("time").value = state.t;
+  if (!state.playing) saveState();
+}
+
+function stepBy(samples) {
+  pause();
+  const { row } = sampleAt(state.t);
+  seek(times[Math.min(Math.max(row + samples, 0), times.length - 1)]);
+}
+
+let lastFrame = 0;
+function frame(now) {
+  if (!state.playing) return;
+  const t = state.t + (state.rate * (now - lastFrame)) / 1000;
+  lastFrame = now;
+  if (t >= duration()) pause();
+  seek(t);
+  if (state.playing) requestAnimationFrame(frame);
+}
+
+function play() {
+  if (state.t >= duration() - 1e-6) state.t = 0;
+  state.playing = true;
+  byId("play").textContent = "❚❚";
+  lastFrame = performance.now();
+  requestAnimationFrame(frame);
+}
+
+function pause() {
+  state.playing = false;
+  byId("play").textContent = "▶";
+  saveState();
+}
+
+// ---- violations ----
+
+function violations() {
+  return meta.rollouts
+    .flatMap((rollout, index) => rollout.violations.map((item) => ({ ...item, index })))
+    .filter((item) => state.shown[item.index])
+    .sort((a, b) => a.t - b.t);
+}
+
+function nextViolation() {
+  const all = violations();
+  if (!all.length) return;
+  jumpTo(all.find((item) => item.t > state.t + 1e-6) || all[0]);
+}
+
+function jumpTo(violation) {
+  pause();
+  setFocus(violation.index);
+  const names = tracksOf(violation.index).names;
+  highlighted = violation.partner ? names.indexOf(violation.partner) : -1;
+  state.follow = true;
+  syncOptions();
+  seek(violation.t);
+}
+
+// ---- what is shown ----
+
+function tracksOf(index) {
+  return meta.ownTracks
+    ? { fields: rollouts[index], names: meta.rollouts[index].tracks }
+    : { fields: scene, names: meta.tracks };
+}
+
+async function show(index, on) {
+  if (on && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+  state.shown[index] = on;
+  if (!state.shown.some(Boolean)) state.shown[index] = true; // something must remain
+  if (!state.shown[state.focus]) state.focus = state.shown.indexOf(true);
+  if (!rollouts[state.focus]) await show(state.focus, true);
+  changed();
+}
+
+function setFocus(index) {
+  state.focus = index;
+  if (!state.shown[index]) show(index, true);
+  highlighted = -1;
+  changed();
+}
+
+function changed() {
+  for (const [index, element] of [...byId("rollouts").children].entries()) {
+    element.classList.toggle("focus", index === state.focus);
+    element.querySelector("input").checked = state.shown[index];
+  }
+  byId("violation").disabled = !violations().length;
+  showCurves();
+  layOut();
+  saveState();
+}
+
+function visible() {
+  return rollouts.map((fields, index) => index).filter((i) => state.shown[i] && rollouts[i]);
+}
+
+// ---- drawing ----
+
+function layOut() {
+  const ratio = window.devicePixelRatio || 1;
+  const { clientWidth: width, clientHeight: height } = byId("stage");
+  canvas.width = Math.round(width * ratio);
+  canvas.height = Math.round(height * ratio);
+  const groups = state.side ? visible().map((i) => [i]) : [visible()];
+  const columns = Math.ceil(Math.sqrt((groups.length * width) / Math.max(height, 1) / 1.4)) || 1;
+  const across = Math.min(columns, groups.length);
+  const down = Math.ceil(groups.length / across);
+  panels = groups.map((members, i) => {
+    const panel = (panels && panels[i] && panels[i].panel) || new Panel(map);
+    const left = ((i % across) * width) / across;
+    const top = (Math.floor(i / across) * height) / down;
+    panel.place(left, top, width / across, height / down, state.scale, ratio);
+    return { panel, members };
+  });
+  draw();
+}
+
+function egoPose(index, at) {
+  return poseAt(rollouts[index], "ego", 1, 0, at);
+}
+
+function draw() {
+  if (!panels) return;
+  const at = sampleAt(state.t);
+  const ratio = window.devicePixelRatio || 1;
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.fillStyle = "#ffffff";
+  context.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
+  for (const { panel, members } of panels) {
+    const leading = members.includes(state.focus) ? state.focus : members[0];
+    const pose = egoPose(leading, at);
+    panel.scale = state.scale;
+    panel.centre = state.follow || !state.centre ? pose.slice(0, 2) : state.centre;
+    context.save();
+    context.beginPath();
+    context.rect(panel.left, panel.top, panel.width, panel.height);
+    context.clip();
+    drawPanel(panel, members, leading, at);
+    context.restore();
+  }
+  strips.draw(state.t);
+  byId("clock").textContent = `${state.t.toFixed(2)} s of ${duration().toFixed(1)} s`;
+  showScale();
+}
+
+function drawPanel(panel, members, leading, at) {
+  panel.drawMap(context);
+  drawLights(context, scene, panel, at);
+  drawAgents(context, tracksOf(leading).fields, panel, at, highlighted);
+  if (state.expert) {
+    drawPath(context, scene.get("expert.xy").data, at, panel, EXPERT, [2, 3], 1.5);
+    drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, EXPERT, false);
+  }
+  const order = members.filter((i) => i !== leading).concat(leading);
+  for (const index of order) {
+    const rollout = meta.rollouts[index];
+    const xy = rollouts[index].get("ego.xy").data;
+    drawPath(context, xy, at, panel, rollout.colour, dashOf(rollout), index === leading ? 2.6 : 1.8);
+  }
+  for (const index of order) {
+    const rollout = meta.rollouts[index];
+    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour);
+    const pose = egoPose(index, at);
+    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading);
+    const reach = meta.vehicle[2];
+    const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
+    drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour);
+  }
+  if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
+}
+
+function captionPanel(panel, rollout, fields, at) {
+  const text = `${labelOf(rollout)}  ${fields.get("speed").data[at.row].toFixed(1)} m/s`;
+  context.strokeStyle = "#ffffff";
+  context.lineWidth = 2;
+  context.strokeRect(panel.left, panel.top, panel.width, panel.height);
+  context.font = "600 12px system-ui, sans-serif";
+  const width = context.measureText(text).width;
+  context.fillStyle = "rgba(255, 255, 255, 0.85)";
+  context.fillRect(panel.left + 6, panel.top + 6, width + 26, 20);
+  drawMarker(context, rollout.marker, panel.left + 16, panel.top + 16, 5, rollout.colour);
+  context.fillStyle = "#222222";
+  context.fillText(text, panel.left + 26, panel.top + 20);
+}
+
+function showScale() {
+  const metres = [1, 2, 5, 10, 20, 50, 100].find((m) => m * state.scale >= 60) || 200;
+  byId("scale").style.width = `${metres * state.scale}px`;
+  byId("scale").textContent = `${metres} m`;
+}
+
+function showCurves() {
+  const lineOf = (index, name, column = 0, width = 1) => ({
+    times,
+    values: Array.from(rollouts[index].get(name).data).filter((_, i) => i % width === column),
+    colour: meta.rollouts[index].colour,
+    dash: dashOf(meta.rollouts[index]).length ? [5, 3] : [],
+  });
+  const members = visible();
+  const expert = { times, values: [...scene.get("expert.speed").data.slice(0, times.length)] };
+  const curves = [
+    {
+      label: "speed",
+      unit: "m/s",
+      least: 2,
+      lines: [{ ...expert, colour: EXPERT, dash: [2, 2] }, ...members.map((i) => lineOf(i, "speed"))],
+    },
+    { label: "acceleration", unit: "m/s²", least: 1, lines: members.map((i) => lineOf(i, "accel")) },
+  ];
+  const noisy = members.filter((i) => meta.rollouts[i].noise !== "none");
+  if (window.innerHeight < SMALL) curves.pop();
+  else if (noisy.length) {
+    const lines = noisy.map((i) => lineOf(i, "noise", 0, 2));
+    curves.push({ label: "noise on acceleration", unit: "m/s²", least: 0.5, lines });
+  }
+  const rows = members.filter((i) => meta.rollouts[i].violations.length);
+  strips.show(curves, rows.flatMap(marksOf));
+}
+
+// one mark per moment: what is first violated at the same time shares it
+function marksOf(index, row) {
+  const { colour, marker, violations: all } = meta.rollouts[index];
+  const moments = [...new Set(all.map((item) => item.t))];
+  return moments.map((t) => {
+    const names = all.filter((item) => item.t === t).map((item) => item.short);
+    return { t, row, text: names.join(" "), colour, marker };
+  });
+}
+
+// ---- controls ----
+
+function listRollouts() {
+  for (const [index, rollout] of meta.rollouts.entries()) {
+    const box = document.createElement("div");
+    box.className = "rollout";
+    box.addEventListener("click", () => setFocus(index));
+    const name = document.createElement("div");
+    name.className = "name";
+    const check = document.createElement("input");
+    check.type = "checkbox";
+    check.setAttribute("aria-label", `show ${labelOf(rollout)}`);
+    check.addEventListener("click", (event) => event.stopPropagation());
+    check.addEventListener("change", () => show(index, check.checked));
+    const label = document.createElement("span");
+    label.className = "label";
+    label.textContent = rollout.planner;
+    label.title = labelOf(rollout);
+    const cls = document.createElement("span");
+    cls.className = "cls";
+    cls.textContent = rollout.cls === null ? "–" : (100 * rollout.cls).toFixed(1);
+    name.append(check, swatch(rollout), label, cls);
+    box.append(name, noiseOf(rollout), scoresOf(rollout), ...rollout.violations.map((v) => violationButton(v, index)));
+    byId("rollouts").append(box);
+  }
+}
+
+function swatch(rollout) {
+  const picture = document.createElement("canvas");
+  picture.width = 56;
+  picture.height = 28;
+  picture.style.width = "28px";
+  picture.style.height = "14px";
+  const pen = picture.getContext("2d");
+  pen.scale(2, 2);
+  pen.setLineDash(dashOf(rollout).length ? [4, 3] : []);
+  pen.strokeStyle = rollout.colour;
+  pen.lineWidth = 2.5;
+  pen.beginPath();
+  pen.moveTo(0, 7);
+  pen.lineTo(28, 7);
+  pen.stroke();
+  pen.setLineDash([]);
+  drawMarker(pen, rollout.marker, 14, 7, 4.5, rollout.colour);
+  return picture;
+}
+
+function noiseOf(rollout) {
+  const line = document.createElement("div");
+  line.className = "noise";
+  line.textContent = rollout.noise === "none" ? "" : `${rollout.noise} · seed ${rollout.seed}`;
+  return line;
+}
+
+function scoresOf(rollout) {
+  const line = document.createElement("div");
+  line.className = "scores";
+  const parts = Object.entries(rollout.scores)
+    .filter(([, value]) => value < 1)
+    .map(([name, value]) => `${name} ${(100 * value).toFixed(0)}`);
+  if (rollout.degraded) parts.push(`${rollout.degraded} degraded steps`);
+  line.textContent = parts.join(" · ");
+  return line;
+}
+
+function violationButton(violation, index) {
+  const button = document.createElement("button");
+  button.textContent = `${violation.short} ${violation.t.toFixed(1)} s`;
+  const value = violation.value === null ? "" : `: ${violation.value.toPrecision(3)} ${violation.unit}`;
+  const limit = violation.threshold === null ? "" : ` (bound ${violation.threshold})`;
+  button.title = `${violation.metric}${value}${limit}`;
+  button.addEventListener("click", (event) => {
+    event.stopPropagation();
+    jumpTo({ ...violation, index });
+  });
+  return button;
+}
+
+function listLegend() {
+  const used = new Set();
+  const fields = meta.ownTracks ? rollouts[state.focus] : scene;
+  for (const kind of fields.get("tracks.kind").data) used.add(kind);
+  const entries = [...used].sort().map((kind) => [AGENT_COLOURS[kind], KIND_NAMES[kind]]);
+  entries.push(["#cfe0d2", "route"], [MAP_COLOURS.crosswalk, "crosswalk"]);
+  for (const [colour, text] of entries) {
+    const item = document.createElement("span");
+    const sample = document.createElement("i");
+    sample.style.background = colour;
+    item.append(sample, text);
+    byId("legend").append(item);
+  }
+}
+
+const OPTIONS = ["follow", "side", "expert", "plans"];
+function syncOptions() {
+  for (const name of OPTIONS) byId(name).checked = state[name];
+  byId("route").checked = map.layers.route;
+  byId("lanes").checked = map.layers.lanes;
+}
+
+function setOption(name, on) {
+  if (name === "follow" && !on) state.centre = [...panels[0].panel.centre];
+  if (OPTIONS.includes(name)) state[name] = on;
+  else {
+    map.layers[name] = on;
+    map.version++;
+  }
+  syncOptions();
+  layOut();
+  saveState();
+}
+
+function zoom(factor, px, py) {
+  const { panel } = panels.find(({ panel: p }) => inside(p, px, py)) || panels[0];
+  const [x, y] = panel.toWorld(px, py);
+  state.scale = Math.min(Math.max(state.scale * factor, MIN_SCALE), MAX_SCALE);
+  if (!state.follow) {
+    panel.scale = state.scale;
+    const [after, aside] = panel.toWorld(px, py);
+    state.centre = [panel.centre[0] + x - after, panel.centre[1] + y - aside];
+  }
+  draw();
+  saveState();
+}
+
+function inside(panel, px, py) {
+  const [dx, dy] = [px - panel.left, py - panel.top];
+  return dx >= 0 && dy >= 0 && dx <= panel.width && dy <= panel.height;
+}
+
+function drag(event) {
+  const start = [event.clientX, event.clientY];
+  const from = [...panels[0].panel.centre];
+  const move = (e) => {
+    if (state.follow) setOption("follow", false);
+    state.centre = [
+      from[0] - (e.clientX - start[0]) / state.scale,
+      from[1] + (e.clientY - start[1]) / state.scale,
+    ];
+    draw();
+  };
+  const end = () => {
+    window.removeEventListener("pointermove", move);
+    window.removeEventListener("pointerup", end);
+    saveState();
+  };
+  window.addEventListener("pointermove", move);
+  window.addEventListener("pointerup", end);
+}
+
+function hover(event) {
+  const tip = byId("tip");
+  const box = canvas.getBoundingClientRect();
+  const [px, py] = [event.clientX - box.left, event.clientY - box.top];
+  const found = panels.find(({ panel }) => inside(panel, px, py));
+  const text = found && event.buttons === 0 ? describeAt(found, px, py) : "";
+  tip.hidden = !text;
+  if (!text) return;
+  tip.textContent = text;
+  tip.style.left = `${Math.min(px + 14, box.width - 160)}px`;
+  tip.style.top = `${py + 12}px`;
+}
+
+function describeAt({ panel, members }, px, py) {
+  const leading = members.includes(state.focus) ? state.focus : members[0];
+  const { fields, names } = tracksOf(leading);
+  const [x, y] = panel.toWorld(px, py);
+  const at = sampleAt(state.t);
+  const kinds = fields.get("tracks.kind").data;
+  const size = fields.get("tracks.size").data;
+  const valid = fields.get("tracks.valid").data;
+  for (let i = 0; i < kinds.length; i++) {
+    if (!valid[at.row * kinds.length + i]) continue;
+    const [cx, cy] = poseAt(fields, "tracks", kinds.length, i, { ...at, next: at.row });
+    if (Math.hypot(cx - x, cy - y) < Math.max(size[2 * i] / 2, 1)) {
+      return `${KIND_NAMES[kinds[i]]} ${names[i]} · ${trackSpeed(fields, i, at).toFixed(1)} m/s`;
+    }
+  }
+  return "";
+}
+
+function trackSpeed(fields, index, at) {
+  const count = fields.get("tracks.kind").data.length;
+  const row = Math.max(at.row, 1);
+  const valid = fields.get("tracks.valid").data;
+  if (!valid[(row - 1) * count + index]) return 0;
+  const here = poseAt(fields, "tracks", count, index, { row, next: row, share: 0 });
+  const before = poseAt(fields, "tracks", count, index, { row: row - 1, next: row - 1, share: 0 });
+  return Math.hypot(here[0] - before[0], here[1] - before[1]) / (times[row] - times[row - 1]);
+}
+
+const KEYS = {
+  " ": () => (state.playing ? pause() : play()),
+  ArrowLeft: (e) => stepBy(e.shiftKey ? -10 : -1),
+  ArrowRight: (e) => stepBy(e.shiftKey ? 10 : 1),
+  Home: () => seek(0),
+  End: () => seek(duration()),
+  v: nextViolation,
+  f: () => setOption("follow", !state.follow),
+  b: () => setOption("side", !state.side),
+  e: () => setOption("expert", !state.expert),
+  p: () => setOption("plans", !state.plans),
+  r: () => setOption("route", !map.layers.route),
+  l: () => setOption("lanes", !map.layers.lanes),
+  a: () => setFocus((state.focus + 1) % rollouts.length),
+  "+": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
+  "=": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
+  "-": () => zoom(0.8, canvas.clientWidth / 2, canvas.clientHeight / 2),
+};
+
+function onKey(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  const digit = "123456".indexOf(event.key);
+  const action = KEYS[event.key];
+  if (action) action(event);
+  else if (event.key.length === 1 && digit >= 0 && digit < rollouts.length) {
+    show(digit, !state.shown[digit]);
+  } else return;
+  event.preventDefault();
+}
+
+function connect() {
+  byId("play").addEventListener("click", KEYS[" "]);
+  byId("back1").addEventListener("click", () => stepBy(-1));
+  byId("next1").addEventListener("click", () => stepBy(1));
+  byId("violation").addEventListener("click", nextViolation);
+  byId("time").max = duration();
+  byId("time").addEventListener("input", (e) => seek(Number(e.target.value)));
+  byId("time").addEventListener("pointerdown", pause);
+  byId("rate").addEventListener("change", (e) => (state.rate = Number(e.target.value)));
+  for (const name of [...OPTIONS, "route", "lanes"]) {
+    byId(name).addEventListener("change", (e) => setOption(name, e.target.checked));
+  }
+  canvas.addEventListener("pointerdown", drag);
+  canvas.addEventListener("pointermove", hover);
+  canvas.addEventListener("pointerleave", () => (byId("tip").hidden = true));
+  canvas.addEventListener(
+    "wheel",
+    (e) => {
+      e.preventDefault();
+      const box = canvas.getBoundingClientRect();
+      zoom(e.deltaY < 0 ? 1.15 : 1 / 1.15, e.clientX - box.left, e.clientY - box.top);
+    },
+    { passive: false },
+  );
+  const scrub = (e) => seek(strips.timeAt(e.clientX - byId("curves").getBoundingClientRect().left));
+  byId("curves").addEventListener("pointerdown", (e) => {
+    pause();
+    scrub(e);
+    byId("curves").setPointerCapture(e.pointerId);
+  });
+  byId("curves").addEventListener("pointermove", (e) => e.buttons && scrub(e));
+  window.addEventListener("keydown", onKey);
+  window.addEventListener("resize", () => {
+    showCurves();
+    layOut();
+  });
+  window.addEventListener("hashchange", async () => {
+    if (location.hash.slice(1) !== written) {
+      await loadState();
+      changed();
+    }
+  });
+}
+
+// ---- the link carries the state ----
+
+let written = "";
+function saveState() {
+  const shown = state.shown.map((on, i) => (on ? i + 1 : 0)).filter(Boolean);
+  const parts = [`t=${state.t.toFixed(2)}`, `on=${shown}`, `focus=${state.focus + 1}`];
+  parts.push(`zoom=${state.scale.toFixed(2)}`);
+  if (state.side) parts.push("side=1");
+  if (!state.follow && state.centre) parts.push(`at=${state.centre.map((v) => v.toFixed(1))}`);
+  written = parts.join("&");
+  try {
+    history.replaceState(null, "", `#${written}`);
+  } catch {
+    // a page inside a notebook has no address of its own
+  }
+}
+
+async function loadState() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  const number = (name, fallback) => {
+    const value = Number.parseFloat(given.get(name));
+    return Number.isFinite(value) ? value : fallback;
+  };
+  const on = (given.get("on") || "").split(",").map(Number);
+  const known = meta.rollouts.map((_, i) => on.includes(i + 1));
+  if (known.some(Boolean)) state.shown = known;
+  const focus = number("focus", 1) - 1;
+  state.focus = state.shown[focus] ? focus : state.shown.indexOf(true);
+  state.scale = Math.min(Math.max(number("zoom", state.scale), MIN_SCALE), MAX_SCALE);
+  state.side = given.get("side") === "1";
+  const at = (given.get("at") || "").split(",").map(Number.parseFloat);
+  state.follow = !(at.length === 2 && at.every(Number.isFinite));
+  if (!state.follow) state.centre = at;
+  for (const [index, shown] of state.shown.entries()) {
+    if (shown && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+  }
+  state.t = Math.min(Math.max(number("t", 0), 0), duration());
+}
+
+async function start() {
+  byId("token").textContent = meta.token;
+  byId("about").textContent = [meta.type, meta.city, meta.log].filter(Boolean).join(" · ");
+  if (meta.back) {
+    byId("back").hidden = false;
+    byId("back").href = meta.back;
+  }
+  scene = await readSection("scene");
+  times = scene.get("time").data;
+  map = new MapPicture(scene);
+  strips = new Strips(byId("curves"), duration());
+  listRollouts();
+  await loadState();
+  listLegend();
+  connect();
+  syncOptions();
+  byId("time").value = state.t;
+  changed();
+  document.documentElement.dataset.ready = "1";
+}
+
+window.replay = { seek, state, draw };
+start().catch((error) => {
+  byId("about").textContent = `this replay cannot be read: ${error.message}`;
+  throw error;
+});

@@ -1,0 +1,316 @@
+"use strict";
+// Draws the scene: a cached picture of the map, and everything that moves on top of it.
+// World coordinates are metres, x to the right, y up; the screen's y points down.
+
+const MAP_COLOURS = {
+  ground: "#f6f5f1",
+  walkway: "#ece6d8",
+  drivable: "#dcdcd8",
+  route: "rgba(94, 160, 110, 0.30)",
+  crosswalk: "#f7f4ea",
+  stop: "rgba(196, 80, 70, 0.25)",
+  boundary: "#a9a9a3",
+  centre: "#c3c3bd",
+};
+const AGENT_COLOURS = ["#8797a8", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
+const AGENT_EDGE = "#3d4650";
+const KIND_NAMES = ["vehicle", "pedestrian", "bicycle", "cone", "barrier", "sign", "object"];
+const LIGHT_COLOURS = [null, "#1f9d4d", "#d9a400", "#d02a1e", null]; // absent, green, yellow, red, unknown
+const CACHE_MARGIN = 0.35; // share of the view around it that the cached map also covers
+
+// Path2D of a layer in world coordinates; rings of one layer fill by the even-odd rule
+function layerPath(fields, name, closed) {
+  const path = new Path2D();
+  const xy = fields.get(`${name}.xy`).data;
+  let vertex = 0;
+  for (const count of fields.get(`${name}.count`).data) {
+    for (let i = 0; i < count; i++, vertex++) {
+      const x = xy[2 * vertex];
+      const y = xy[2 * vertex + 1];
+      if (i === 0) path.moveTo(x, y);
+      else path.lineTo(x, y);
+    }
+    if (closed) path.closePath();
+  }
+  return path;
+}
+
+class MapPicture {
+  constructor(fields) {
+    this.areas = ["walkway", "drivable", "route", "stop", "crosswalk"].map((name) => [
+      name,
+      layerPath(fields, name, true),
+    ]);
+    this.boundary = layerPath(fields, "boundary", false);
+    this.centre = layerPath(fields, "centre", false);
+    this.layers = { route: true, lanes: true };
+    this.version = 0;
+  }
+
+  paint(context, scale) {
+    for (const [name, path] of this.areas) {
+      if (name === "route" && !this.layers.route) continue;
+      context.fillStyle = MAP_COLOURS[name];
+      context.fill(path, "evenodd");
+    }
+    if (!this.layers.lanes) return;
+    context.strokeStyle = MAP_COLOURS.boundary;
+    context.lineWidth = 1 / scale;
+    context.stroke(this.boundary);
+    if (scale < 3) return;
+    context.strokeStyle = MAP_COLOURS.centre;
+    context.setLineDash([1.5, 2.5]);
+    context.stroke(this.centre);
+    context.setLineDash([]);
+  }
+}
+
+// One view of the scene. Several share a canvas when rollouts stand side by side.
+class Panel {
+  constructor(map) {
+    this.map = map;
+    this.cache = document.createElement("canvas");
+    this.cached = null;
+    this.centre = [0, 0];
+  }
+
+  place(left, top, width, height, scale, ratio) {
+    Object.assign(this, { left, top, width, height, scale, ratio });
+  }
+
+  toScreen(x, y) {
+    return [
+      this.left + this.width / 2 + (x - this.centre[0]) * this.scale,
+      this.top + this.height / 2 - (y - this.centre[1]) * this.scale,
+    ];
+  }
+
+  toWorld(px, py) {
+    return [
+      this.centre[0] + (px - this.left - this.width / 2) / this.scale,
+      this.centre[1] - (py - this.top - this.height / 2) / this.scale,
+    ];
+  }
+
+  // the map is painted again only when the view leaves the cached picture
+  drawMap(context) {
+    const spare = CACHE_MARGIN * Math.max(this.width, this.height);
+    const key = [this.width, this.height, this.scale, this.ratio, this.map.version].join();
+    const moved = this.cached && [0, 1].map((i) => Math.abs(this.centre[i] - this.cached.centre[i]));
+    const stale = !this.cached || this.cached.key !== key || Math.max(...moved) * this.scale > spare;
+    if (stale) this.repaint(key, spare);
+    const dx = (this.cached.centre[0] - this.centre[0]) * this.scale - spare;
+    const dy = -(this.cached.centre[1] - this.centre[1]) * this.scale - spare;
+    const { cache } = this;
+    context.drawImage(
+      cache, this.left + dx, this.top + dy, cache.width / this.ratio, cache.height / this.ratio,
+    );
+  }
+
+  repaint(key, spare) {
+    const { cache, ratio, scale } = this;
+    cache.width = Math.ceil((this.width + 2 * spare) * ratio);
+    cache.height = Math.ceil((this.height + 2 * spare) * ratio);
+    const context = cache.getContext("2d", { alpha: false });
+    context.fillStyle = MAP_COLOURS.ground;
+    context.fillRect(0, 0, cache.width, cache.height);
+    const zoom = scale * ratio;
+    context.setTransform(
+      zoom, 0, 0, -zoom,
+      (this.width / 2 + spare) * ratio - this.centre[0] * zoom,
+      (this.height / 2 + spare) * ratio + this.centre[1] * zoom,
+    );
+    this.map.paint(context, scale);
+    this.cached = { key, centre: [...this.centre] };
+  }
+}
+
+// corners of a box as a closed sub-path
+function addBox(context, x, y, heading, front, rear, halfWidth, panel) {
+  const c = Math.cos(heading) * panel.scale;
+  const s = -Math.sin(heading) * panel.scale;
+  const [px, py] = panel.toScreen(x, y);
+  context.moveTo(px + front * c - halfWidth * s, py + front * s + halfWidth * c);
+  context.lineTo(px + front * c + halfWidth * s, py + front * s - halfWidth * c);
+  context.lineTo(px - rear * c + halfWidth * s, py - rear * s - halfWidth * c);
+  context.lineTo(px - rear * c - halfWidth * s, py - rear * s + halfWidth * c);
+  context.closePath();
+}
+
+// everything is kept at samples; between two of them positions are interpolated
+function poseAt(fields, name, count, index, at) {
+  const xy = fields.get(`${name}.xy`).data;
+  const heading = fields.get(`${name}.heading`).data;
+  const low = at.row * count + index;
+  const high = at.next * count + index;
+  const mix = (a, b) => a + (b - a) * at.share;
+  return [
+    mix(xy[2 * low], xy[2 * high]),
+    mix(xy[2 * low + 1], xy[2 * high + 1]),
+    mix(heading[low], heading[high]),
+  ];
+}
+
+function drawAgents(context, fields, panel, at, highlighted) {
+  const kinds = fields.get("tracks.kind").data;
+  const size = fields.get("tracks.size").data;
+  const valid = fields.get("tracks.valid").data;
+  const count = kinds.length;
+  const marked = [];
+  for (let kind = 0; kind < AGENT_COLOURS.length; kind++) {
+    context.beginPath();
+    for (let i = 0; i < count; i++) {
+      if (kinds[i] !== kind || !valid[at.row * count + i]) continue;
+      const there = valid[at.next * count + i] ? at : { ...at, next: at.row };
+      const [x, y, heading] = poseAt(fields, "tracks", count, i, there);
+      const [px, py] = panel.toScreen(x, y);
+      const reach = (size[2 * i] + 2) * panel.scale;
+      if (px < panel.left - reach || px > panel.left + panel.width + reach) continue;
+      if (py < panel.top - reach || py > panel.top + panel.height + reach) continue;
+      const half = size[2 * i] / 2;
+      addBox(context, x, y, heading, half, half, size[2 * i + 1] / 2, panel);
+      if (i === highlighted) marked.push([x, y, heading, half, size[2 * i + 1] / 2]);
+    }
+    context.fillStyle = AGENT_COLOURS[kind];
+    context.fill();
+    context.lineWidth = 1;
+    context.strokeStyle = AGENT_EDGE;
+    context.stroke();
+  }
+  for (const [x, y, heading, half, halfWidth] of marked) {
+    context.beginPath();
+    addBox(context, x, y, heading, half + 0.4, half + 0.4, halfWidth + 0.4, panel);
+    context.lineWidth = 3;
+    context.strokeStyle = "#d02a1e";
+    context.stroke();
+  }
+}
+
+function drawLights(context, fields, panel, at) {
+  const { shape, data } = fields.get("lights.status");
+  const counts = fields.get("lights.count").data;
+  const xy = fields.get("lights.xy").data;
+  let vertex = 0;
+  context.lineWidth = Math.max(2, 0.5 * panel.scale);
+  context.globalAlpha = 0.75;
+  for (let i = 0; i < shape[1]; i++) {
+    const colour = LIGHT_COLOURS[data[at.row * shape[1] + i]];
+    if (colour) strokeLine(context, xy, vertex, vertex + counts[i], panel, colour);
+    vertex += counts[i];
+  }
+  context.globalAlpha = 1;
+}
+
+function strokeLine(context, xy, first, stop, panel, colour) {
+  context.beginPath();
+  for (let i = first; i < stop; i++) {
+    const [px, py] = panel.toScreen(xy[2 * i], xy[2 * i + 1]);
+    if (i === first) context.moveTo(px, py);
+    else context.lineTo(px, py);
+  }
+  context.strokeStyle = colour;
+  context.stroke();
+}
+
+// the driven path: what is past strong, what is to come faint
+function drawPath(context, xy, at, panel, colour, dash, width) {
+  context.setLineDash(dash);
+  context.lineWidth = width;
+  strokeLine(context, xy, 0, at.row + 1, panel, colour);
+  context.globalAlpha = 0.35;
+  strokeLine(context, xy, at.row, xy.length / 2, panel, colour);
+  context.globalAlpha = 1;
+  context.setLineDash([]);
+}
+
+// the first second of the plan, from the rear axle on
+function drawPlan(context, fields, panel, at, colour) {
+  const { shape, data } = fields.get("plan");
+  const base = at.row * shape[1];
+  if (Number.isNaN(data[2 * base])) return;
+  const xy = fields.get("ego.xy").data;
+  context.beginPath();
+  for (let i = 0; i < shape[1]; i++) {
+    const x = xy[2 * at.row] + data[2 * (base + i)];
+    const y = xy[2 * at.row + 1] + data[2 * (base + i) + 1];
+    const [px, py] = panel.toScreen(x, y);
+    if (i === 0) context.moveTo(px, py);
+    else context.lineTo(px, py);
+  }
+  context.lineWidth = 5;
+  context.lineCap = "round";
+  context.globalAlpha = 0.45;
+  context.strokeStyle = colour;
+  context.stroke();
+  context.globalAlpha = 1;
+  context.lineCap = "butt";
+}
+
+function drawEgo(context, pose, vehicle, panel, colour, filled) {
+  const [length, width, toCentre] = vehicle;
+  const front = toCentre + length / 2;
+  context.beginPath();
+  addBox(context, ...pose, front, length / 2 - toCentre, width / 2, panel);
+  context.lineWidth = 2;
+  context.strokeStyle = colour;
+  if (filled) {
+    context.fillStyle = colour;
+    context.globalAlpha = 0.8;
+    context.fill();
+    context.globalAlpha = 1;
+  }
+  context.stroke();
+  const [x, y, heading] = pose;
+  const tip = panel.toScreen(x + front * Math.cos(heading), y + front * Math.sin(heading));
+  const tail = panel.toScreen(x + toCentre * Math.cos(heading), y + toCentre * Math.sin(heading));
+  context.beginPath();
+  context.moveTo(...tail);
+  context.lineTo(...tip);
+  context.strokeStyle = filled ? "#ffffff" : colour;
+  context.stroke();
+}
+
+const MARKERS = {
+  o: (c, r) => c.arc(0, 0, r, 0, 2 * Math.PI),
+  s: (c, r) => c.rect(-r, -r, 2 * r, 2 * r),
+  "^": (c, r) => polygon(c, [[0, -r], [r, r], [-r, r]]),
+  v: (c, r) => polygon(c, [[0, r], [r, -r], [-r, -r]]),
+  D: (c, r) => polygon(c, [[0, -r], [r, 0], [0, r], [-r, 0]]),
+  P: (c, r) => polygon(c, cross(r, 0)),
+  X: (c, r) => polygon(c, cross(r, Math.PI / 4)),
+  "*": (c, r) => polygon(c, star(r)),
+};
+
+function polygon(context, points) {
+  points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  context.closePath();
+}
+
+function cross(r, angle) {
+  const arm = r * 0.4;
+  const quarter = [[arm, -r], [arm, -arm], [r, -arm]];
+  const turn = ([x, y], by) => [
+    x * Math.cos(by) - y * Math.sin(by), x * Math.sin(by) + y * Math.cos(by),
+  ];
+  return [0, 1, 2, 3].flatMap((k) => quarter.map((p) => turn(p, angle + (k * Math.PI) / 2)));
+}
+
+function star(r) {
+  return [...Array(10).keys()].map((k) => {
+    const reach = k % 2 ? r * 0.45 : r;
+    return [reach * Math.sin((k * Math.PI) / 5), -reach * Math.cos((k * Math.PI) / 5)];
+  });
+}
+
+function drawMarker(context, marker, x, y, radius, colour) {
+  context.save();
+  context.translate(x, y);
+  context.beginPath();
+  (MARKERS[marker] || MARKERS.o)(context, radius);
+  context.fillStyle = colour;
+  context.fill();
+  context.lineWidth = 1.2;
+  context.strokeStyle = "#ffffff";
+  context.stroke();
+  context.restore();
+}
