@@ -31,7 +31,8 @@ from shiftsim.planners.device import prepare_inference, require_torch, resolve_d
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
 SUFFIXES = (".ckpt", ".pth", ".safetensors")
-_FILES = ("model.pth", "model_best.pth")  # what is meant by a folder
+_MEMBER = "model_best.pth"  # of CaRL: one folder for each policy
+_FILES = ("model.pth", _MEMBER)  # what is meant by a folder
 _ENTRIES = ("ema_state_dict", "state_dict", "model")  # where weights are, the first that is there
 _PREFIXES = ("model.", "module.", "_orig_mod.")
 _WITH_ARGS = ("diffusion-planner",)  # planners whose weights mean nothing without their args
@@ -106,7 +107,7 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
 def checkpoint_fingerprint(spec: str, planner: str) -> str:
     """What tells these weights from others: SHA-256 of the files, or the deterministic name.
 
-    Several checkpoints of an ensemble, separated by commas, give several. Files are hashed once.
+    Several checkpoints of an ensemble give several, separated by commas. Files are hashed once.
 
     Raises:
         CheckpointError: There is no such file.
@@ -115,8 +116,12 @@ def checkpoint_fingerprint(spec: str, planner: str) -> str:
 
 
 def split_ensemble(spec: str) -> tuple[str, ...]:
-    """The checkpoints of `A,B,C`; a file whose name has commas is one."""
-    return (spec,) if Path(spec).exists() else tuple(part.strip() for part in spec.split(","))
+    """The checkpoints of `A,B,C`, or of a folder with one folder for each; else the one given."""
+    path = Path(spec).expanduser()
+    members = [] if (path / _MEMBER).exists() else sorted(path.glob(f"*/{_MEMBER}"))
+    if members:
+        return tuple(str(member) for member in members)
+    return (spec,) if path.exists() else tuple(part.strip() for part in spec.split(","))
 
 
 def find_checkpoint(spec: str, planner: str = "") -> Path:
