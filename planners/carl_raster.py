@@ -27,9 +27,7 @@ Picture = NDArray[np.uint8]
 def draw_polyline(picture: Picture, xy: IntArray, value: int) -> None:
     """Draw an open line through pixels (K, 2), of which there must be two at least."""
     for index in range(1, len(xy)):
-        draw_line(
-            picture, xy[index - 1, 0], xy[index - 1, 1], xy[index, 0], xy[index, 1], value
-        )
+        draw_line(picture, xy[index - 1, 0], xy[index - 1, 1], xy[index, 0], xy[index, 1], value)
 
 
 @kernel
@@ -129,9 +127,7 @@ class Crossings(NamedTuple):
 
 def make_crossings(height: int, max_vertices: int) -> Crossings:
     """Room for pictures of a given height, and areas of so many vertices at most."""
-    return Crossings(
-        np.empty((height, max(max_vertices, 4)), np.int32), np.zeros(height, np.int64)
-    )
+    return Crossings(np.empty((height, max(max_vertices, 4)), np.int32), np.zeros(height, np.int64))
 
 
 @kernel

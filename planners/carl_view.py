@@ -1,4 +1,4 @@
-"""The picture that CaRL sees: nine channels of 256 x 256 pixels around the ego (planner-carl.md §2).
+"""The picture CaRL sees: nine channels of 256 x 256 pixels around the ego (planner-carl.md §2).
 
 Columns grow forward and rows to the left, two pixels a metre; the origin of the picture's middle is
 14 m ahead of the centre of the ego. What depends on the map only is laid out once per map, with the
@@ -173,17 +173,26 @@ def _borders(road: VectorMap) -> tuple[IntArray, Lines]:
 
 
 def _in_chunks(lines: Polylines) -> Lines:
-    circles, chunk_ptr = [], [0]
-    for line in range(len(lines.ptr) - 1):
-        vertices = lines.at(line)
-        for start in range(0, max(len(vertices) - 1, 0), _CHUNK):
-            part = vertices[start : start + _CHUNK + 1]
-            middle = 0.5 * (part.min(axis=0) + part.max(axis=0))
-            circles.append((*middle, np.hypot(*(part - middle).T).max()))
-        chunk_ptr.append(len(circles))
-    return Lines(
-        lines.xy, lines.ptr, np.array(chunk_ptr), np.array(circles, np.float64).reshape(-1, 3)
-    )
+    segments = np.maximum(np.diff(lines.ptr) - 1, 0)
+    chunk_ptr = np.concatenate([[0], np.cumsum(-(-segments // _CHUNK))])
+    circles = np.empty((chunk_ptr[-1], 3))
+    _surround(lines.xy, lines.ptr, chunk_ptr, circles)
+    return Lines(lines.xy, lines.ptr, chunk_ptr, circles)
+
+
+@kernel
+def _surround(xy: FloatArray, ptr: IntArray, chunk_ptr: IntArray, circles: FloatArray) -> None:
+    """Write a circle around every chunk into `circles` (C, 3)."""
+    for line in range(len(ptr) - 1):
+        for chunk in range(chunk_ptr[line], chunk_ptr[line + 1]):
+            start = ptr[line] + (chunk - chunk_ptr[line]) * _CHUNK
+            stop = min(start + _CHUNK + 1, ptr[line + 1])
+            x = 0.5 * (xy[start:stop, 0].min() + xy[start:stop, 0].max())
+            y = 0.5 * (xy[start:stop, 1].min() + xy[start:stop, 1].max())
+            radius = 0.0
+            for vertex in range(start, stop):
+                radius = max(radius, np.hypot(xy[vertex, 0] - x, xy[vertex, 1] - y))
+            circles[chunk, 0], circles[chunk, 1], circles[chunk, 2] = x, y, radius
 
 
 def make_room(roads: Roads) -> Room:
@@ -219,7 +228,11 @@ def picture_frame(center: FloatArray) -> FloatArray:
 def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
     """Areas that touch the picture, in the order of the spatial index."""
     corners = np.empty((4, 2))
-    box_corners(frame[0], frame[1], np.arctan2(frame[3], frame[2]), 128.0, 128.0, corners)
+    for corner in range(4):
+        ahead = HALF_SIDE if corner == 0 or corner == 3 else -HALF_SIDE
+        left = HALF_SIDE if corner < 2 else -HALF_SIDE
+        corners[corner, 0] = frame[0] + (ahead * frame[2] - left * frame[3])
+        corners[corner, 1] = frame[1] + (ahead * frame[3] + left * frame[2])
     reach = HALF_SIDE * (abs(frame[2]) + abs(frame[3])) + 1e-6
     bounds = roads.areas.bounds
     out = np.empty(len(roads.order), np.int64)
@@ -323,9 +336,7 @@ def _fill_shell(
 
 
 @kernel
-def _draw_line_of(
-    picture: Picture, lines: Lines, line: int, frame: FloatArray, value: int
-) -> None:
+def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
     """Draw a line, chunk by chunk."""
     first, last = lines.ptr[line], lines.ptr[line + 1] - 1
     for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
@@ -377,9 +388,7 @@ def draw_ego(
 ) -> None:
     """Draw the ego; `center` is (3,), `speed` that of its centre."""
     value = level(speed, MAX_SPEED)
-    _draw_box(
-        pictures[EGO], frame, center[0], center[1], center[2], length, width, value, room
-    )
+    _draw_box(pictures[EGO], frame, center[0], center[1], center[2], length, width, value, room)
 
 
 @kernel
