@@ -37,6 +37,7 @@ from shiftsim.planners.checkpoint import (
     find_checkpoint,
     load_weights,
     open_checkpoint,
+    split_ensemble,
 )
 from shiftsim.planners.checkpoint_convert import convert_checkpoint, inspect_checkpoint
 from shiftsim.planners.checkpoint_match import empty_state
@@ -416,6 +417,18 @@ def test_the_fingerprint_follows_the_content_and_not_the_place(tmp_path):
     assert checkpoint_fingerprint(str(a), "carl") != checkpoint_fingerprint(str(b), "carl")
     both = checkpoint_fingerprint(f"{a},{b}", "carl")
     assert both.split(",") == [checkpoint_fingerprint(str(p), "carl") for p in (a, b)]
+
+
+def test_a_folder_of_policies_is_an_ensemble(tmp_path):
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model_best.pth").write_text(name)
+    members = [str(tmp_path / name / "model_best.pth") for name in ("a", "b")]
+    assert split_ensemble(str(tmp_path)) == tuple(members)
+    assert split_ensemble(str(tmp_path / "a")) == (str(tmp_path / "a"),)
+    assert split_ensemble("one, two") == ("one", "two")
+    both = checkpoint_fingerprint(str(tmp_path), "carl")
+    assert both == ",".join(checkpoint_fingerprint(member, "carl") for member in members)
 
 
 def test_the_fingerprint_of_diffusion_planner_follows_its_args(tmp_path):
