@@ -190,7 +190,7 @@ class PlanTfNetwork(nn.Module):
         if not predict:
             return Outputs(trajectory, probability, None)
         prediction = self.agent_predictor(x[:, 1:])
-        shape = (*prediction.shape[:2], -1, 2)
+        shape = (*prediction.shape[:2], self.trajectory_decoder.future_steps, 2)
         return Outputs(trajectory, probability, prediction.reshape(shape))
 
 
