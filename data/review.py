@@ -1,8 +1,8 @@
 """The review of a store by people: decisions and corrected routes, as an overlay.
 
 `review/review.jsonl` in the store holds one JSON object per reviewed scenario (see
-deepplan-conversion.md §10): `token`, `decision` (accept, reject or empty), `comment`, `route` (ids of
-the corrected route, or null), `reviewer`, `version`. The scenarios themselves keep their bytes.
+deepplan-conversion.md §10): `token`, `decision` (accept, reject or empty), `comment`, `route` (ids
+of the corrected route, or null), `reviewer`, `version`. The scenarios themselves keep their bytes.
 """
 
 import hashlib

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,6 +19,7 @@ import pyarrow as pa
 from shiftsim.data import schema
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.recording import scenario as make_scenario
+from shiftsim.data.review import REVIEW, read_reviews, require_blocks
 from shiftsim.data.store_files import MEND, Table, digest, file_name, write_blocks, write_json
 from shiftsim.data.store_map import read_map_file, write_map
 from shiftsim.data.store_tracks import (
@@ -45,6 +47,7 @@ class ScenarioStore:
         path: Its folder.
         tokens: Tokens of all scenarios, sorted.
         hash: Digest of the content; equal content has an equal hash.
+        reviews: What people say of the scenarios; an overlay that is not part of the hash.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,6 +56,7 @@ class ScenarioStore:
         self.hash = str(manifest["hash"])
         self._table = Table(path / SCENARIOS, schema.SCENARIOS).read()
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
+        self.reviews = read_reviews(path)
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
@@ -92,9 +96,20 @@ class ScenarioStore:
     def read(self, token: str) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.
 
+        A route that was corrected in the review takes the place of the recorded one.
+
         Raises:
             DataError: The store has no such scenario, or a file is missing or damaged.
         """
+        scenario = self.read_recorded(token)
+        review = self.reviews.get(token)
+        if review is None or review.route is None:
+            return scenario
+        require_blocks(scenario.map, review, str(self.path / REVIEW))
+        return replace(scenario, route=review.route)
+
+    def read_recorded(self, token: str) -> Scenario:
+        """As `read`, without the review."""
         window = self.window(token)
         stored = self._recording(window.log_name)
         first, last = window.first_row, window.last_row

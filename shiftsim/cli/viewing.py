@@ -1,4 +1,4 @@
-"""Commands that show: view, plot."""
+"""Commands that show: view, plot, inspect."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,6 +33,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(view)
     app.command()(plot)
+    app.command()(inspect)
 
 
 def view(
@@ -73,7 +74,7 @@ def view(
         page = folder / "index.html"
     say(f"written: {page}")
     if browser:
-        _open(page)
+        _show(page.resolve().as_uri())
 
 
 def plot(
@@ -100,6 +101,34 @@ def plot(
     say(f"written: {out}")
 
 
+def inspect(
+    store: Annotated[str, typer.Argument(metavar="STORE", help="Name or folder of a store.")],
+    reviewer: Annotated[str, typer.Option(help="Who reviews. [the login name]")] = "",
+    port: Annotated[int, typer.Option(help="Port on this machine, 0 for a free one.")] = 0,
+    browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
+    ] = True,
+    debug: Debug = False,
+) -> None:
+    """Review scenarios in the browser: accept, reject, comment, correct the route."""
+    from shiftsim.data.review import REVIEW
+    from shiftsim.inspection.desk import Desk
+    from shiftsim.inspection.server import ReviewServer
+    from shiftsim.runner import open_named_store
+
+    path = open_named_store(store).path
+    with ReviewServer(Desk(path, reviewer), port) as server:
+        say(f"review     {server.address}")
+        say(f"kept in    {path / REVIEW}")
+        say("stop with Ctrl-C; what was decided is on disk")
+        if browser:
+            _show(server.address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            say()
+
+
 def _gallery(
     runs: list[Path],
     planner: list[str] | None,
@@ -117,12 +146,12 @@ def _gallery(
     return Gallery(opened, found, choice)
 
 
-def _open(page: Path) -> None:
-    """Show the page, where there is a screen."""
+def _show(address: str) -> None:
+    """Open an address in the browser, where there is a screen."""
     import os
     import sys
     import webbrowser
 
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if screen or sys.platform != "linux":
-        webbrowser.open(page.resolve().as_uri())
+        webbrowser.open(address)

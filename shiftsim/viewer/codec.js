@@ -3,8 +3,11 @@
 
 const MISSING = -2147483648;
 
-async function readSection(id) {
-  const text = document.getElementById(`data-${id}`).textContent;
+function readSection(id) {
+  return unpack(document.getElementById(`data-${id}`).textContent);
+}
+
+async function unpack(text) {
   const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   return readFields(new Uint8Array(await new Response(stream).arrayBuffer()));

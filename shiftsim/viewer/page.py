@@ -46,9 +46,9 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
 
 
 @cache
-def asset(name: str) -> str:
-    """A file of this folder."""
-    return (_HERE / name).read_text(encoding="utf-8")
+def asset(name: str, folder: Path = _HERE) -> str:
+    """A file of this folder, or of another one."""
+    return (folder / name).read_text(encoding="utf-8")
 
 
 def fill(template: str, **parts: str) -> str:

@@ -1,0 +1,433 @@
+"use strict";
+// The review desk: walks through scenarios, keeps every decision at once, edits routes by clicking.
+
+const byId = (id) => document.getElementById(id);
+const secret = new URLSearchParams(location.search).get("token") || "";
+const ROUTE = "rgba(40, 140, 90, 0.38)";
+const CHANGED = "rgba(224, 138, 0, 0.45)";
+const EGO = "#0b62c4";
+const CLICK = 4; // pixels a pointer may move between down and up to count as a click
+
+let listing, current, fields, scene, map, panel, blocks;
+let playing = false;
+let now = 0;
+let highlighted = -1;
+const view = { scale: 4, centre: [0, 0] };
+const undone = []; // {token, values} that bring back what was before
+const canvas = byId("scene");
+const context = canvas.getContext("2d", { alpha: false });
+
+async function ask(path, body) {
+  const options = { headers: { "X-Shiftsim-Token": secret } };
+  if (body) {
+    options.method = "POST";
+    options.body = JSON.stringify(body);
+  }
+  const answer = await fetch(path, options);
+  const value = await answer.json();
+  if (!answer.ok) throw new Error(value.error || answer.statusText);
+  return value;
+}
+
+function say(text, bad = false) {
+  byId("kept").textContent = text;
+  byId("kept").classList.toggle("bad", bad);
+}
+
+// ---- the list ----
+
+const isOpen = (row) => !row.decision;
+const WHICH = {
+  open: isOpen,
+  all: () => true,
+  accept: (row) => row.decision === "accept",
+  reject: (row) => row.decision === "reject",
+  dropped: (row) => row.verdict === "dropped",
+};
+
+function rowOf(token) {
+  return listing.scenarios.find((row) => row.token === token);
+}
+
+function chosen() {
+  return listing.scenarios.filter((row) => WHICH[byId("which").value](row) || row.token === current);
+}
+
+function showList() {
+  const count = (decision) => listing.scenarios.filter((row) => row.decision === decision).length;
+  byId("counts").textContent =
+    `${listing.scenarios.length} scenarios · ${count("accept")} accepted · ` +
+    `${count("reject")} rejected · ${count("")} open`;
+  const lines = chosen().map((row) => {
+    const line = document.createElement("li");
+    line.classList.toggle("current", row.token === current);
+    const sign = document.createElement("span");
+    sign.textContent = { accept: "✓", reject: "✗", "": "" }[row.decision] + (row.route ? " ⤳" : "");
+    line.append(row.token, sign);
+    line.title = `${row.city} · ${row.type} · filter: ${row.verdict} ${row.reason}`;
+    line.addEventListener("click", () => open(row.token));
+    return line;
+  });
+  byId("list").replaceChildren(...lines);
+  byId("list").querySelector(".current")?.scrollIntoView({ block: "nearest" });
+}
+
+function move(step) {
+  const rows = chosen();
+  const index = rows.findIndex((row) => row.token === current);
+  const next = rows[index + step];
+  if (next) open(next.token);
+  else say(step > 0 ? "this was the last one of the list" : "this is the first one of the list");
+}
+
+// ---- one scenario ----
+
+async function open(token) {
+  stop();
+  const found = await ask(`/api/scenario?id=${encodeURIComponent(token)}`);
+  scene = await unpack(found.scene);
+  fields = await unpack(found.rollout);
+  blocks = readBlocks(await unpack(found.blocks), found.blockIds);
+  map = new MapPicture(scene);
+  map.layers.route = false;
+  panel = new Panel(map);
+  current = token;
+  highlighted = -1;
+  byId("token").textContent = token;
+  byId("about").textContent = [found.meta.type, found.meta.city, found.meta.log].join(" · ");
+  const numbers = Object.entries(found.numbers).map(([name, value]) =>
+    `${name.replaceAll("_", " ")} ${typeof value === "number" ? value.toFixed(2) : value}`);
+  byId("verdict").textContent = `filter: ${found.verdict} ${found.reason} ${numbers.join(" · ")}`;
+  Object.assign(open, { found });
+  history.replaceState(null, "", `${location.pathname}${location.search}#${encodeURIComponent(token)}`);
+  byId("time").max = duration();
+  now = 0;
+  wholeScene();
+  showReview(found);
+  showList();
+  document.documentElement.dataset.ready = token;
+}
+
+function readBlocks(packed, ids) {
+  const rings = packed.get("blocks.rings").data;
+  const counts = packed.get("blocks.count").data;
+  const xy = packed.get("blocks.xy").data;
+  let ring = 0;
+  let vertex = 0;
+  return ids.map((id, i) => {
+    const path = new Path2D();
+    for (let k = 0; k < rings[i]; k++, ring++) {
+      for (let j = 0; j < counts[ring]; j++, vertex++) {
+        if (j) path.lineTo(xy[2 * vertex], xy[2 * vertex + 1]);
+        else path.moveTo(xy[2 * vertex], xy[2 * vertex + 1]);
+      }
+      path.closePath();
+    }
+    return { id, path };
+  });
+}
+
+function showReview(state) {
+  Object.assign(open.found, state);
+  Object.assign(rowOf(current), {
+    decision: state.decision, comment: state.comment, route: state.route,
+  });
+  byId("accept").classList.toggle("on", state.decision === "accept");
+  byId("reject").classList.toggle("on", state.decision === "reject");
+  if (document.activeElement !== byId("comment")) byId("comment").value = state.comment;
+  byId("undo").disabled = !undone.length;
+  byId("recorded").disabled = !state.route;
+  const items = state.current.map((id) => {
+    const line = document.createElement("li");
+    line.textContent = id;
+    line.classList.toggle("corrected", !open.found.recordedRoute.includes(id));
+    return line;
+  });
+  byId("blocks").replaceChildren(...items);
+  const problems = state.problems.length ? state.problems : ["the route is connected"];
+  byId("problems").classList.toggle("good", !state.problems.length);
+  byId("problems").replaceChildren(
+    ...problems.map((text) => {
+      const line = document.createElement("li");
+      line.textContent = text;
+      return line;
+    }),
+  );
+  draw();
+}
+
+async function keep(values, { undo = true, token = current } = {}) {
+  const before = rowOf(token);
+  const old = Object.fromEntries(Object.keys(values).map((name) => [name, before[name]]));
+  try {
+    const state = await ask("/api/review", { token, values });
+    if (undo) undone.push({ token, values: old });
+    if (token === current) showReview(state);
+    else Object.assign(before, { decision: state.decision, comment: state.comment, route: state.route });
+    say("kept");
+    showList();
+  } catch (error) {
+    say(`not kept: ${error.message}`, true);
+  }
+}
+
+async function decide(decision) {
+  await keepComment();
+  await keep({ decision: rowOf(current).decision === decision ? "" : decision });
+  if (rowOf(current).decision === decision) move(1);
+}
+
+async function keepComment() {
+  const comment = byId("comment").value;
+  if (current && comment !== rowOf(current).comment) await keep({ comment });
+}
+
+async function undo() {
+  const last = undone.pop();
+  if (!last) return;
+  if (last.token !== current) await open(last.token);
+  await keep(last.values, { undo: false });
+}
+
+// ---- the route ----
+
+// a roadblock of the route is taken out; another one goes where it connects best
+async function toggleBlock(id) {
+  const route = [...open.found.current];
+  const at = route.indexOf(id);
+  if (at >= 0) route.splice(at, 1);
+  else route.splice(await bestPlace(route, id), 0, id);
+  if (route.length) await keep({ route });
+}
+
+async function bestPlace(route, id) {
+  let best = [Infinity, route.length];
+  for (let place = route.length; place >= 0; place--) {
+    const values = [...route.slice(0, place), id, ...route.slice(place)];
+    const { problems } = await ask("/api/route", { token: current, values });
+    if (problems.length < best[0]) best = [problems.length, place];
+  }
+  return best[1];
+}
+
+function blockAt(px, py) {
+  const [x, y] = panel.toWorld(px, py);
+  const bare = document.createElement("canvas").getContext("2d");
+  const found = blocks.filter(({ path }) => bare.isPointInPath(path, x, y, "evenodd"));
+  const onRoute = found.find(({ id }) => open.found.current.includes(id));
+  return (onRoute || found[0] || { id: "" }).id;
+}
+
+// ---- drawing and time ----
+
+const times = () => scene.get("time").data;
+const duration = () => times()[times().length - 1];
+
+function sampleAt(t) {
+  const all = times();
+  let row = 0;
+  while (row + 1 < all.length && all[row + 1] <= t + 1e-6) row++;
+  const next = Math.min(row + 1, all.length - 1);
+  const span = all[next] - all[row];
+  return { row, next, share: span > 0 ? Math.min((t - all[row]) / span, 1) : 0 };
+}
+
+function wholeScene() {
+  const xy = fields.get("ego.xy").data;
+  const [xs, ys] = [0, 1].map((k) => [...xy].filter((_, i) => i % 2 === k));
+  const range = (values) => [Math.min(...values), Math.max(...values)];
+  const [[x0, x1], [y0, y1]] = [range(xs), range(ys)];
+  const { clientWidth: width, clientHeight: height } = byId("stage");
+  view.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
+  view.scale = Math.min(width / (x1 - x0 + 60), height / (y1 - y0 + 60), 12);
+  layOut();
+}
+
+function layOut() {
+  if (!panel) return;
+  const ratio = window.devicePixelRatio || 1;
+  const { clientWidth: width, clientHeight: height } = byId("stage");
+  canvas.width = Math.round(width * ratio);
+  canvas.height = Math.round(height * ratio);
+  panel.place(0, 0, width, height, view.scale, ratio);
+  draw();
+}
+
+function draw() {
+  if (!panel) return;
+  const at = sampleAt(now);
+  const ratio = window.devicePixelRatio || 1;
+  panel.scale = view.scale;
+  panel.centre = view.centre;
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  panel.drawMap(context);
+  drawRoute(ratio);
+  drawLights(context, scene, panel, at);
+  drawAgents(context, scene, panel, at, highlighted);
+  drawPath(context, scene.get("expert.xy").data, at, panel, EGO, [], 2);
+  drawTicks();
+  drawEgo(context, poseAt(fields, "ego", 1, 0, at), open.found.meta.vehicle, panel, EGO, true);
+  byId("clock").textContent = `${now.toFixed(1)} s of ${duration().toFixed(1)} s`;
+  byId("time").value = now;
+}
+
+function drawRoute(ratio) {
+  const zoom = view.scale * ratio;
+  context.save();
+  const [left, top] = panel.toScreen(0, 0);
+  context.setTransform(zoom, 0, 0, -zoom, left * ratio, top * ratio);
+  for (const { id, path } of blocks) {
+    if (!open.found.current.includes(id)) continue;
+    context.fillStyle = open.found.recordedRoute.includes(id) ? ROUTE : CHANGED;
+    context.fill(path, "evenodd");
+  }
+  context.restore();
+}
+
+function drawTicks() {
+  const xy = scene.get("expert.xy").data;
+  context.fillStyle = EGO;
+  context.font = "10px system-ui, sans-serif";
+  times().forEach((t, i) => {
+    if (Math.abs(t - Math.round(t)) > 0.02 || Math.round(t) % 5) return;
+    const [px, py] = panel.toScreen(xy[2 * i], xy[2 * i + 1]);
+    context.fillRect(px - 2, py - 2, 4, 4);
+    context.fillText(`${Math.round(t)} s`, px + 5, py - 4);
+  });
+}
+
+let lastFrame = 0;
+function frame(stamp) {
+  if (!playing) return;
+  now = Math.min(now + (stamp - lastFrame) / 1000, duration());
+  lastFrame = stamp;
+  draw();
+  if (now >= duration()) stop();
+  else requestAnimationFrame(frame);
+}
+
+function play() {
+  if (playing) return stop();
+  if (now >= duration() - 1e-6) now = 0;
+  playing = true;
+  byId("play").textContent = "❚❚";
+  lastFrame = performance.now();
+  requestAnimationFrame(frame);
+}
+
+function stop() {
+  playing = false;
+  byId("play").textContent = "▶";
+}
+
+function step(samples) {
+  stop();
+  const row = Math.min(Math.max(sampleAt(now).row + samples, 0), times().length - 1);
+  now = times()[row];
+  draw();
+}
+
+// ---- controls ----
+
+function zoom(factor, px, py) {
+  const [x, y] = panel.toWorld(px, py);
+  view.scale = Math.min(Math.max(view.scale * factor, 0.3), 60);
+  panel.scale = view.scale;
+  const [after, aside] = panel.toWorld(px, py);
+  view.centre = [view.centre[0] + x - after, view.centre[1] + y - aside];
+  draw();
+}
+
+function pointer(event) {
+  const box = canvas.getBoundingClientRect();
+  return [event.clientX - box.left, event.clientY - box.top];
+}
+
+function onDown(event) {
+  const start = [event.clientX, event.clientY];
+  const from = [...view.centre];
+  let dragged = false;
+  const onMove = (e) => {
+    const [dx, dy] = [e.clientX - start[0], e.clientY - start[1]];
+    if (Math.hypot(dx, dy) > CLICK) dragged = true;
+    if (!dragged) return;
+    view.centre = [from[0] - dx / view.scale, from[1] + dy / view.scale];
+    draw();
+  };
+  const onUp = (e) => {
+    window.removeEventListener("pointermove", onMove);
+    window.removeEventListener("pointerup", onUp);
+    const id = dragged ? "" : blockAt(...pointer(e));
+    if (id) toggleBlock(id);
+  };
+  window.addEventListener("pointermove", onMove);
+  window.addEventListener("pointerup", onUp);
+}
+
+function onHover(event) {
+  const tip = byId("tip");
+  const [px, py] = pointer(event);
+  const id = panel && event.buttons === 0 ? blockAt(px, py) : "";
+  tip.hidden = !id;
+  if (!id) return;
+  tip.textContent = `${id} · click to ${open.found.current.includes(id) ? "take out" : "add"}`;
+  tip.style.left = `${px + 14}px`;
+  tip.style.top = `${py + 12}px`;
+}
+
+const KEYS = {
+  n: () => move(1),
+  b: () => move(-1),
+  a: () => decide("accept"),
+  r: () => decide("reject"),
+  u: undo,
+  c: () => byId("comment").focus(),
+  o: () => keep({ route: null }),
+  f: wholeScene,
+  " ": play,
+  ArrowLeft: () => step(-1),
+  ArrowRight: () => step(1),
+  "+": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
+  "-": () => zoom(0.8, canvas.clientWidth / 2, canvas.clientHeight / 2),
+};
+
+function onKey(event) {
+  if (event.target === byId("comment")) {
+    if (event.key === "Escape") byId("comment").blur();
+    return;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  if (!KEYS[event.key] || !current) return;
+  event.preventDefault();
+  KEYS[event.key]();
+}
+
+async function start() {
+  listing = await ask("/api/scenarios");
+  const wanted = decodeURIComponent(location.hash.slice(1));
+  const first = listing.scenarios.find((row) => row.token === wanted) ||
+    listing.scenarios.find(isOpen) || listing.scenarios[0];
+  byId("which").value = isOpen(first) ? "open" : "all";
+  for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "u"], ["recorded", "o"], ["play", " "]]) {
+    byId(id).addEventListener("click", KEYS[key]);
+  }
+  byId("which").addEventListener("change", showList);
+  byId("comment").addEventListener("change", keepComment);
+  byId("time").addEventListener("input", (e) => {
+    stop();
+    now = Number(e.target.value);
+    draw();
+  });
+  canvas.addEventListener("pointerdown", onDown);
+  canvas.addEventListener("pointermove", onHover);
+  canvas.addEventListener("pointerleave", () => (byId("tip").hidden = true));
+  canvas.addEventListener("wheel", (e) => {
+    e.preventDefault();
+    zoom(e.deltaY < 0 ? 1.15 : 1 / 1.15, ...pointer(e));
+  }, { passive: false });
+  window.addEventListener("keydown", onKey);
+  window.addEventListener("resize", layOut);
+  await open(first.token);
+}
+
+start().catch((error) => say(error.message, true));
