@@ -5,6 +5,8 @@ Attention runs through torch's fused kernel. What the official code computes and
 not computed here: the ego's own history, and all but the last step of an agent's.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -14,6 +16,7 @@ NUM_AGENT_KINDS = 4
 HISTORY_CHANNELS = 9
 _WIDTHS, _HEADS, _WINDOWS = (32, 64, 128), (2, 4, 8), (3, 3, 5)
 _MLP_RATIO = 3  # of the history encoder
+_LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
 
 
 class Attention(nn.Module):
@@ -295,18 +298,44 @@ class PointsEncoder(nn.Module):
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, out)."""
-        (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
-        line = row // keep.shape[2]
-        weight, bias, last = _folded(self.first_mlp)
-        rows = points.flatten(0, 2)[row]
-        first = last(functional.linear(rows, weight, bias).relu_())
-        pooled = _pooled(first, row, keep)
-        # Linear([point, pooled]) in two parts: that of the line is the same for all its points
-        weight, bias, last = _folded(self.second_mlp)
-        half = first.shape[1]
-        of_line = functional.linear(pooled, weight[:, half:], bias)
-        mixed = torch.addmm(of_line[line], first, weight[:, :half].t()).relu_()
-        return _pooled(last(mixed), row, keep).reshape(*keep.shape[:2], -1)
+        lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
+        size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
+        first, second = _folded(self.first_mlp), _folded(self.second_mlp)
+        parts = zip(lines.split(size), valid.split(size), strict=True)
+        encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
+        return encoded.reshape(*keep.shape[:2], -1)
+
+
+class _FoldedMlp(NamedTuple):
+    """Weight and bias of the first layer with the normalisation in them, and the last layer."""
+
+    weight: Tensor
+    bias: Tensor
+    last: nn.Module
+
+
+def _folded(mlp: nn.Sequential) -> _FoldedMlp:
+    linear, norm, _, last = mlp
+    assert isinstance(linear, nn.Linear)
+    assert isinstance(norm, nn.BatchNorm1d)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    bias = (linear.bias - norm.running_mean) * scale + norm.bias
+    return _FoldedMlp(linear.weight * scale[:, None], bias, last)
+
+
+def _encode_lines(points: Tensor, keep: Tensor, first: _FoldedMlp, second: _FoldedMlp) -> Tensor:
+    """(M, out) from (M, K, channels) with `keep` (M, K)."""
+    (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
+    rows = points.flatten(0, 1)[row]
+    hidden = first.last(functional.linear(rows, first.weight, first.bias).relu_())
+    pooled = _pooled(hidden, row, keep)
+    # Linear([point, pooled]) in two parts: that of the line is the same for all its points
+    half = hidden.shape[1]
+    mixed = functional.linear(hidden, second.weight[:, :half])
+    mixed += functional.linear(pooled, second.weight[:, half:], second.bias)[row // keep.shape[1]]
+    return _pooled(second.last(mixed.relu_()), row, keep)
 
 
 def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -315,20 +344,8 @@ def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     )
 
 
-def _folded(mlp: nn.Sequential) -> tuple[Tensor, Tensor, nn.Module]:
-    """Weight and bias of the first layer with the normalisation in them, and the last layer."""
-    linear, norm, _, last = mlp
-    assert isinstance(linear, nn.Linear)
-    assert isinstance(norm, nn.BatchNorm1d)
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    bias = (linear.bias - norm.running_mean) * scale + norm.bias
-    return linear.weight * scale[:, None], bias, last
-
-
 def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
-    """(B M, C) maximum over the points of each line; points without a value count as zero."""
+    """(M, C) maximum over the points of each line; points without a value count as zero."""
     dense = values.new_zeros(keep.numel(), values.shape[1])
     dense.index_copy_(0, row, values)
-    return dense.reshape(-1, keep.shape[2], values.shape[1]).amax(dim=1)
+    return dense.reshape(*keep.shape, -1).amax(dim=1)
