@@ -73,13 +73,14 @@ def repeat_first(poses: FloatArray) -> FloatArray:
 
 
 def predicted_agents(
-    output: Output, present: FloatArray, velocity: FloatArray, rear: FloatArray
+    output: Output, local: np.ndarray, present: FloatArray, velocity: FloatArray, rear: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the agents will be.
+    """Where the agents are now and will be.
 
     Args:
         output: Of the network.
-        present: (A, 3) poses now, in the ego frame.
+        local: (A, 3) float32 poses now, in the ego frame.
+        present: (A, 3) the same poses in the map frame.
         velocity: (A, 2) velocities now [m/s].
         rear: (3,) rear axle x [m], y [m], heading [rad].
 
@@ -87,11 +88,9 @@ def predicted_agents(
         Poses (A, 81, 3) in the map frame and speeds (A, 81) from now on, every 0.1 s.
     """
     motion = output.prediction
-    poses = np.empty((len(present), STEPS + 1, 3))
+    poses, speeds = np.empty((len(present), STEPS + 1, 3)), np.empty((len(present), STEPS + 1))
     poses[:, 0] = present
-    poses[:, 1:] = headings_of(motion)
-    poses[:, 1:] += present[:, None]
-    speeds = np.empty((len(present), STEPS + 1))
+    poses[:, 1:] = to_map(headings_of(motion) + local[:, None], rear)
     speeds[:, 0] = np.hypot(velocity[:, 0], velocity[:, 1])
     speeds[:, 1:] = np.hypot(motion[..., 4], motion[..., 5])
-    return to_map(poses, rear), speeds
+    return poses, speeds

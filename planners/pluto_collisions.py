@@ -236,7 +236,6 @@ def times_to_collision(
     flags: BoolArray,
     world: World,
     near: IntArray,
-    variant: int,
     scores: FloatArray,
 ) -> None:
     """Whether the ego, moved ahead along its heading, stays clear (§5.5); scores (P,) 0 or 1.
@@ -260,18 +259,16 @@ def times_to_collision(
                     box[corner, 0] = corners[row, step, corner, 0] + travel * cos
                     box[corner, 1] = corners[row, step, corner, 1] + travel * sin
                 x, y, radius = _circle_of(box)
-                # nuPlan: the index of the projection stands in for the time: of the ego, of its
-                # place, and of the object's centre and speed (planner-pluto.md §5.5)
+                # nuPlan: the number of the projection stands in for the time of the ego, of its
+                # place and of the object, but not of the moved box (planner-pluto.md §5.5)
                 then = states[row, number]
                 astray = flags[row, number, MULTIPLE] or flags[row, number, OFF_ROAD]
                 for index in near:
                     if world.touched[index] or _is_apart(world, step, index, x, y, radius):
                         continue
-                    ring = world.boxes[step, index]
-                    if not convex_intersect(box, ring):
+                    if not convex_intersect(box, world.boxes[step, index]):
                         continue
-                    if variant == 1:
-                        ring = world.boxes[number, index]
+                    ring = world.boxes[number, index]
                     speed, center = world.speeds[number, index], world.centers[number, index]
                     if is_at_fault(then, box, ring, center, speed, astray):
                         scores[row] = 0.0

@@ -12,7 +12,7 @@ import numpy as np
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry import project_on_polyline, wrap_angle
 from shiftsim.layers import Polygons, Polylines, meets_convex, square_around
-from shiftsim.map import VectorMap
+from shiftsim.map import NONE, VectorMap
 from shiftsim.planners.pdm_areas import Areas, admit, make_areas
 
 AREA_HALF_SIDE = 60.0  # m, of the square of the drivable areas
@@ -61,6 +61,7 @@ class RouteLanes(NamedTuple):
     Attributes:
         blocks: Blocks of the corrected route, each once.
         starts: Connectors, then lanes of these blocks, in the order of the map.
+        has_block: (B,) whether a block is one of these.
         is_on: (E,) whether an edge belongs to one of these blocks.
         areas: Areas of the map, those of the route marked.
         limits: (M,) speed limits [m/s].
@@ -68,6 +69,7 @@ class RouteLanes(NamedTuple):
 
     blocks: list[int]
     starts: IntArray
+    has_block: BoolArray
     is_on: BoolArray
     areas: Areas
     limits: FloatArray
@@ -84,12 +86,14 @@ def map_areas(road: VectorMap) -> MapAreas:
 def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> RouteLanes:
     """Lanes of a corrected route."""
     unique = list(dict.fromkeys(blocks))
-    is_on = np.isin(road.block_of, np.array(unique, np.int64))
+    has_block = np.zeros(len(road.blocks), np.bool_)
+    has_block[unique] = True
+    is_on = (road.block_of != NONE) & has_block[road.block_of]
     edges = np.flatnonzero(is_on)
     starts = np.concatenate([edges[edges >= road.num_lanes], edges[edges < road.num_lanes]])
     on_route = np.isin(made.areas.edge, edges)
     areas = made.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, is_on, areas, made.limits)
+    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits)
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:

@@ -25,7 +25,6 @@ from shiftsim.planners.pluto_reference import Drivable
 from shiftsim.planners.pluto_world import SCORED, World
 from shiftsim.state import NUM_STATE, VX, VY, VehicleParameters, X, Y
 
-VARIANT = 0
 LEARNED_WEIGHT = 0.3
 PROGRESS_WEIGHT, TTC_WEIGHT, SPEED_WEIGHT, COMFORT_WEIGHT = 5.0, 5.0, 2.0, 2.0
 UNCOMFORTABLE = TOO_FAST = 0.5  # factors
@@ -108,16 +107,11 @@ def score(
     near = near_objects(corners, driven, world)
     clear, fault_times, ttc = np.empty(count), np.empty(count), np.empty(count)
     collisions(driven, corners, flags, world, near, place.edges, clear, fault_times)
-    times_to_collision(driven, corners, flags, world, near, VARIANT, ttc)
+    times_to_collision(driven, corners, flags, world, near, ttc)
     factors = np.stack([clear, on_road(flags[..., OFF_ROAD]), direction(driven, flags)])
     progress = travel(driven, place.baseline)
     terms = np.stack([np.empty(count), speed_score(driven, limits), comfort_score(driven), ttc])
-    product = factors.prod(axis=0)
-    product = product * np.where(terms[2] == 0.0, UNCOMFORTABLE, 1.0)
-    product = product * np.where(terms[1] < SPEED_SCORE_MIN, TOO_FAST, 1.0)
-    terms[0] = normalise(progress, product)
-    weights = np.array([PROGRESS_WEIGHT, SPEED_WEIGHT, COMFORT_WEIGHT, TTC_WEIGHT])
-    rule = product * (weights @ terms / weights.sum())
+    terms[0], rule = aggregate(factors, terms, progress)
     total = rule + LEARNED_WEIGHT * learned
     return Scores(total, rule, factors, terms, progress, fault_times, driven, flags, limits)
 
@@ -184,6 +178,29 @@ def _project_ends(
             baseline, arc, 0, count, driven[row, last, X], driven[row, last, Y]
         )
         out[row] = max(0.0, end - start)
+
+
+def aggregate(
+    factors: FloatArray, terms: FloatArray, progress: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Put the parts of the rule-based score together (§5.6).
+
+    Args:
+        factors: (3, P) of `Scores`.
+        terms: (4, P) of `Scores`; the first row is not read.
+        progress: (P,) [m].
+
+    Returns:
+        The progress scores (P,) in [0, 1], and the rule-based scores (P,).
+    """
+    product = factors.prod(axis=0)
+    product = product * np.where(terms[2] == 0.0, UNCOMFORTABLE, 1.0)
+    product = product * np.where(terms[1] < SPEED_SCORE_MIN, TOO_FAST, 1.0)
+    first = normalise(progress, product)
+    weighted = PROGRESS_WEIGHT * first + TTC_WEIGHT * terms[3]
+    weighted += SPEED_WEIGHT * terms[1] + COMFORT_WEIGHT * terms[2]
+    weights = PROGRESS_WEIGHT + TTC_WEIGHT + SPEED_WEIGHT + COMFORT_WEIGHT
+    return first, product * (weighted / weights)
 
 
 def normalise(progress: FloatArray, product: FloatArray) -> FloatArray:

@@ -195,6 +195,7 @@ class AgentPredictor(nn.Module):
 
     def __init__(self, steps: int) -> None:
         super().__init__()
+        self.steps = steps
         self.loc_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
         self.yaw_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
         self.vel_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
@@ -202,7 +203,7 @@ class AgentPredictor(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """(B, A, 128) to (B, A, steps, 6)."""
         heads = (self.loc_predictor, self.yaw_predictor, self.vel_predictor)
-        shape = (*tokens.shape[:2], -1, 2)
+        shape = (*tokens.shape[:2], self.steps, 2)
         return torch.cat([head(tokens).reshape(shape) for head in heads], dim=-1)
 
 
