@@ -6,6 +6,7 @@ known here are checked by the constructor; planners, stores and splits are check
 
 import difflib
 import json
+import math
 import os
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -17,7 +18,9 @@ from shiftsim.errors import ConfigError
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
-SAVE_ROLLOUTS = ("all", "none")
+SAVE_ROLLOUTS = ("all", "failed", "none")
+EXECUTORS = ("processes", "dask")
+DEVICES = ("cpu", "cuda", "auto")
 DEFAULT_STORE = "demo"
 MAX_SEED = 2**63 - 1
 
@@ -39,9 +42,21 @@ class RunConfig:
         split: Name or file of a split; empty for all scenarios of the store.
         limit: Use only the first scenarios of the split, 0 for all.
         all_scenarios: Also use what the filter dropped, where a whole store is run.
-        workers: Worker processes; 0 chooses from the cores.
+        checkpoints: Checkpoints of learned planners, as a path or `planner=path`.
+        device: Where learned planners compute: `cpu`, `cuda`, or `auto` for what there is.
+        batch_size: Scenarios that advance together, for planners that can; results of another
+            batch size may differ in the last digits.
+        strict: Fail where a planner falls back to a makeshift instead of counting the step.
+        workers: Worker processes; 0 chooses from cores and memory.
+        timeout: Time that one scenario may take [s]; 0 for any.
+        executor: `processes` of this machine, or `dask` for a cluster.
+        scheduler: Address of the cluster's scheduler.
+        shard: The part `i/n` of all tasks; empty for all.
         out: Run folder; empty for `runs/<id>`.
-        save_rollouts: `all` or `none`.
+        resume: Go on with a run that was interrupted, instead of refusing to replace it.
+        retry_failed: Go on with a run, and do again what failed.
+        save_rollouts: `all`, `failed` for those with a score of 0, or `none`.
+        bundle: Copy the scenarios and maps that were used into the run folder.
         allow_partial: Print a labelled mean over the survivors when tasks fail or are missing.
     """
 
@@ -57,9 +72,20 @@ class RunConfig:
     split: str = ""
     limit: int = 0
     all_scenarios: bool = False
+    checkpoints: tuple[str, ...] = ()
+    device: str = "cpu"
+    batch_size: int = 1
+    strict: bool = False
     workers: int = 0
+    timeout: float = 0.0
+    executor: str = "processes"
+    scheduler: str = ""
+    shard: str = ""
     out: str = ""
+    resume: bool = False
+    retry_failed: bool = False
     save_rollouts: str = "all"
+    bundle: bool = False
     allow_partial: bool = False
 
     def __post_init__(self) -> None:
@@ -72,10 +98,20 @@ class RunConfig:
             _no_repeats(name, getattr(self, name))
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
             raise ConfigError(f"seeds {list(self.seeds)!r}: a seed is an integer from 0 on")
-        for name in ("limit", "workers"):
-            if getattr(self, name) < 0:
+        for name in ("limit", "workers", "timeout"):
+            if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} is {getattr(self, name)!r}; it cannot be negative")
+        if self.batch_size < 1:
+            raise ConfigError(f"batch_size is {self.batch_size!r}; it must be at least 1")
         one_of("save_rollouts", self.save_rollouts, SAVE_ROLLOUTS)
+        one_of("executor", self.executor, EXECUTORS)
+        one_of("device", self.device.partition(":")[0], DEVICES)
+        if self.executor == "dask" and not self.scheduler:
+            raise ConfigError(
+                "executor 'dask' needs a scheduler", hint="for example --scheduler tcp://head:8786"
+            )
+        if self.shard:
+            parse_shard(self.shard)
         for planner in self.planner_args:
             one_of("planner in planner_args", planner, self.planners)
 
@@ -85,8 +121,16 @@ class RunConfig:
         return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
 
 
-_LISTS = {"planners": str, "noise": str, "seeds": int, "metrics": str}
-_SCALARS = {"limit": int, "workers": int, "allow_partial": bool, "all_scenarios": bool}
+_LISTS = {"planners": str, "noise": str, "seeds": int, "metrics": str, "checkpoints": str}
+_SCALARS = {
+    "limit": int,
+    "workers": int,
+    "batch_size": int,
+    "timeout": float,
+    **dict.fromkeys(
+        ("allow_partial", "all_scenarios", "strict", "resume", "retry_failed", "bundle"), bool
+    ),
+}
 
 
 def _check_type(name: str, value: object) -> None:
@@ -106,7 +150,8 @@ def _check_type(name: str, value: object) -> None:
 
 
 def _is_a(value: object, kind: type) -> bool:
-    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    kinds = (int, float) if kind is float else (kind,)
+    return isinstance(value, kinds) and (kind is bool or not isinstance(value, bool))
 
 
 def _not_empty(name: str, values: tuple[object, ...]) -> None:
@@ -225,6 +270,18 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
     return planner, name, value
 
 
+def parse_shard(text: str) -> tuple[int, int]:
+    """Number and count of a shard `i/n`, i from 1 to n.
+
+    Raises:
+        ConfigError: It has another form.
+    """
+    number, _, count = text.partition("/")
+    if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
+        return int(number), int(count)
+    raise ConfigError(f"shard {text!r} is not i/n with i from 1 to n", hint="for example 2/16")
+
+
 def store_path(name: str) -> Path:
     """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`).
 
@@ -243,8 +300,42 @@ def checkpoint_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
 
 
-def default_workers() -> int:
-    """Worker processes when nothing is said: one per core that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def default_workers(memory_each: float = 0.5e9) -> int:
+    """Worker processes when nothing is said: one per core, as long as they fit into the memory.
+
+    Args:
+        memory_each: Memory that each of them needs [bytes].
+    """
+    free = _free_memory()
+    fitting = int(free // memory_each) if free else _cores()
+    return max(1, min(_cores(), fitting))
+
+
+def _cores() -> int:
+    """Cores that this process may use, also in a container that gets only a share of them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    quota, _, period = _first_line("/sys/fs/cgroup/cpu.max").partition(" ")
+    if quota.isdecimal() and period.isdecimal():
+        return max(1, min(cores or 1, int(quota) // int(period)))
+    return cores or 1
+
+
+def _free_memory() -> float:
+    """Memory that this process could still take [bytes], 0 where unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return 0.0
+    free = next((float(x.split()[1]) * 1024 for x in lines if x.startswith("MemAvailable")), 0.0)
+    limit = _first_line("/sys/fs/cgroup/memory.max")
+    used = _first_line("/sys/fs/cgroup/memory.current")
+    if limit.isdecimal() and used.isdecimal():
+        free = min(free, float(limit) - float(used))
+    return free
+
+
+def _first_line(path: str) -> str:
+    try:
+        return Path(path).read_text().partition("\n")[0]
+    except OSError:
+        return ""

@@ -1,11 +1,14 @@
 """The manifest of a run: how its results were made."""
 
+import hashlib
 import os
 import platform
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,34 @@ from shiftsim.config import RunConfig
 from shiftsim.results import FORMAT_VERSION
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
+# the sources that results depend on
+_SOURCES = (
+    "data/recording.py",
+    "data/schema.py",
+    "data/store*.py",
+    "dynamics/*.py",
+    "metrics/*.py",
+    "planners/**/*.py",
+    "traffic/*.py",
+    *(
+        f"{name}.py"
+        for name in (
+            "arrays",
+            "geometry",
+            "layers",
+            "log",
+            "map",
+            "noise",
+            "plan_check",
+            "planner",
+            "predicates",
+            "scenario",
+            "simulation",
+            "state",
+            "tasks",
+        )
+    ),
+)
 
 
 def make_manifest(
@@ -24,21 +55,21 @@ def make_manifest(
     split: str,
     store: Path,
     determining: dict[str, Any],
-    counts: dict[str, int],
     argv: Sequence[str],
 ) -> dict[str, Any]:
-    """What a run folder says about how its results were made."""
+    """What a run folder says about how its results were made; state and counts come later."""
     return {
         "format": FORMAT_VERSION,
         "run": folder.name,
-        "state": "finished",
+        "state": "running",
         "argv": list(argv),
-        "config": config.to_dict(),
+        "config": replace(config, resume=False, retry_failed=False).to_dict(),
         "split": split,
+        "shard": config.shard,
         "store": str(store),
-        "counts": counts,
+        "counts": {},
         "determining": determining,
-        "ended": now(),
+        "started": now(),
         "versions": versions(),
         "machine": {
             "system": platform.platform(),
@@ -52,6 +83,16 @@ def make_manifest(
 def now() -> str:
     """The time, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@cache
+def code_digest() -> str:
+    """Digest of all sources that results depend on: two versions of them are not mixed."""
+    root = Path(__file__).parent
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted({path for pattern in _SOURCES for path in root.glob(pattern)}):
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:

@@ -9,11 +9,13 @@ from typing import Any
 
 from shiftsim.config import default_workers, make_config
 from shiftsim.errors import DataError
-from shiftsim.executors import map_unordered
-from shiftsim.manifest import make_manifest
+from shiftsim.executors import Outcome, map_unordered
+from shiftsim.manifest import code_digest, make_manifest, now
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.results import Run, RunWriter, TaskResult, check_target, open_run
+from shiftsim.results import MISSING, OK, Run, TaskResult, open_run
+from shiftsim.resume import check_target
 from shiftsim.rollouts import Task
+from shiftsim.run_writer import RunWriter
 from shiftsim.runner import RUNS, Progress, advanced, ended, run_name
 from shiftsim.tasks import attempt, score_rollout
 
@@ -93,44 +95,51 @@ def rescore(
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
         "metric_version": METRIC_VERSION,
+        "code": _code(run.manifest["determining"].get("code", "")),
     }
     values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
     config = make_config(values, where=str(run.path / "manifest.json"))
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
     check_target(target, determining)
     tasks = [Task(*(row[n] for n in Task._fields)) for row in _finished(run)]
-    lacking = [task for task in tasks if run.places[task] is None]
+    lacking = [task for task in tasks if run.rollout_files[task] is None]
     if lacking:
         raise DataError(
             f"run {run.path.name!r} holds no rollouts for {len(lacking)} of {len(tasks)} tasks",
             hint="run again with --save-rollouts all",
         )
     rescorer = Rescorer(run.path.resolve(), folder, thresholds, metrics, determining["traffic"])
-    writer = RunWriter(target)
+    manifest = make_manifest(
+        target,
+        config=config,
+        split=run.manifest["split"],
+        store=folder,
+        determining=determining,
+        argv=argv,
+    )
+    writer = RunWriter(target, manifest)
     try:
-        writer.link_rollouts(run)
         _keep_unfinished(run, writer)
         progress = Progress(0, len(tasks), 0)
         count = min(workers or default_workers(), len(tasks))
         outcomes = map_unordered(partial(_same, rescorer), tasks, workers=count, alone=1)
         with closing(outcomes):
             for outcome in outcomes:
-                result = ended(outcome)
-                writer.add(result)
+                result = outcome.result or _lost(outcome)
+                writer.add(result, rollout=run.rollout_files[result.task])
                 progress = advanced(progress, result)
                 on_progress(progress)
-        manifest = make_manifest(
-            target,
-            config=config,
-            split=run.manifest["split"],
-            store=folder,
-            determining=determining,
-            counts=writer.counts(run.manifest["counts"]["expected"]),
-            argv=argv,
-        )
-        return writer.finish(manifest | {"rescored_from": run.path.name})
+        manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
+        errors = dict(zip(run.rollout_files, run.tasks["error"].to_pylist(), strict=True))
+        return writer.finish(manifest, run.rollout_files, errors.__getitem__)
     finally:
-        writer.discard()
+        writer.close()
+
+
+def _code(simulated: str) -> str:
+    """Digest of the code that simulated, and of the code that scores where it is another."""
+    here = code_digest()
+    return here if here == simulated else f"{simulated}, scored by {here}"
 
 
 def _same(rescorer: Rescorer) -> Rescorer:
@@ -154,14 +163,19 @@ def _same_store(run: Run, store: str | None) -> Path:
     return path.resolve()
 
 
+def _lost(outcome: Outcome[Task, TaskResult]) -> TaskResult:
+    (result,) = ended(Outcome((outcome.task,), None, outcome.death))
+    return result
+
+
 def _finished(run: Run) -> list[dict[str, Any]]:
-    return [row for row in run.tasks.to_pylist() if row["status"] == "ok"]
+    return [row for row in run.tasks.to_pylist() if row["status"] == OK]
 
 
 def _keep_unfinished(run: Run, writer: RunWriter) -> None:
     """Tasks that failed or are missing stay so."""
     names = ("status", "scenario_type", "error", "hint", "traceback")
     for row in run.tasks.to_pylist():
-        if row["status"] != "ok":
+        if row["status"] not in (OK, MISSING):
             task = Task(*(row[n] for n in Task._fields))
             writer.add(TaskResult(task, *(row[name] for name in names)))

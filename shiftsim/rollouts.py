@@ -1,4 +1,4 @@
-"""Rollouts on disk: one row per sample, one row group per rollout.
+"""Rollouts on disk: a Parquet file each, with a row per sample.
 
 What the scenario holds already is not stored again: recorded tracks (unless the traffic reacts),
 lights, route and expert come back from the store when a rollout is read.
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from shiftsim.errors import DataError
 from shiftsim.log import SimulationLog
@@ -31,6 +32,13 @@ _EGO_COLUMNS = (
 )
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
+# states hardly compress and are never searched: what costs time brings nothing
+_WRITE_OPTIONS: dict[str, Any] = {
+    "compression": "zstd",
+    "compression_level": 1,
+    "use_dictionary": ["planner", "noise", "token"],
+    "write_statistics": False,
+}
 _TRACK_COLUMNS = {
     "track_valid": pa.bool_(),
     "track_poses": pa.float64(),
@@ -59,6 +67,15 @@ def describe(task: Task) -> str:
     """A task in words."""
     seed = "" if task.noise == "none" else f" seed {task.seed}"
     return f"{task.planner} {task.noise}{seed} {task.token}"
+
+
+def encode_rollout(task: Task, log: SimulationLog, *, with_tracks: bool) -> bytes:
+    """One rollout as the bytes of its file."""
+    sink = pa.BufferOutputStream()
+    table = rollout_table(task, log, with_tracks=with_tracks)
+    pq.write_table(table, sink, **_WRITE_OPTIONS)
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
 
 
 def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Table:

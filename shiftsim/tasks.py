@@ -1,13 +1,10 @@
-"""One task of a run: read the scenario, drive it, score it, and never raise.
+"""Tasks of a run: read the scenario, drive it, score it, and never raise.
 
-This runs in a worker. It holds what is worth keeping between tasks: the open store, one instance
-per planner, and the last scenario.
+This runs in a worker, on one unit of work after the other: one task, or several of a planner that
+answers for all of them with one forward pass. It holds what is worth keeping between them: the open
+store, one instance per planner, and the last scenario.
 """
 
-import copy
-import hashlib
-import inspect
-import pickle
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,147 +12,26 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.config import Value
-from shiftsim.errors import ConfigError, ShiftsimError
+from shiftsim.errors import ShiftsimError
 from shiftsim.log import SimulationLog
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
 from shiftsim.noise import NoiseModel
-from shiftsim.planner import Planner
-from shiftsim.results import TaskResult
-from shiftsim.rollouts import Task
+from shiftsim.planner import BatchPlanner, Planner
+from shiftsim.planner_entry import PlannerEntry, close_planner
+from shiftsim.results import FAILED, OK, TaskResult
+from shiftsim.rollouts import Task, encode_rollout
 from shiftsim.scenario import Scenario
 
-# what constructors of users' planners are likely to raise
-_CANNOT_MAKE = (
-    TypeError,
-    ValueError,
-    AttributeError,
-    LookupError,
-    RuntimeError,
-    OSError,
-    ImportError,
-)
-_NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedError, RuntimeError)
-
-
-@dataclass(frozen=True, slots=True)
-class PlannerEntry:
-    """A planner of a run: how to make it, and what identifies it.
-
-    Attributes:
-        name: As in tables.
-        source: A name, `package.module:Class`, a class, or an instance.
-        arguments: Passed to the constructor of a name or class.
-        fingerprint: All that tells it from another planner, as JSON values.
-    """
-
-    name: str
-    source: Any
-    arguments: Mapping[str, Value]
-    fingerprint: Mapping[str, Any]
-
-    def make(self) -> Planner:
-        """An instance of its own for one worker."""
-        if isinstance(self.source, str):
-            from shiftsim.planners import load_planner
-
-            loaded: Planner = load_planner(self.source, dict(self.arguments))
-            return loaded
-        if inspect.isclass(self.source):
-            made: Planner = cast(Any, self.source)(**self.arguments)
-            return made
-        own: Planner = copy.deepcopy(self.source)
-        return own
-
-
-def planner_name(source: Any) -> str:
-    """How a planner given by name, class or instance is called in tables."""
-    if isinstance(source, str):
-        return source
-    kind = source if inspect.isclass(source) else type(source)
-    return str(getattr(source, "name", "") or kind.__name__)
-
-
-def planner_entry(source: Any, arguments: Mapping[str, Value]) -> PlannerEntry:
-    """Describe a planner given by name, class or instance; it is made once to see that it works.
-
-    Raises:
-        ShiftsimError: It does not exist, or cannot be made.
-    """
-    if isinstance(source, str):
-        from shiftsim.planners import planner_fingerprint
-
-        entry = PlannerEntry(
-            source, source, arguments, planner_fingerprint(source, dict(arguments))
-        )
-    else:
-        kind = source if inspect.isclass(source) else type(source)
-        fingerprint = _object_fingerprint(kind, source, arguments)
-        entry = PlannerEntry(planner_name(source), source, arguments, fingerprint)
-    try:
-        planner = entry.make()
-    except ShiftsimError:
-        raise
-    except _CANNOT_MAKE as error:
-        raise ConfigError(
-            f"planner {entry.name!r} cannot be made: {type(error).__name__}: {error}",
-            hint="check its arguments with --planner-arg key=value",
-        ) from error
-    for method in ("reset", "plan"):
-        if not callable(getattr(planner, method, None)):
-            raise ConfigError(
-                f"planner {entry.name!r} has no method {method}()",
-                hint="a planner has reset(scene) and plan(observation)",
-            )
-    _close(planner)
-    return entry
-
-
-def _object_fingerprint(
-    kind: type, source: object, arguments: Mapping[str, Value]
-) -> dict[str, Any]:
-    """A class's code and an instance's state, as far as they can be seen."""
-    digest = hashlib.sha256()
-    try:
-        digest.update(inspect.getsource(kind).encode())
-    except (OSError, TypeError):
-        digest.update(repr(sorted(vars(kind))).encode())
-    if source is not kind:
-        try:
-            digest.update(pickle.dumps(getattr(source, "__dict__", None)))
-        except _NO_PICKLE as error:  # then its state merely has no digest
-            digest.update(type(error).__name__.encode())
-    return {
-        "planner": f"{kind.__module__}:{kind.__qualname__}",
-        "arguments": dict(sorted(arguments.items())),
-        "source": digest.hexdigest(),
-    }
-
-
-def can_travel(entry: PlannerEntry) -> bool:
-    """Whether a planner can be sent to a worker process.
-
-    A class defined in the main script cannot: workers do not import that script.
-    """
-    if isinstance(entry.source, str):
-        return True
-    kind = entry.source if inspect.isclass(entry.source) else type(entry.source)
-    if kind.__module__ == "__main__":
-        return False
-    try:
-        pickle.dumps(entry.source)
-    except _NO_PICKLE:
-        return False
-    return True
+Unit: TypeAlias = tuple[Task, ...]  # what a worker is handed at once
 
 
 @dataclass
 class TaskRunner:
-    """Does tasks, one after the other.
+    """Does units of tasks, one after the other.
 
     Attributes:
         store: Folder of the scenario store.
@@ -165,7 +41,8 @@ class TaskRunner:
         controller: How a plan moves the ego.
         thresholds: Threshold profile.
         metrics: Own metrics, by `module:attribute`.
-        keep_rollouts: Whether results carry their rollout.
+        save_rollouts: Which results carry their rollout: `all`, `failed` (a score of 0) or `none`.
+        strict: Whether a step with a makeshift plan fails its task.
     """
 
     store: Path
@@ -175,26 +52,72 @@ class TaskRunner:
     controller: str
     thresholds: str
     metrics: tuple[str, ...]
-    keep_rollouts: bool
+    save_rollouts: str
+    strict: bool = False
     _open: Any = field(default=None, init=False)
     _made: dict[str, Planner] = field(default_factory=dict, init=False)
     _last: Scenario | None = field(default=None, init=False)
 
-    def __call__(self, task: Task) -> TaskResult:
-        """The result of one task."""
+    def __call__(self, unit: Unit) -> list[TaskResult]:
+        """One result per task of a unit."""
+        return self._together(unit) if len(unit) > 1 else [self._alone(unit[0])]
+
+    def _alone(self, task: Task) -> TaskResult:
         result = attempt(task, partial(self._do, task))
-        if result.status != "ok":
-            # a planner that failed may be in any state: the next task gets a new one
-            self._made.pop(task.planner, None)
+        if result.status != OK:
+            self._forget(task.planner)
         return result
 
     def _do(self, task: Task, seconds: dict[str, float], result: TaskResult) -> TaskResult:
+        from shiftsim.simulation import simulate
+
         with _measured(seconds, "read_seconds"):
             scenario = self._read(task.token)
         with _measured(seconds, "simulate_seconds"):
-            log = self._simulate(scenario, task)
-        seconds |= planning_times(log)
-        with _measured(seconds, "metrics_seconds"):
+            log = simulate(scenario, self._planner(task), **self._setting(task))
+        return self._scored(scenario, log, result)
+
+    def _together(self, unit: Unit) -> list[TaskResult]:
+        """Several tasks in lock step; each of them fails for itself."""
+        from shiftsim.simulation import Rollout, simulate_together
+
+        rollouts: dict[Task, tuple[Scenario, Rollout]] = {}
+
+        def begin(task: Task, seconds: dict[str, float], result: TaskResult) -> TaskResult:
+            with _measured(seconds, "read_seconds"):
+                scenario = self._read(task.token)
+            rollout = Rollout(scenario, self._planner(task), **self._setting(task))
+            rollouts[task] = (scenario, rollout)
+            return result
+
+        results = {task: attempt(task, partial(begin, task)) for task in unit}
+        began = perf_counter()
+        try:
+            logs = simulate_together([rollout for _, rollout in rollouts.values()])
+        except Exception:  # the shared pass itself failed: too little memory for all of them?
+            self._forget(unit[0].planner)
+            return [self._alone(task) for task in unit]
+        share = (perf_counter() - began) / max(1, len(logs))
+        for (task, (scenario, _)), log in zip(rollouts.items(), logs, strict=True):
+            read = results[task].seconds
+            results[task] = attempt(task, partial(self._finished, scenario, log))
+            results[task].seconds.update(read, simulate_seconds=share)
+        return list(results.values())
+
+    def _finished(
+        self,
+        scenario: Scenario,
+        log: SimulationLog | Exception,
+        seconds: dict[str, float],
+        result: TaskResult,
+    ) -> TaskResult:
+        if isinstance(log, Exception):
+            raise log
+        return self._scored(scenario, log, result)
+
+    def _scored(self, scenario: Scenario, log: SimulationLog, result: TaskResult) -> TaskResult:
+        result.seconds.update(planning_times(log))
+        with _measured(result.seconds, "metrics_seconds"):
             scores, metrics = score_rollout(
                 scenario,
                 log,
@@ -202,13 +125,26 @@ class TaskRunner:
                 traffic=self.traffic,
                 metrics=self.metrics,
             )
+        reactive = self.traffic != "nonreactive"
+        keep = self.save_rollouts == "all" or (
+            self.save_rollouts == "failed" and scores["cls"] == 0.0
+        )
         return replace(
             result,
             scenario_type=scenario.scenario_type,
             scores=scores,
             metrics=metrics,
-            log=log if self.keep_rollouts else None,
+            rollout=encode_rollout(result.task, log, with_tracks=reactive) if keep else b"",
         )
+
+    def _setting(self, task: Task) -> dict[str, Any]:
+        return {
+            "noise": self.noises[task.noise],
+            "seed": task.seed,
+            "traffic": self.traffic,
+            "controller": self.controller,
+            "strict": self.strict,
+        }
 
     def _read(self, token: str) -> Scenario:
         if self._open is None:
@@ -219,25 +155,24 @@ class TaskRunner:
             self._last = self._open.read(token)
         return self._last
 
-    def _simulate(self, scenario: Scenario, task: Task) -> SimulationLog:
-        from shiftsim.simulation import simulate
-
+    def _planner(self, task: Task) -> Planner | None:
+        """The planner of a task: made once, or a fork of it that has nothing of other tasks."""
+        if self.controller == "log-playback":
+            return None
         planner = self._made.get(task.planner)
-        if planner is None and self.controller != "log-playback":
+        if planner is None:
             planner = self._made[task.planner] = self.planners[task.planner].make()
-        return simulate(
-            scenario,
-            planner,
-            noise=self.noises[task.noise],
-            seed=task.seed,
-            traffic=self.traffic,
-            controller=self.controller,
-        )
+        return planner.fork() if isinstance(planner, BatchPlanner) else planner
+
+    def _forget(self, name: str) -> None:
+        """After a failure a planner may be in any state: the next task gets a new one."""
+        if not isinstance(self._made.get(name), BatchPlanner):
+            self._made.pop(name, None)
 
     def close(self) -> None:
         """Let the planners release what they hold."""
         for planner in self._made.values():
-            _close(planner)
+            close_planner(planner)
         self._made.clear()
 
 
@@ -248,13 +183,13 @@ def attempt(task: Task, work: Callable[[dict[str, float], TaskResult], TaskResul
         task: The task.
         work: Fills the durations it is given, and completes the result it is given.
     """
-    result = TaskResult(task, "ok")
+    result = TaskResult(task, OK)
     try:
         return work(result.seconds, result)
     except Exception as error:  # the one place: a task that fails is a row, not the end of a run
         return replace(
             result,
-            status="failed",
+            status=FAILED,
             error=f"{_kind(error)}{error}",
             hint=getattr(error, "hint", ""),
             traceback=traceback.format_exc(),
@@ -311,12 +246,6 @@ def _metric_row(row: MetricRow, start_us: int) -> dict[str, Any]:
         "first_violation_value": None if first is None else first.value,
         "partner_token": None if first is None else first.partner,
     }
-
-
-def _close(planner: object) -> None:
-    close = getattr(planner, "close", None)
-    if callable(close):
-        close()
 
 
 def _kind(error: Exception) -> str:

@@ -1,7 +1,10 @@
 """Commands that simulate or score: run, demo, score."""
 
 import shlex
+import signal
 import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +20,12 @@ _UNFINISHED, _INTERRUPTED = 3, 130
 _DEMO_PLANNERS = ("log-future", "idm", "constant-velocity")
 _DEMO_NOISE = ("none", "ou-high")
 _MAX_NAMED_FAILURES = 5
+_BEFORE = {
+    "new": "nothing there yet",
+    "unfinished": "goes on with what is finished",
+    "failed": "had ended with failed or missing tasks",
+    "complete": "is complete already",
+}
 
 Planners = Annotated[
     list[str] | None,
@@ -44,7 +53,29 @@ AllScenarios = Annotated[
 ]
 Workers = Annotated[str | None, typer.Option(help="Worker processes. [auto]")]
 Out = Annotated[str | None, typer.Option(help="Run folder. [runs/<id>]")]
-SaveRollouts = Annotated[str | None, typer.Option(help="all or none. [all]")]
+SaveRollouts = Annotated[str | None, typer.Option(help="all, failed (score 0) or none. [all]")]
+Checkpoints = Annotated[
+    list[str] | None,
+    typer.Option("--checkpoint", help="PATH, or PLANNER=PATH; repeatable."),
+]
+Device = Annotated[str | None, typer.Option(help="cpu, cuda or auto. [cpu]")]
+BatchSize = Annotated[
+    int | None, typer.Option(help="Scenarios per forward pass of a learned planner. [1]")
+]
+Strict = Annotated[bool, typer.Option("--strict", help="Fail where a planner falls back.")]
+Timeout = Annotated[
+    float | None, typer.Option(help="Seconds that one scenario may take; a hung one is killed.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Finish an interrupted or killed run.")]
+RetryFailed = Annotated[
+    bool, typer.Option("--retry-failed", help="Finish a run, and do again what failed.")
+]
+Shard = Annotated[str | None, typer.Option(help="Only the part i/n of the tasks; see merge.")]
+Executor = Annotated[str | None, typer.Option(help="processes or dask. [processes]")]
+Scheduler = Annotated[str | None, typer.Option(help="Address of the dask scheduler.")]
+Bundle = Annotated[
+    bool, typer.Option("--bundle", help="Copy the scenarios used into the run folder.")
+]
 Metrics = Annotated[
     list[str] | None,
     typer.Option("--metric", help="Own metric as package.module:function; repeatable."),
@@ -77,9 +108,20 @@ def run(
     planner_arg: PlannerArgs = None,
     metric: Metrics = None,
     config: Config = None,
+    checkpoint: Checkpoints = None,
+    device: Device = None,
+    batch_size: BatchSize = None,
+    strict: Strict = False,
     out: Out = None,
     workers: Workers = None,
+    timeout: Timeout = None,
+    resume: Resume = False,
+    retry_failed: RetryFailed = False,
+    shard: Shard = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     save_rollouts: SaveRollouts = None,
+    bundle: Bundle = False,
     allow_partial: Partial = False,
     dry_run: DryRun = False,
     quiet: Quiet = False,
@@ -87,13 +129,13 @@ def run(
     debug: Debug = False,
 ) -> None:
     """Simulate and score planners on scenarios."""
-    from shiftsim.config import make_config, parse_argument, read_toml
+    from shiftsim.config import make_config, read_toml
 
     values = read_toml(config) if config else {}
     flags: dict[str, Any] = {
         "planners": planner or None,
         "noise": noise or None,
-        "seeds": None if seeds is None else _numbers(seeds),
+        "seeds": None if seeds is None else numbers(seeds),
         "store": store,
         "split": split,
         "limit": limit,
@@ -102,24 +144,45 @@ def run(
         "controller": controller,
         "thresholds": thresholds,
         "metrics": metric or None,
+        "checkpoints": checkpoint or None,
+        "device": device,
+        "batch_size": batch_size,
+        "strict": strict or None,
         "out": out,
         "workers": None if workers is None else worker_count(workers),
+        "timeout": timeout,
+        "resume": resume or None,
+        "retry_failed": retry_failed or None,
+        "shard": shard,
+        "executor": executor,
+        "scheduler": scheduler,
         "save_rollouts": save_rollouts,
+        "bundle": bundle or None,
         "allow_partial": allow_partial or None,
     }
     values |= {name: value for name, value in flags.items() if value is not None}
     if planner_arg:
-        named = tuple(values.get("planners", ()))
-        arguments = {name: dict(table) for name, table in values.get("planner_args", {}).items()}
-        for text in planner_arg:
-            owner, name, value = parse_argument(text, named)
-            arguments.setdefault(owner, {})[name] = value
-        values["planner_args"] = arguments
+        before, names = values.get("planner_args", {}), values.get("planners", ())
+        values["planner_args"] = planner_arguments(planner_arg, before, names)
     made = make_config(values, where=str(config) if config else "run")
-    _run(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
+    run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
 
 
-def _numbers(text: str) -> list[int]:
+def planner_arguments(
+    texts: Sequence[str] | None, before: Mapping[str, Any], planners: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Arguments by planner, those of the command line put over what a file says."""
+    from shiftsim.config import parse_argument
+
+    arguments = {name: dict(table) for name, table in before.items()}
+    for text in texts or ():
+        owner, name, value = parse_argument(text, tuple(planners))
+        arguments.setdefault(owner, {})[name] = value
+    return arguments
+
+
+def numbers(text: str) -> list[int]:
+    """Seeds as given on the command line."""
     from shiftsim.errors import ConfigError
 
     try:
@@ -143,7 +206,8 @@ def worker_count(text: str | None) -> int:
     return int(text)
 
 
-def _run(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
+def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
+    """Run what the settings say, print what it gave, and leave with the right code."""
     from shiftsim.runner import execute, prepare
 
     prepared = prepare(config)
@@ -152,25 +216,39 @@ def _run(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
     if dry_run:
         say("dry run: everything checked, nothing simulated")
         return
-    with progress_bar(quiet=quiet or as_json) as advance:
+    with progress_bar(quiet=quiet or as_json) as advance, stopped_as_interrupt():
 
         def show(progress: "Progress") -> None:
-            advance(progress.done, progress.total, _shares(progress))
+            advance(progress.done, progress.total, progress_note(progress))
 
         try:
             finished = execute(prepared, on_progress=show, argv=sys.argv)
         except KeyboardInterrupt:
-            kept = prepared.folder if prepared.folder.exists() else "nothing"
-            again = shlex.join(["shiftsim", *sys.argv[1:]])
+            words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
+            again = shlex.join(["shiftsim", *words, "--resume"])
             typer.echo("error: interrupted", err=True)
-            typer.echo(f"hint: kept: {kept}; start again with: {again}", err=True)
+            typer.echo(f"hint: kept: {prepared.folder}; go on with: {again}", err=True)
             raise typer.Exit(_INTERRUPTED) from None
     _show(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
     if not finished.is_complete:
         raise typer.Exit(_UNFINISHED)
 
 
-def _shares(progress: "Progress") -> str:
+@contextmanager
+def stopped_as_interrupt() -> Iterator[None]:
+    """A request to end, as a batch system sends it, keeps what is finished like an interrupt."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def progress_note(progress: "Progress") -> str:
     """Where the time goes."""
     parts = dict(progress.seconds)
     planner = parts.get("planner_seconds", 0.0)
@@ -207,10 +285,20 @@ def _announce(prepared: "Prepared") -> None:
     )
     if config.metrics:
         say(f"metrics     {' '.join(config.metrics)}")
+    if any(entry.in_batches for entry in prepared.runner.planners.values()):
+        strict = "   strict" if config.strict else ""
+        say(f"networks    device {config.device}   batch size {config.batch_size}{strict}")
+    where = f"workers {prepared.workers} x 1 thread"
+    if config.executor == "dask":
+        where = f"dask {config.scheduler}"
+    limit = f"   timeout {config.timeout:g} s" if config.timeout else ""
+    part = f" (shard {config.shard})" if config.shard else ""
     say(
-        f"tasks       {len(prepared.tasks)}   workers {prepared.workers}"
+        f"tasks       {len(prepared.tasks)}{part}   {where}{limit}"
         f"   rollouts {config.save_rollouts}   → {prepared.folder}"
     )
+    if prepared.resumes:
+        say(f"resume      {_BEFORE[prepared.before]}")
     say()
 
 
@@ -232,8 +320,8 @@ def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
         say(f" {row['status']}: {row['token']} {row['planner']} {row['noise']}: {row['error']}")
     if lost:
         say(
-            f" {counts['failed']} failed, {counts['missing']} missing of {counts['expected']} tasks"
-            f" — shiftsim explain {finished.path} TOKEN"
+            f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
+            f" of {counts['expected']} tasks — shiftsim explain {finished.path} TOKEN"
         )
     say(f" results: {finished.path}")
 
@@ -264,7 +352,7 @@ def demo(
         "workers": worker_count(workers),
     }
     try:
-        _run(make_config(values, where="demo"), dry_run=False, quiet=quiet, as_json=False)
+        run_config(make_config(values, where="demo"), dry_run=False, quiet=quiet, as_json=False)
     finally:
         named = f" --store {folder}" if out else ""
         say()

@@ -53,9 +53,9 @@ def test_shuffled_tasks_give_the_same_bytes(clean_run, toy, tmp_path):
         seeds=[1, 0],
     )
     prepared = prepare(config)
-    tasks = list(prepared.tasks)
-    random.Random(5).shuffle(tasks)
-    other = execute(replace(prepared, tasks=tuple(tasks)))
+    units = list(prepared.units)
+    random.Random(5).shuffle(units)
+    other = execute(replace(prepared, units=tuple(units)))
     assert same_results(clean_run, other) == [True, True]
 
 
@@ -87,7 +87,13 @@ def test_a_folder_with_other_content_is_left_alone(toy, tmp_path):
 
 def test_a_failing_task_is_a_row_and_withholds_the_score(toy, tmp_path):
     run = execute(prepare(settings(toy, tmp_path / "run", planners=["drivers:Failing"])))
-    assert run.manifest["counts"] == {"expected": 4, "ok": 3, "failed": 1, "missing": 0}
+    assert run.manifest["counts"] == {
+        "expected": 4,
+        "ok": 3,
+        "failed": 1,
+        "timeout": 0,
+        "missing": 0,
+    }
     failed = [task for task in run.tasks.to_pylist() if task["status"] == "failed"]
     assert failed[0]["token"] == BAD
     assert failed[0]["error"] == "RuntimeError: cannot drive here"
@@ -102,7 +108,13 @@ def test_a_failing_task_is_a_row_and_withholds_the_score(toy, tmp_path):
 def test_a_dying_worker_costs_one_task(toy, tmp_path):
     config = settings(toy, tmp_path / "run", planners=["drivers:Dying"], workers=2)
     run = execute(prepare(config))
-    assert run.manifest["counts"] == {"expected": 4, "ok": 3, "failed": 1, "missing": 0}
+    assert run.manifest["counts"] == {
+        "expected": 4,
+        "ok": 3,
+        "failed": 1,
+        "timeout": 0,
+        "missing": 0,
+    }
     failed = next(task for task in run.tasks.to_pylist() if task["status"] == "failed")
     assert (failed["token"], failed["error"]) == (BAD, "worker process ended with exit code 11")
 
@@ -113,7 +125,13 @@ def test_an_interrupt_keeps_what_is_finished(toy, tmp_path):
         execute(prepare(config))
     run = shiftsim.open_run(tmp_path / "run")
     assert run.manifest["state"] == "interrupted"
-    assert run.manifest["counts"] == {"expected": 4, "ok": 1, "failed": 0, "missing": 3}
+    assert run.manifest["counts"] == {
+        "expected": 4,
+        "ok": 1,
+        "failed": 0,
+        "timeout": 0,
+        "missing": 3,
+    }
     assert "– (1/4 done)" in run.table()
 
 
@@ -171,7 +189,13 @@ def test_scenarios_that_the_store_lacks_stop_the_run_or_are_counted(toy, tmp_pat
     config = settings(toy, tmp_path / "run", split=str(split), allow_partial=True)
     run = execute(prepare(config))
     assert run.manifest["split"] == "mine"
-    assert run.manifest["counts"] == {"expected": 3, "ok": 2, "failed": 0, "missing": 1}
+    assert run.manifest["counts"] == {
+        "expected": 3,
+        "ok": 2,
+        "failed": 0,
+        "timeout": 0,
+        "missing": 1,
+    }
     assert "– (2/3 done)" in run.table()
 
 
@@ -180,7 +204,13 @@ def test_a_broken_scenario_fails_alone(tmp_path):
     ego = next((store / "recordings").glob("*1/ego*"))
     ego.write_bytes(ego.read_bytes()[:200])
     run = execute(prepare(settings(store, tmp_path / "run")))
-    assert run.manifest["counts"] == {"expected": 3, "ok": 2, "failed": 1, "missing": 0}
+    assert run.manifest["counts"] == {
+        "expected": 3,
+        "ok": 2,
+        "failed": 1,
+        "timeout": 0,
+        "missing": 0,
+    }
     failed = next(task for task in run.tasks.to_pylist() if task["status"] == "failed")
     assert failed["token"] == BAD
     assert ego.name in failed["error"]
