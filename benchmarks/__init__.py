@@ -1,4 +1,130 @@
-"""Benchmarks: speed figures of this checkout, in `speed`."""
+"""The benchmark as data: its tracks, its lists of scenarios, and the published figures.
+
+`load_track("state-drift")` says what a complete result covers; `bench` runs it.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from shiftsim.config import one_of
+from shiftsim.report.groups import KnownSet
+from shiftsim.report.published import Published
+
+TRACKS = ("semantic-shift", "state-drift")
+_HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """What a complete result of a track covers.
+
+    Attributes:
+        name: On the command line.
+        title: Of its table.
+        planners: Those that the paper compares.
+        traffic: Traffic modes, one run each.
+        noise: Noise models.
+        seeds: Seeds of the noise.
+        reference: The published list that is driven besides one's own scenarios.
+        own_thresholds: Threshold profile of one's own scenarios.
+        own_note: What scores on one's own scenarios are, and are not.
+    """
+
+    name: str
+    title: str
+    planners: tuple[str, ...]
+    traffic: tuple[str, ...]
+    noise: tuple[str, ...]
+    seeds: tuple[int, ...]
+    reference: KnownSet
+    own_thresholds: str
+    own_note: str
+
+    @property
+    def rollouts_per_scenario(self) -> int:
+        """Rollouts of one planner on one scenario."""
+        noisy = sum(name != "none" for name in self.noise)
+        return len(self.traffic) * (len(self.noise) - noisy + noisy * len(self.seeds))
+
+
+def load_track(name: str) -> Track:
+    """A track by its name.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    one_of("track", name, TRACKS)
+    table = _read(name.replace("-", "_"))
+    sets = table["sets"]
+    return Track(
+        name=name,
+        title=table["title"],
+        planners=tuple(table["planners"]),
+        traffic=tuple(table["traffic"]),
+        noise=tuple(table["noise"]),
+        seeds=tuple(table["seeds"]),
+        reference={one.name: one for one in known_sets()}[sets["reference"]],
+        own_thresholds=sets["own_thresholds"],
+        own_note=sets["own_note"],
+    )
+
+
+@cache
+def known_sets() -> tuple[KnownSet, ...]:
+    """The lists of scenarios that are known, small ones before those that hold them."""
+    return tuple(
+        KnownSet(
+            name=name,
+            label=table["label"],
+            thresholds=table["thresholds"],
+            count=table["count"],
+            sha256=table["sha256"],
+            tokens=tuple(table.get("tokens", ())),
+        )
+        for name, table in _read("sets").items()
+    )
+
+
+@cache
+def published() -> Published:
+    """The figures of the paper."""
+    table = _read("published")
+    shift, noise, comparison = (
+        table[name] for name in ("semantic_shift", "noise_robustness", "comparison")
+    )
+    return Published(
+        source=table["source"],
+        cities={short: tuple(names) for short, names in table["cities"].items()},
+        scenarios=table["scenarios"],
+        columns=tuple(shift["columns"]),
+        semantic_shift={
+            traffic: {name: tuple(values) for name, values in rows.items()}
+            for traffic, rows in _tables(shift).items()
+        },
+        noises=tuple(noise["columns"]),
+        robustness={
+            traffic: {
+                name: {planner: tuple(map(tuple, cells)) for planner, cells in rows.items()}
+                for name, rows in sets.items()
+            }
+            for traffic, sets in _tables(noise).items()
+        },
+        sets=tuple(comparison["columns"]),
+        comparison={name: tuple(cells) for name, cells in comparison["rows"].items()},
+    )
+
+
+def _tables(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in table.items() if isinstance(value, dict)}
+
+
+def _read(name: str) -> dict[str, Any]:
+    return tomllib.loads((_HERE / f"{name}.toml").read_text("utf-8"))
+
 
 if __name__ == "benchmarks":  # pragma: no cover
     raise ImportError("import it as shiftsim.benchmarks")

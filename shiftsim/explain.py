@@ -8,6 +8,7 @@ from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.results import Run
 from shiftsim.rollouts import Task
 
+_COLLISIONS = "no_ego_at_fault_collisions"
 _UNITS = {  # nuPlan's names, shortened
     "meters": "m",
     "seconds": "s",
@@ -40,7 +41,8 @@ def select_tasks(
         seed: Only this seed.
 
     Returns:
-        Rows of `tasks.parquet`, with `cls` and `metrics` added.
+        Rows of `tasks.parquet`, with `cls`, `why` and `metrics` added; every metric has its `role`
+        (`multiplier`, `weighted` or empty) and `weight`.
 
     Raises:
         ConfigError: There is no such task, or several scenarios begin like that.
@@ -62,10 +64,44 @@ def select_tasks(
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in run.metrics.to_pylist():
         metrics.setdefault(_key(row), []).append(row)
-    return [
-        {**row, "cls": scores.get(_key(row), {}).get("cls"), "metrics": metrics.get(_key(row), [])}
-        for row in rows
-    ]
+    out = []
+    for row in rows:
+        cls = scores.get(_key(row), {}).get("cls")
+        known = [_with_role(metric) for metric in metrics.get(_key(row), [])]
+        out.append({**row, "cls": cls, "why": why(cls, known), "metrics": known})
+    return out
+
+
+def _with_role(row: dict[str, Any]) -> dict[str, Any]:
+    name = row["metric"]
+    role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
+    return {**row, "role": role, "weight": WEIGHTS.get(name)}
+
+
+def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
+    """A score in one line: what made it 0, or how it is composed; empty for a failed task."""
+    if cls is None:
+        return ""
+    scored = [row for row in metrics if row["score"] is not None]
+    factors = [row for row in scored if row["role"] == "multiplier"]
+    parts = [row for row in scored if row["role"] == "weighted"]
+    zero = [row for row in factors if row["score"] == 0.0]
+    if zero:
+        causes = (f"{row['metric']} is 0{_first_violation(row)}" for row in zero)
+        return f"score 0 because {' and '.join(causes)}"
+    if cls == 0.0:
+        return "score 0 because every weighted metric is 0"
+    product = " × ".join(f"{row['score']:g}" for row in factors)
+    terms = " + ".join(f"{row['weight']:g}·{row['score']:.4g}" for row in parts)
+    total = sum(row["weight"] for row in parts)
+    return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
+
+
+def _first_violation(row: dict[str, Any]) -> str:
+    if row["first_violation_iteration"] is None:
+        return ""
+    partner = f", track {row['partner_token']}" if row["partner_token"] else ""
+    return f" ({row['first_violation_s']:.1f} s{partner})"
 
 
 def _key(row: dict[str, Any]) -> Task:
@@ -99,6 +135,7 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
         lines += [f"  hint: {task['hint']}"] if task["hint"] else []
         return lines + [f"  {line}" for line in (task["traceback"] or "").splitlines()]
     lines = [f"{head}  CLS {task['cls']:.4f}"]
+    lines.append(f"  {task['why']}")
     lines.append("  the score is the product of the × rows and the weighted mean of the + rows")
     scored = [row for row in task["metrics"] if row["metric"] in SHORT_NAMES]
     scored.sort(key=lambda row: row["metric"] not in MULTIPLIERS)
@@ -120,11 +157,11 @@ def _metric_line(row: dict[str, Any]) -> str:
     if row["threshold"] is not None:
         parts.append(f"threshold {row['threshold']:.4g}{_unit(row)}")
     if row["first_violation_iteration"] is not None:
-        partner = f" with {row['partner_token']}" if row["partner_token"] else ""
-        parts.append(
-            f"first violated at {row['first_violation_s']:.1f} s: "
-            f"{row['first_violation_value']:.4g}{_unit(row)}{partner}"
-        )
+        partner = f", track {row['partner_token']}" if row["partner_token"] else ""
+        value = f"{row['first_violation_value']:.4g}{_unit(row)}"
+        if name == _COLLISIONS:  # its value counts collisions, that of a violation is a speed
+            value = f"delta-v {value} m/s"
+        parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{partner}")
     return "  ".join(parts).rstrip()
 
 

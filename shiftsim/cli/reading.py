@@ -1,12 +1,18 @@
-"""Commands that look at things: report, explain, check, planners, verify, doctor."""
+"""Commands that look at things: report, explain, diff, check, planners, verify, doctor."""
 
+import shutil
+import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+
+if TYPE_CHECKING:
+    from shiftsim.results import Run
 
 _USAGE, _DATA = 1, 2
 
@@ -19,6 +25,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(report)
     app.command()(explain)
+    app.command()(diff)
     app.command()(check)
     app.command()(verify)
     app.command()(doctor)
@@ -30,36 +37,82 @@ def register(app: typer.Typer) -> None:
 
 def report(
     runs: RunFolders,
-    style: Annotated[str, typer.Option("--format", "-f", help="text, md, csv or latex.")] = "text",
-    by: Annotated[
-        str | None, typer.Option(help="One row per scenario_type, or per seed, as well.")
+    style: Annotated[
+        list[str] | None,
+        typer.Option("--format", "-f", help="text, md, csv, latex, html; repeatable. [text]"),
     ] = None,
+    table: Annotated[
+        list[str] | None,
+        typer.Option("--table", "-t", help="Only this table; repeatable. A wrong name lists them."),
+    ] = None,
+    by: Annotated[
+        str | None, typer.Option(help="Scores per scenario_type, city or seed as well.")
+    ] = None,
+    published: Annotated[
+        bool, typer.Option("--published", help="The paper's figures beside the own ones.")
+    ] = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Pictures as well, into --out [RUN/report].")
+    ] = False,
     worst: Annotated[int, typer.Option(help="Name the N worst rollouts.")] = 5,
-    out: Annotated[Path | None, typer.Option(help="Write to this file instead.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write everything into this folder.")] = None,
     allow_partial: Annotated[
         bool, typer.Option("--allow-partial", help="Print a labelled mean over what finished.")
     ] = False,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
-    """Score tables of one or several runs."""
-    from shiftsim.report import score_table, summary, worst_rollouts
-    from shiftsim.results import open_run
+    """Tables and pictures of one or several runs, or of a benchmark's folder."""
+    from shiftsim.benchmarks import known_sets
+    from shiftsim.benchmarks import published as published_figures
+    from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.report import FORMATS, read_groups, render, summary
+    from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
 
-    opened = [open_run(path) for path in runs]
+    opened, own_lists, extra = open_runs(runs)
     if as_json:
         say_json([summary(run) for run in opened])
         return
-    text = score_table(opened, style=style, by=by, allow_partial=allow_partial)
+    for name in style or ():
+        one_of_formats(name, FORMATS)
+    groups = read_groups(opened, (*known_sets(), *own_lists))
+    if figures and out is None:
+        out = runs[0] / "report"
+    chosen = tuple(table or (TABLES if out else BRIEF))
+    options = Options(chosen, by, published, allow_partial)
+    tables = [*make_tables(groups, published_figures(), options), *extra(groups)]
     if out is not None:
-        out.write_text(text + "\n")
-        say(f"written: {out}")
-    else:
-        say(text)
-    if style != "text" or out is not None:
+        from shiftsim.report.figures import figures as draw
+
+        drawn = draw(groups, allow_partial=allow_partial) if figures else []
+        files = write_report(out, tables, drawn, style or FORMATS)
+        say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
         return
-    for run in opened:
-        rows = worst_rollouts(run, worst)
+    kind = (style or ["text"])[0]
+    if kind == "csv" and not table:
+        tables = tables[:1]
+    say("\n\n".join(render(one, kind, width=terminal_width()) for one in tables))
+    if kind == "text" and not table:
+        _say_worst(opened, worst)
+
+
+def terminal_width() -> int:
+    """Columns of the terminal; 0 where the output goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+
+
+def one_of_formats(name: str, formats: Sequence[str]) -> None:
+    """Refuse an unknown format."""
+    from shiftsim.config import one_of
+
+    one_of("format", name, formats)
+
+
+def _say_worst(runs: "Sequence[Run]", count: int) -> None:
+    from shiftsim.report import worst_rollouts
+
+    for run in runs:
+        rows = worst_rollouts(run, count)
         if rows:
             say(f"\n worst of {run.path.name}")
         for row in rows:
@@ -91,6 +144,25 @@ def explain(
             say()
         for line in explain_lines(task):
             say(line)
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run folder.")],
+    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
+    limit: Annotated[int, typer.Option(help="Look into the N largest changes.")] = 10,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Scenarios whose score differs between two runs, and where the rollouts part."""
+    from shiftsim.diff import diff_lines, diff_runs
+    from shiftsim.results import open_run
+
+    found = diff_runs(open_run(first), open_run(second), limit=limit)
+    if as_json:
+        say_json(found.to_dict())
+        return
+    for line in diff_lines(found):
+        say(line)
 
 
 def check(

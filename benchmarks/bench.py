@@ -1,0 +1,232 @@
+"""A track as one command: its runs, one after the other, and one report about all of them.
+
+The folder holds a run per set of scenarios and traffic mode, `bench.json`, which says what belongs
+to it, and `report/`.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from shiftsim.benchmarks import Track, load_track
+from shiftsim.benchmarks.coverage import coverage
+from shiftsim.config import DEFAULT_STORE, make_config
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.report.groups import Group, KnownSet, token_digest
+from shiftsim.report.tables import Table
+from shiftsim.results import Run, open_run
+from shiftsim.runner import RUNS, Prepared, Progress, execute, prepare
+
+MANIFEST = "bench.json"
+DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said
+_FORMAT = 1
+
+Extra = Callable[[Sequence[Group]], list[Table]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A benchmark that has been checked and can start.
+
+    Attributes:
+        track: The track.
+        folder: Where everything goes.
+        runs: The runs, by the name of their folder.
+        own: One's own list of scenarios as a whole.
+    """
+
+    track: Track
+    folder: Path
+    runs: Mapping[str, Prepared]
+    own: KnownSet
+
+    @property
+    def num_tasks(self) -> int:
+        """Rollouts of all runs."""
+        return sum(len(prepared.tasks) for prepared in self.runs.values())
+
+
+def plan_bench(
+    track: Track, settings: Mapping[str, Any], *, reference: str = "", out: str = ""
+) -> Plan:
+    """Check all runs of a track before the first one starts.
+
+    Args:
+        track: The track.
+        settings: Settings of `RunConfig`; traffic, noise, seeds and thresholds are the track's
+            unless they are given.
+        reference: Store, or `STORE:SPLIT`, with the scenarios of the track's published list;
+            empty to leave it out.
+        out: The folder; by default `runs/<id>`.
+
+    Raises:
+        ShiftsimError: A setting is wrong, or something is missing.
+    """
+    values = dict(settings)
+    modes = [values.pop("traffic")] if values.get("traffic") else list(track.traffic)
+    if "store" not in values and "split" not in values:
+        values |= {"store": DEFAULT_STORE, "split": DEFAULT_SPLIT}
+    values = {"noise": list(track.noise), "seeds": list(track.seeds)} | values
+    sets = {"own": {"thresholds": track.own_thresholds} | values}
+    if reference:
+        store, _, split = reference.partition(":")
+        rules = {"store": store, "split": split, "thresholds": track.reference.thresholds}
+        sets[track.reference.name] = values | rules
+    folder = Path(out) if out else RUNS / _name(track, sets)
+    _check_folder(folder, track)
+    runs = {
+        f"{name}-{traffic}": _prepared(
+            track, table | {"traffic": traffic}, folder / f"{name}-{traffic}"
+        )
+        for name, table in sets.items()
+        for traffic in modes
+    }
+    return Plan(track, folder, runs, _own_list(next(iter(runs.values()))))
+
+
+def _prepared(track: Track, table: Mapping[str, Any], folder: Path) -> Prepared:
+    """One run; it goes on with what its folder holds."""
+    values = {**table, "out": str(folder), "resume": folder.exists()}
+    return prepare(make_config(values, where=f"bench {track.name}"))
+
+
+def _name(track: Track, sets: Mapping[str, Mapping[str, Any]]) -> str:
+    text = json.dumps([track.name, sets], sort_keys=True, default=str)
+    digest = hashlib.blake2b(text.encode(), digest_size=2).hexdigest()
+    own = sets["own"]
+    split = Path(str(own.get("split") or own.get("store") or DEFAULT_STORE)).stem
+    return f"{track.name}_{split}_{digest}"
+
+
+def _check_folder(folder: Path, track: Track) -> None:
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    found = _read_manifest(folder)
+    if found is None or found["track"] != track.name:
+        raise ConfigError(
+            f"{str(folder)!r} holds something else than a {track.name} benchmark",
+            hint="choose another --out",
+        )
+
+
+def _own_list(prepared: Prepared) -> KnownSet:
+    """The whole list that a run is on, which may be limited to its first scenarios."""
+    whole = prepared
+    if prepared.config.limit:
+        unlimited = replace(
+            prepared.config, limit=0, out=str(prepared.folder / "whole"), resume=False
+        )
+        whole = prepare(unlimited)
+    tokens = {task.token for task in (*whole.tasks, *whole.missing)}
+    rules = prepared.config.thresholds
+    return KnownSet(whole.split, whole.split, rules, len(tokens), token_digest(tokens))
+
+
+def run_bench(
+    plan: Plan,
+    *,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    argv: Sequence[str] = (),
+) -> list[Run]:
+    """Do all runs; those that are complete already are kept as they are.
+
+    Args:
+        plan: The benchmark.
+        on_progress: Called after every rollout, with counts over all runs.
+        argv: The command line, for the manifests.
+    """
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    own = plan.own
+    manifest = {
+        "format": _FORMAT,
+        "track": plan.track.name,
+        "runs": list(plan.runs),
+        "own": {"name": own.name, "count": own.count, "sha256": own.sha256},
+        "argv": list(argv),
+    }
+    text = json.dumps(manifest, indent=1, ensure_ascii=False)
+    (plan.folder / MANIFEST).write_text(f"{text}\n", encoding="utf-8")
+    out = []
+    base = Progress(0, plan.num_tasks, 0)
+    for prepared in plan.runs.values():
+        last = [Progress(0, 0, 0)]
+
+        def show(progress: Progress, base: Progress = base, last: list[Progress] = last) -> None:
+            last[0] = progress
+            on_progress(_added(base, progress))
+
+        if prepared.before == "complete":
+            out.append(open_run(prepared.folder))
+            base = replace(base, done=base.done + len(prepared.tasks))
+            on_progress(base)
+        else:
+            out.append(execute(prepared, on_progress=show, argv=argv))
+            base = _added(base, last[0])
+    return out
+
+
+def _added(base: Progress, progress: Progress) -> Progress:
+    seconds = dict(base.seconds)
+    for name, value in progress.seconds.items():
+        seconds[name] = seconds.get(name, 0.0) + value
+    return replace(
+        base,
+        done=base.done + progress.done,
+        failed=base.failed + progress.failed,
+        seconds=seconds,
+    )
+
+
+def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:
+    """The runs of folders, where the folder of a benchmark stands for all of its runs.
+
+    Returns:
+        The runs, the lists of scenarios that benchmarks name, and a function that makes the
+        tables which only a benchmark has.
+
+    Raises:
+        ShiftsimError: A folder is neither, or damaged.
+    """
+    runs: list[Run] = []
+    own: list[KnownSet] = []
+    tracks: list[Track] = []
+    for folder in folders:
+        found = _read_manifest(folder)
+        if found is None:
+            runs.append(open_run(folder))
+            continue
+        runs += [open_run(folder / name) for name in found["runs"]]
+        own.append(KnownSet(label=found["own"]["name"], thresholds="", **found["own"]))
+        tracks.append(load_track(found["track"]))
+
+    def extra(groups: Sequence[Group]) -> list[Table]:
+        return [coverage(track, groups) for track in dict.fromkeys(tracks)]
+
+    return runs, own, extra
+
+
+def _read_manifest(folder: Path) -> dict[str, Any] | None:
+    """What `bench.json` says; None where there is none.
+
+    Raises:
+        DataError: It is damaged.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        version, _, _ = found["format"], found["runs"], found["own"]["sha256"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{str(path)!r} is damaged: {error}", hint="run the benchmark again"
+        ) from error
+    if version != _FORMAT:
+        raise DataError(
+            f"{str(path)!r} has format {version!r}, this version reads {_FORMAT}",
+            hint="run the benchmark again with this version of shiftsim",
+        )
+    return found

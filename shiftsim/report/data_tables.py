@@ -1,0 +1,99 @@
+"""What the scenarios are like: own data described, and beside the published sets."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from shiftsim.data.stats import ALL, StoreStats, store_stats
+from shiftsim.data.store import open_store
+from shiftsim.errors import DataError
+from shiftsim.report.groups import DataSet, Group
+from shiftsim.report.paper import distinct_sets
+from shiftsim.report.published import Published
+from shiftsim.report.tables import Cell, Number, Table
+
+_COLUMNS = {
+    "vehicles_t0": "vehicles t0",
+    "pedestrians_t0": "pedestrians t0",
+    "bicycles_t0": "bicycles t0",
+    "vehicles": "vehicles",
+    "pedestrians": "pedestrians",
+    "bicycles": "bicycles",
+    "interactions": "close agents",
+    "mean_speed_mps": "mean speed",
+    "path_m": "path",
+}
+
+
+def own_statistics(groups: Sequence[Group]) -> dict[str, StoreStats | str]:
+    """Statistics of every data set by its label, or why there are none."""
+    out: dict[str, StoreStats | str] = {}
+    for data in distinct_sets(groups):
+        runs = [group.run for group in groups if group.data.key == data.key]
+        store, digest = runs[0].manifest["store"], runs[0].manifest["determining"]["store"]
+        out[data.label] = _statistics(Path(store), digest, data)
+    return out
+
+
+def _statistics(path: Path, digest: str, data: DataSet) -> StoreStats | str:
+    if not path.exists():
+        return f"the store is not at {str(path)!r}"
+    try:
+        store = open_store(path)
+        if store.hash != digest:
+            return f"store {str(path)!r} has changed since the run"
+        held = set(store.tokens)
+        return store_stats(store, [token for token in data.tokens if token in held])
+    except DataError as error:
+        return str(error)
+
+
+def data_statistics(found: Mapping[str, StoreStats | str]) -> Table | None:
+    """Means per scenario by city; None where no store could be read."""
+    rows: list[tuple[Cell, ...]] = []
+    notes = [
+        "means per scenario; t0: present at iteration 0, else at any iteration; close agents: "
+        "mean number near the ego's path within 3 s; m, m/s"
+    ]
+    for label, stats in found.items():
+        if isinstance(stats, str):
+            notes.append(f"{label}: {stats}")
+            continue
+        for city, row in stats.groups("city").items():
+            numbers = (Number(row[name], 1) if name in row else None for name in _COLUMNS)
+            rows.append((label, city, Number(row["scenarios"], 0), *numbers))
+    if not rows:
+        return None
+    header = ("set", "city", "scenarios", *_COLUMNS.values())
+    return Table("data-statistics", "The scenarios", header, tuple(rows), 2, tuple(notes))
+
+
+def benchmark_comparison(published: Published, found: Mapping[str, StoreStats | str]) -> Table:
+    """The paper's comparison of benchmarks, with own sets beside."""
+    own = {label: stats for label, stats in found.items() if isinstance(stats, StoreStats)}
+    rows: list[tuple[Cell, ...]] = [
+        (name, *values, *(_property(name, stats) for stats in own.values()))
+        for name, values in published.comparison.items()
+    ]
+    return Table(
+        "benchmark-comparison",
+        "Benchmarks compared",
+        ("property", *published.sets, *(f"{label} (own)" for label in own)),
+        tuple(rows),
+        1 + len(published.sets) + len(own),
+        (
+            f"nuPlan, interPlan, DeepPlan: {published.source}",
+            "own sets: measured from the store; interaction density: mean number of agents near "
+            "the ego's path within 3 s",
+        ),
+    )
+
+
+def _property(name: str, stats: StoreStats) -> str:
+    groups = stats.groups("city")
+    if name == "scenario count":
+        return f"{groups[ALL]['scenarios']:.0f}"
+    if name == "geographic coverage":
+        return ", ".join(city for city in groups if city != ALL)
+    if name == "interaction density":
+        return f"{groups[ALL]['interactions']:.1f}"
+    return "–"

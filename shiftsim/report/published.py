@@ -1,0 +1,47 @@
+"""Figures of the published benchmark, to be shown beside own ones."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+TRAFFIC = ("NR", "R")
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """Numbers copied from the paper; scores are times 100.
+
+    Attributes:
+        source: Where they are from.
+        cities: Names of each site by its abbreviation, in the paper's order.
+        scenarios: Scenarios of each site, by abbreviation.
+        columns: Columns of `semantic_shift`: sets, sites, metrics.
+        semantic_shift: Values by traffic and planner.
+        noises: Columns of `robustness`.
+        robustness: By traffic, set and planner: mean and deviation of each noise.
+        sets: Columns of `comparison`.
+        comparison: Properties of the data sets, by name of the property.
+    """
+
+    source: str
+    cities: Mapping[str, tuple[str, ...]]
+    scenarios: Mapping[str, int]
+    columns: tuple[str, ...]
+    semantic_shift: Mapping[str, Mapping[str, tuple[float, ...]]]
+    noises: tuple[str, ...]
+    robustness: Mapping[str, Mapping[str, Mapping[str, tuple[tuple[float, ...], ...]]]]
+    sets: tuple[str, ...]
+    comparison: Mapping[str, tuple[str, ...]]
+
+    def abbreviation(self, city: str) -> str:
+        """The paper's abbreviation of a city; empty for other cities."""
+        plain = _plain(city)
+        found = (s for s, names in self.cities.items() if plain in map(_plain, (s, *names)))
+        return next(found, "")
+
+    def planners(self, name: str, listed: Mapping[str, object]) -> list[str]:
+        """Planners of a published table that are called like one of ours: one or none."""
+        return [other for other in listed if _plain(other) == _plain(name)]
+
+
+def _plain(text: str) -> str:
+    return "".join(c for c in text.casefold() if c.isalnum())

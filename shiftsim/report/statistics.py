@@ -1,0 +1,168 @@
+"""How sure a mean is: cluster bootstrap, paired randomisation test, Holm's correction.
+
+Scenarios of one recording overlap in time and share traffic, so they are not independent; the
+recordings are. Everything here therefore draws or flips whole recordings ("clusters").
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+
+DRAWS = 10_000
+SEED = 20_260_101  # of every draw here, so that a report can be repeated to the digit
+CONFIDENCE = 0.95
+FEW_CLUSTERS = 20  # below, percentile intervals are known to be too narrow
+_BLOCK = 500  # draws held in memory at once
+_EXACT_CLUSTERS = 13  # up to here all 2^G sign patterns are fewer than DRAWS
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Where a mean lies with confidence `CONFIDENCE`."""
+
+    low: float
+    high: float
+
+
+def cluster_codes(clusters: Sequence[str]) -> IntArray:
+    """(S,) number of every scenario's recording, from 0 on."""
+    return np.unique(np.asarray(clusters, dtype=str), return_inverse=True)[1].astype(np.int64)
+
+
+def bootstrap_interval(
+    values: FloatArray, clusters: IntArray, *, draws: int = DRAWS, seed: int = SEED
+) -> Interval | None:
+    """Percentile interval of the mean; clusters are drawn with replacement.
+
+    The mean of a draw is over its scenarios, so large recordings weigh as they do in the score.
+
+    Args:
+        values: (S,) one value per scenario.
+        clusters: (S,) recording of each, as `cluster_codes` gives them.
+        draws: How many samples are drawn.
+        seed: Of the draws.
+
+    Returns:
+        None with fewer than two clusters: then nothing is known of the spread between them.
+    """
+    sums, sizes = _per_cluster(values, clusters)
+    if len(sums) < 2:
+        return None
+    means = np.concatenate(
+        [(drawn @ sums) / (drawn @ sizes) for drawn in _draws(len(sums), draws, seed)]
+    )
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(means, [tail, 1.0 - tail])
+    return Interval(float(low), float(high))
+
+
+def _per_cluster(values: FloatArray, clusters: IntArray) -> tuple[FloatArray, FloatArray]:
+    count = int(clusters.max(initial=-1)) + 1
+    sums, sizes = np.zeros(count), np.zeros(count)
+    np.add.at(sums, clusters, values)
+    np.add.at(sizes, clusters, 1.0)
+    return sums, sizes
+
+
+def _draws(count: int, draws: int, seed: int) -> list[FloatArray]:
+    """Blocks (B, G): how often each cluster is in each draw."""
+    rng = np.random.default_rng(seed)
+    share = np.full(count, 1.0 / count)
+    return [
+        rng.multinomial(count, share, size=min(_BLOCK, draws - start)).astype(np.float64)
+        for start in range(0, draws, _BLOCK)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two planners on the same scenarios.
+
+    Attributes:
+        difference: Mean of first minus second.
+        interval: Of that mean; None with fewer than two clusters.
+        p_value: Two-sided, that the sign of every recording's difference is a toss of a coin.
+        smallest_p: The smallest value the test can give with so few recordings.
+        wins: Scenarios on which the first is better.
+        ties: Scenarios on which both are equal.
+        losses: Scenarios on which the first is worse.
+    """
+
+    difference: float
+    interval: Interval | None
+    p_value: float
+    smallest_p: float
+    wins: int
+    ties: int
+    losses: int
+
+
+def compare(
+    first: FloatArray, second: FloatArray, clusters: IntArray, *, draws: int = DRAWS
+) -> Comparison:
+    """Compare two planners scenario by scenario.
+
+    Args:
+        first: (S,) scores of one planner.
+        second: (S,) scores of the other one on the same scenarios.
+        clusters: (S,) recording of each scenario.
+        draws: Samples of bootstrap and test.
+    """
+    delta = first - second
+    p_value, smallest = sign_flip_test(delta, clusters, draws=draws)
+    return Comparison(
+        difference=float(delta.mean()),
+        interval=bootstrap_interval(delta, clusters, draws=draws),
+        p_value=p_value,
+        smallest_p=smallest,
+        wins=int(np.sum(delta > 0.0)),
+        ties=int(np.sum(delta == 0.0)),
+        losses=int(np.sum(delta < 0.0)),
+    )
+
+
+def sign_flip_test(
+    delta: FloatArray, clusters: IntArray, *, draws: int = DRAWS, seed: int = SEED
+) -> tuple[float, float]:
+    """Two-sided p-value of a mean difference, and the smallest one that could come out.
+
+    If the planners were alike, the sign of each recording's summed difference would be a toss of
+    a coin. Few recordings: all patterns of signs are tried; else `draws` random ones.
+    """
+    sums = _per_cluster(delta, clusters)[0]
+    observed = abs(float(sums.sum()))
+    # sums that differ by rounding alone are as extreme as the observed one
+    bound = observed - 1e-12 * max(1.0, float(np.abs(sums).sum()))
+    if len(sums) <= _EXACT_CLUSTERS:
+        flipped = np.abs(_all_signs(len(sums)) @ sums)
+        return float(np.mean(flipped >= bound)), float(2.0 ** (1 - len(sums)))
+    rng = np.random.default_rng(seed)
+    count = 0
+    for start in range(0, draws, _BLOCK):
+        signs = rng.integers(0, 2, size=(min(_BLOCK, draws - start), len(sums))) * 2.0 - 1.0
+        count += int(np.sum(np.abs(signs @ sums) >= bound))
+    return (count + 1.0) / (draws + 1.0), 1.0 / (draws + 1.0)
+
+
+def _all_signs(count: int) -> FloatArray:
+    patterns = np.arange(2**count)[:, None] >> np.arange(count)
+    return (patterns & 1).astype(np.float64) * 2.0 - 1.0
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's step-down correction: p-values that may all be compared with one level."""
+    order = np.argsort(p_values, kind="stable")
+    out = np.zeros(len(order))
+    worst = 0.0
+    for rank, index in enumerate(order):
+        worst = max(worst, min(1.0, (len(order) - rank) * p_values[index]))
+        out[index] = worst
+    return out.tolist()
+
+
+def seed_deviation(values: FloatArray) -> float | None:
+    """Sample standard deviation (n - 1) over the seeds' means; None for a single seed."""
+    return float(values.std(ddof=1)) if len(values) > 1 else None
