@@ -115,13 +115,10 @@ def compare_relations(file: ArrayFile, report: Report, planner: str) -> None:
     def road(name: str) -> np.ndarray:
         return file[f"in/map.{name}"].astype(np.float64)
 
-    valid = road("valid_mask").any(-1)
-    present: np.ndarray = np.asarray(agent("valid_mask"), np.bool_)
-    points, vectors, angles = (
-        road("point_position"),
-        road("point_vector"),
-        road("point_orientation"),
-    )
+    valid = np.asarray(road("valid_mask").max(axis=-1, initial=0.0) > 0.0)
+    present = np.asarray(agent("valid_mask") > 0.0)
+    points, vectors = road("point_position"), road("point_vector")
+    angles = road("point_orientation")
     turned = wrap_angles(angles - np.arctan2(vectors[..., 1], vectors[..., 0]))
     check("map.point_orientation", turned[valid], np.zeros_like(turned[valid]), FEATURE)
     check("map.point_vector", np.diff(points, axis=3), vectors[..., :-1, :], FEATURE)
@@ -133,9 +130,16 @@ def compare_relations(file: ArrayFile, report: Report, planner: str) -> None:
     check("map.polygon_orientation", start, np.zeros_like(start), FEATURE)
     unlimited = road("polygon_has_speed_limit") == 0
     check("map.polygon_speed_limit", road("polygon_speed_limit")[unlimited], 0.0 * start[unlimited])
+    # padding is zero
     for name in ("position", "velocity", "shape", "heading"):
         rest = agent(name)[~present]
         check(f"agent.{name} where absent", np.zeros_like(rest), rest)
+    rest = agent("category")[~present.any(axis=-1)]
+    check("agent.category where absent", np.zeros_like(rest), rest)
+    for path in sorted(file.arrays):
+        if path.startswith("in/map."):
+            rest = file[path][~valid]
+            check(f"{path[3:]} where absent", np.zeros_like(rest), rest)
     size = agent("shape")[:, 0]
     check("ego shape", np.broadcast_to([EGO_WIDTH, EGO_LENGTH], size.shape), size, FEATURE)
     for name, now in (

@@ -76,7 +76,11 @@ def _manifest_fields() -> dict[str, Any]:
     network = plantf.build_network()
     state = network.state_dict().values()
     return {
-        "checkpoint": None,
+        "checkpoint": lambda given: {
+            **given,  # the rest of it is prose
+            "weights_under": "state_dict",
+            "prefix": plantf.PREFIXES[0],
+        },
         "hyper_parameters": lambda _: plantf.RELEASED,
         "feature_builder": lambda _: {
             "radius": RADIUS,
