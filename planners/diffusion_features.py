@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.layers import Polygons, Polylines, meeting, square_around
+from shiftsim.layers import square_around
 from shiftsim.map import VectorMap
 from shiftsim.planner import Observation, SceneInfo
 from shiftsim.planners.diffusion_kernels import (
@@ -32,6 +32,8 @@ from shiftsim.planners.diffusion_kernels import (
     fill_agents,
     fill_lanes,
     fill_objects,
+    lanes_in_square,
+    line_bounds,
     nearest_lanes,
     resample_lanes,
 )
@@ -89,7 +91,7 @@ class Features:
 def lane_lines(road: VectorMap) -> LaneLines:
     """The edges of a map as the network reads them."""
     rows = resample_lanes(road.baselines, road.left_boundaries, road.right_boundaries)
-    return LaneLines(rows, road.speed_limits, road.block_of)
+    return LaneLines(rows, line_bounds(road.baselines), road.speed_limits, road.block_of)
 
 
 class FeatureBuilder:
@@ -112,7 +114,7 @@ class FeatureBuilder:
         anchor = np.array(seen.history.ego[-1, :3])
         lights = self._lights(seen.lights)
         road = self._road
-        edges = lanes_around(road.edges.polygons, road.baselines, anchor)
+        edges = lanes_around(road, self._lanes.bounds, anchor)
         route = self._corrector.at(anchor) if self._corrector else None
         on_route = lanes_on_route(self._lanes.blocks[edges], route or ())
         agents, objects, chosen = agent_features(seen.history.tracks, anchor)
@@ -145,10 +147,17 @@ class FeatureBuilder:
         return out
 
 
-def lanes_around(areas: Polygons, lines: Polylines, anchor: FloatArray) -> IntArray:
-    """Edges that the network sees, nearest first."""
+def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> IntArray:
+    """Edges that the network sees, nearest first.
+
+    Args:
+        road: The map.
+        bounds: Of its centre lines (`LaneLines`).
+        anchor: (3,) rear axle.
+    """
     x, y = float(anchor[0]), float(anchor[1])
-    near = meeting(areas, square_around(x, y, RADIUS))
+    areas, lines, square = road.edges.polygons, road.baselines, square_around(x, y, RADIUS)
+    near = lanes_in_square(areas, lines, bounds, road.num_lanes, square)
     return np.asarray(nearest_lanes(near, areas, lines, x, y, LANES))
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.geometry import point_on_polyline
-from shiftsim.layers import Polygons, Polylines, distance_to
+from shiftsim.geometry import point_on_polyline, segments_intersect
+from shiftsim.layers import Polygons, Polylines, distance_to, meets_convex
 
 POINTS = 20  # of a lane
 AGENTS, SAMPLES, AGENT_COLUMNS = 32, 21, 11
@@ -26,11 +26,13 @@ class LaneLines(NamedTuple):
     Attributes:
         rows: (E, POINTS, 8) x, y, step to the next point (0 at the last), offset to the left and
             to the right boundary [m].
+        bounds: (E, 4) min x, min y, max x, max y of the centre lines [m].
         limits: (E,) speed limits [m/s], NaN where the map has none.
         blocks: (E,) block of each edge, -1 where unknown.
     """
 
     rows: FloatArray
+    bounds: FloatArray
     limits: FloatArray
     blocks: IntArray
 
@@ -78,6 +80,73 @@ def _resample(lines: Polylines, line: int, out: FloatArray) -> None:
         at = length * point / (POINTS - 1)
         x, y = point_on_polyline(lines.xy, lines.arc, start, stop, at)
         out[point, 0], out[point, 1] = x, y
+
+
+@kernel
+def line_bounds(lines: Polylines) -> FloatArray:
+    """(M, 4) min x, min y, max x, max y of each line; of an empty one nothing is within [m]."""
+    out = np.empty((len(lines.ptr) - 1, 4))
+    for line in range(len(out)):
+        out[line, :2], out[line, 2:] = np.inf, -np.inf
+        for vertex in range(lines.ptr[line], lines.ptr[line + 1]):
+            for axis in range(2):
+                out[line, axis] = min(out[line, axis], lines.xy[vertex, axis])
+                out[line, 2 + axis] = max(out[line, 2 + axis], lines.xy[vertex, axis])
+    return out
+
+
+@kernel
+def lanes_in_square(
+    areas: Polygons,
+    lines: Polylines,
+    bounds: FloatArray,
+    num_lanes: int,
+    square: FloatArray,
+) -> IntArray:
+    """Lanes whose area, and connectors whose centre line shares a point with a square, ascending.
+
+    nuPlan: the table of lane connectors, which is queried, holds lines; areas are in another one.
+
+    Args:
+        areas: Of the edges.
+        lines: Centre lines of the edges.
+        bounds: Of the centre lines.
+        num_lanes: How many of the edges are lanes.
+        square: (4, 2) corners, counter-clockwise from the upper right one [m].
+    """
+    low, high = square[2], square[0]
+    out = np.empty(len(bounds), np.int64)
+    found = 0
+    for edge in range(len(bounds)):
+        box = areas.bounds[edge] if edge < num_lanes else bounds[edge]
+        if box[0] > high[0] or box[2] < low[0] or box[1] > high[1] or box[3] < low[1]:
+            continue
+        if edge < num_lanes:
+            meets = meets_convex(areas, edge, square)
+        else:
+            meets = _line_meets(lines, edge, square)
+        if meets:
+            out[found] = edge
+            found += 1
+    return out[:found].copy()
+
+
+@kernel
+def _line_meets(lines: Polylines, line: int, square: FloatArray) -> bool:
+    """Whether a line shares a point with an axis-parallel square (see `lanes_in_square`)."""
+    low, high = square[2], square[0]
+    start, stop = lines.ptr[line], lines.ptr[line + 1]
+    for vertex in range(start, stop):
+        x, y = lines.xy[vertex, 0], lines.xy[vertex, 1]
+        if low[0] <= x <= high[0] and low[1] <= y <= high[1]:
+            return True
+    for vertex in range(start + 1, stop):
+        for corner in range(4):
+            if segments_intersect(
+                lines.xy[vertex - 1], lines.xy[vertex], square[corner - 1], square[corner]
+            ):
+                return True
+    return False
 
 
 @kernel

@@ -79,16 +79,21 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
     def decode(self, output: Single, observation: Observation) -> Trajectory:
         """The ego's trajectory in the map frame."""
         self.degraded = self._reason
-        ego = output[0].astype(np.float64)
-        heading = np.arctan2(ego[:, 3], ego[:, 2])
-        poses = np.column_stack([ego[:, :2], heading])
-        return plan_of_poses(from_frame(poses, observation.history.ego[-1]), observation.history)
+        return decode_ego(output, observation)
 
     def _batch(self, features: Sequence[Features], name: str) -> Any:
         import torch
 
         stacked = np.stack([getattr(one, name) for one in features])
         return torch.from_numpy(stacked).to(self._device)
+
+
+def decode_ego(output: Single, observation: Observation) -> Trajectory:
+    """The ego's trajectory in the map frame, from trajectories (A, T, 4) in the ego frame."""
+    ego = output[0].astype(np.float64)
+    heading = np.arctan2(ego[:, 3], ego[:, 2])
+    poses = from_frame(np.column_stack([ego[:, :2], heading]), observation.history.ego[-1])
+    return plan_of_poses(poses, observation.history)
 
 
 def why_makeshift(features: Features, num_samples: int) -> str:

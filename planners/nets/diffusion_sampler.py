@@ -112,6 +112,6 @@ def sample(network: Callable[[Tensor, int], Tensor], current: Tensor, noise: Ten
         before = clean
         x = float(SCHEDULE.c_x[step]) * x + float(SCHEDULE.c_x0[step]) * data
         x[..., :STATE] = current
-    x = network(x, STEPS)
+    x = network(x, STEPS).clone()
     x[..., :STATE] = current
     return x.view(*x.shape[:-1], -1, STATE)
