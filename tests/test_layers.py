@@ -6,6 +6,7 @@ import shapely
 from strategies import OFFSETS
 
 from shiftsim import layers
+from shiftsim.geometry import boxes_to_corners
 
 
 def random_layer(rng, offset, count=60):
@@ -72,3 +73,19 @@ def test_polylines_know_their_arc_lengths():
     lines = layers.make_polylines([np.array([[0, 0], [3, 4], [3, 10.0]]), np.zeros((0, 2))])
     assert lines.length(0) == 11.0
     assert len(lines.at(1)) == 0
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_polygons_that_meet_a_turned_box_are_those_of_shapely(rng, offset):
+    layer, shapes = random_layer(rng, offset)
+    for x, y in rng.uniform(0, 80, (50, 2)) + offset:
+        pose, size = np.array([x, y, rng.uniform(-4, 4)]), rng.uniform(0.5, 30.0, 2)
+        corners = boxes_to_corners(pose, size)
+        expected = np.flatnonzero(shapely.intersects(shapes, shapely.Polygon(corners)))
+        np.testing.assert_array_equal(layers.meeting(layer.polygons, corners), expected)
+
+
+def test_touching_a_box_from_outside_counts():
+    layer = layers.make_layer(["0", "1"], [shapely.box(0, 0, 2, 2), shapely.box(3, 3, 4, 4)])
+    assert layers.meeting(layer.polygons, layers.square_around(3.0, 1.0, 1.0)).tolist() == [0]
+    assert layers.meeting(layer.polygons, layers.square_around(2.5, 2.5, 0.5)).tolist() == [0, 1]
