@@ -1,8 +1,12 @@
 """Small worlds to simulate in: a straight two-lane road and whoever is on it."""
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 
+from shiftsim.geometry import wrap_angles
+from shiftsim.layers import Layer, make_layer
 from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.scenario import Scenario
 from shiftsim.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
@@ -112,3 +116,53 @@ def cruise_scenario(
         mission_goal=np.array([400.0, 0.0, 0.0]),
         mapping=(15.0, 0.0, 0.5),
     )
+
+
+def moved_points(xy: np.ndarray, angle: float, shift: np.ndarray) -> np.ndarray:
+    """Points (..., 2) after a rotation [rad] and a translation [m] of the world."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return xy @ np.array([[cos, sin], [-sin, cos]]) + shift
+
+
+def moved_poses(poses: np.ndarray, angle: float, shift: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) after the same."""
+    out = poses.copy()
+    out[..., :2] = moved_points(poses[..., :2], angle, shift)
+    out[..., 2] = wrap_angles(poses[..., 2] + angle)
+    return out
+
+
+def moved_layer(layer: Layer, angle: float, shift: np.ndarray) -> Layer:
+    """A map layer after the same."""
+    shapes = [
+        shapely.transform(layer.shape(i), lambda xy: moved_points(xy, angle, shift))
+        for i in range(len(layer))
+    ]
+    return make_layer(layer.ids, shapes)
+
+
+def moved_map(road: VectorMap, angle: float, shift: np.ndarray) -> VectorMap:
+    """A map after the same."""
+    layers = ("edges", "blocks", "intersections", "crosswalks", "drivable_areas")
+    lines = ("baselines", "left_boundaries", "right_boundaries")
+    changes = {name: moved_layer(getattr(road, name), angle, shift) for name in layers}
+    for name in lines:
+        line = getattr(road, name)
+        xy = moved_points(line.xy, angle, shift)
+        xy.flags.writeable = False  # as in every map
+        changes[name] = line._replace(xy=xy)
+    return replace(road, **changes)
+
+
+def moved(scenario: Scenario, angle: float, shift: np.ndarray) -> Scenario:
+    """The same scenario in a world that was turned and shifted as a whole."""
+    tracks = scenario.tracks
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = replace(
+        tracks,
+        poses=moved_poses(tracks.poses, angle, shift),
+        velocities=tracks.velocities @ np.array([[cos, sin], [-sin, cos]]),
+    )
+    ego = scenario.ego.copy()
+    ego[:, :3] = moved_poses(ego[:, :3], angle, shift)
+    return replace(scenario, map=moved_map(scenario.map, angle, shift), ego=ego, tracks=turned)

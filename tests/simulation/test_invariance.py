@@ -4,18 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import seeds
-from worlds import cruise_scenario, standing_tracks, straight_road
+from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
-from shiftsim.geometry import wrap_angles
-from shiftsim.layers import Layer, make_layer
-from shiftsim.map import VectorMap
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners import load_planner
-from shiftsim.scenario import Scenario
 from shiftsim.simulation import simulate
 from shiftsim.state import AgentKind, Tracks, join_tracks
 
@@ -42,50 +37,6 @@ def scene(seed):
 def result(scenario, planner="constant-velocity", noise="awgn-low"):
     log = simulate(scenario, load_planner(planner, {}), noise=noise, seed=3)
     return compute_metrics(log, scenario.map)
-
-
-def moved_points(xy, angle, shift):
-    cos, sin = np.cos(angle), np.sin(angle)
-    return xy @ np.array([[cos, sin], [-sin, cos]]) + shift
-
-
-def moved_poses(poses, angle, shift):
-    out = poses.copy()
-    out[..., :2] = moved_points(poses[..., :2], angle, shift)
-    out[..., 2] = wrap_angles(poses[..., 2] + angle)
-    return out
-
-
-def moved_layer(layer: Layer, angle, shift):
-    shapes = [
-        shapely.transform(layer.shape(i), lambda xy: moved_points(xy, angle, shift))
-        for i in range(len(layer))
-    ]
-    return make_layer(layer.ids, shapes)
-
-
-def moved_map(road: VectorMap, angle, shift):
-    layers = ("edges", "blocks", "intersections", "drivable_areas")
-    lines = ("baselines", "left_boundaries", "right_boundaries")
-    changes = {name: moved_layer(getattr(road, name), angle, shift) for name in layers}
-    for name in lines:
-        line = getattr(road, name)
-        changes[name] = line._replace(xy=moved_points(line.xy, angle, shift))
-    return replace(road, **changes)
-
-
-def moved(scenario: Scenario, angle, shift):
-    """The same scenario in a world that was turned and shifted as a whole."""
-    tracks = scenario.tracks
-    cos, sin = np.cos(angle), np.sin(angle)
-    turned = replace(
-        tracks,
-        poses=moved_poses(tracks.poses, angle, shift),
-        velocities=tracks.velocities @ np.array([[cos, sin], [-sin, cos]]),
-    )
-    ego = scenario.ego.copy()
-    ego[:, :3] = moved_poses(ego[:, :3], angle, shift)
-    return replace(scenario, map=moved_map(scenario.map, angle, shift), ego=ego, tracks=turned)
 
 
 def assert_same(first, second, atol):
