@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast lint types bench verify dist clean-cache
+.PHONY: install demo test test-fast test-kill lint types bench verify dist clean-cache
 
 install: .venv/installed
 
@@ -19,6 +19,9 @@ test: install
 
 test-fast: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-kill: install
+	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/run/test_kills.py
 
 lint: install
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
