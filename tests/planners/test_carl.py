@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks, straight_road
 
-from shiftsim.data.synthetic import bench_scene
 from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.planners import carl_view
 from shiftsim.planners.carl import Carl, command_of
@@ -190,7 +189,7 @@ def test_moving_the_whole_world_does_not_change_the_picture(planner, heading, dx
     poses = np.array([[31.23, 7.31, 0.41], [42.17, -9.77, 2.2]])
     pictures = []
     for offset in ((0.0, 0.0), (float(dx), float(dy))):
-        moved = poses + [*offset, 0.0]
+        moved = poses + np.array([*offset, 0.0])
         start = (17.137 + offset[0], 0.291 + offset[1], heading)
         road = straight_road(offset=offset)
         picture, _, _ = look(planner, scenario_with(moved, [VEHICLE, CONE], road=road, start=start))
@@ -234,15 +233,17 @@ def test_a_plan_before_a_scenario_is_an_error():
         Carl("deterministic:base").plan(observe(cruise_scenario(), 0, np.zeros(11)))
 
 
-def scenes_in_the_city(count):
-    city = bench_scene(40, 0)
+def some_scenes(rng, count):
     for index in range(count):
-        rows = city.iteration_rows[10 * index : 10 * index + 6]
-        yield replace(city, token=f"{index:016x}", iteration_rows=rows)
+        poses = np.column_stack([rng.uniform(-20, 90, (9, 2)), rng.uniform(-3, 3, 9)])
+        kinds = [AgentKind(int(kind)) for kind in rng.integers(0, 7, 9)]
+        scene = scenario_with(poses, kinds, start=(20.0 * index, 0.1 * index, 0.0))
+        rows = scene.iteration_rows[:6]
+        yield replace(scene, token=f"{index:016x}", iteration_rows=rows)
 
 
-def test_scenes_in_one_batch_are_driven_as_alone(planner):
-    scenes = list(scenes_in_the_city(6))
+def test_scenes_in_one_batch_are_driven_as_alone(planner, rng):
+    scenes = list(some_scenes(rng, 6))
     alone = [simulate(scene, planner) for scene in scenes]
     together = simulate_together([Rollout(scene, planner.fork()) for scene in scenes])
     for one, other in zip(alone, together, strict=True):
@@ -250,9 +251,9 @@ def test_scenes_in_one_batch_are_driven_as_alone(planner):
         np.testing.assert_allclose(other.ego, one.ego, atol=2e-5)
 
 
-def test_actions_of_a_batch_are_those_of_its_scenes(planner):
+def test_actions_of_a_batch_are_those_of_its_scenes(planner, rng):
     features = []
-    for scene in scenes_in_the_city(9):
+    for scene in some_scenes(rng, 9):
         fork = planner.fork()
         fork.reset(scene_info(scene))
         features.append(fork.features(observe(scene, 0, scene.expert[0])))

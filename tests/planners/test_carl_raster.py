@@ -1,5 +1,6 @@
 """The rasteriser of CaRL against pictures drawn by OpenCV, and what its rules imply."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +90,7 @@ def test_a_line_that_leaves_the_picture_stays_close_to_the_true_one(x0, y0, x1, 
 def test_an_area_holds_its_outline_and_its_corners(ring):
     picture = draw(AREA, ring)
     closed = [*ring, ring[0]]
-    for start, stop in zip(closed, closed[1:], strict=False):
+    for start, stop in pairwise(closed):
         # the way round decides how a line is cut at the border
         assert (picture >= draw(LINE, [start, stop])).all()
     for x, y in ring:
@@ -125,8 +126,8 @@ def test_away_from_its_outline_an_area_is_filled_by_the_even_odd_rule(ring):
 def test_every_row_of_a_box_within_the_picture_is_one_run_of_pixels(center, length, width, heading):
     ahead = 0.5 * length * np.array([np.cos(heading), np.sin(heading)])
     left = 0.5 * width * np.array([-np.sin(heading), np.cos(heading)])
-    corners = np.array(center) + [ahead + left, left - ahead, -ahead - left, ahead - left]
-    picture = draw(BOX, np.trunc(corners))
+    around = np.array([ahead + left, left - ahead, -ahead - left, ahead - left])
+    picture = draw(BOX, np.trunc(around + center))
     for row in picture:
         filled = np.flatnonzero(row)
         assert len(filled) == 0 or filled[-1] - filled[0] + 1 == len(filled)
