@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from stores import write_toy_store
+
+import shiftsim
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 GOLDEN = REPOSITORY / "tests" / "golden"
@@ -39,3 +42,22 @@ def nuplan_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with tarfile.open(GOLDEN / "nuplan.tar.xz") as archive:
         archive.extractall(folder, filter="data")
     return folder / "nuplan"
+
+
+@pytest.fixture(scope="session")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with four short scenarios on a straight road."""
+    return write_toy_store(tmp_path_factory.mktemp("stores") / "toy")
+
+
+@pytest.fixture(scope="session")
+def clean_run(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> "shiftsim.Run":
+    """Two planners, clean and with noise of two seeds, in this process."""
+    return shiftsim.run(
+        ["constant-velocity", "log-future"],
+        noise=["none", "ou-high"],
+        seeds=[0, 1],
+        store=str(toy),
+        workers=1,
+        out=str(tmp_path_factory.mktemp("runs") / "clean"),
+    )

@@ -74,6 +74,7 @@ def _matplotlib() -> Any:
         import matplotlib
 
         matplotlib.use("Agg")
+        matplotlib.rcParams["svg.hashsalt"] = "shiftsim"  # ids in SVG files are then always the same
         from matplotlib import pyplot
     except ImportError as error:
         raise MissingExtraError(
@@ -155,7 +156,7 @@ def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
             linewidth=1.8,
             linestyle="-" if clean else (0, (5, 3)),
             marker=look.marker,
-            markersize=5,
+            markersize=6,
             markeredgecolor="white",
             markeredgewidth=0.5,
             markevery=(min(10, len(ego) - 1), 30),
