@@ -208,9 +208,10 @@ def _verify_forward(path: Path, report: Report, networks: _Networks) -> None:
     given = {name: file[f"in.{name}"] for name in INPUTS}
     noise = keyed_normals(f"noise:{case}", (1, *NOISE_SHAPE)).astype(np.float32)
     report.compare(f"{NAME} start noise", path.name, noise, file["in.noise"])
-    limits = given["route_lanes_speed_limit"] = file["in.route_lanes_speed_limit"]
-    known = file["in.route_lanes_has_speed_limit"]  # the network does not read it
-    report.compare(f"{NAME} has limit", path.name, limits != 0.0, known)
+    given["route_lanes_speed_limit"] = file["in.route_lanes_speed_limit"]
+    for name in ("lanes", "route_lanes"):  # those of the route are read by nobody
+        limits, known = given[f"{name}_speed_limit"], file[f"in.{name}_has_speed_limit"]
+        report.compare(f"{NAME} has limit", f"{path.name} {name}", limits != 0.0, known)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(value) for name, value in given.items()}
         scene = networks("base").normalise(inputs)
