@@ -15,13 +15,16 @@ demo: install
 	$(BIN)/shiftsim demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not browser"
 
 test-fast: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
 
 test-kill: install
 	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/run/test_kills.py
+
+test-browser: install
+	$(BIN)/python -m pytest tests/browser -rs
 
 lint: install
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .

@@ -204,7 +204,7 @@ def filter_store(
     """
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)
-    conditions = _conditions(config, opened.hash)
+    conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
     done = {
         row["token"]: row
         for row in (*_finished(path, conditions), *_unfinished(path, conditions))
@@ -223,7 +223,7 @@ def filter_store(
     return _read(path)
 
 
-def _conditions(config: FilterConfig, store_hash: str) -> dict[str, Any]:
+def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[str, Any]:
     """Everything that verdicts depend on, and a digest of it."""
     out = {
         "config": asdict(config),
@@ -231,6 +231,8 @@ def _conditions(config: FilterConfig, store_hash: str) -> dict[str, Any]:
         "metric_version": METRIC_VERSION,
         "store": store_hash,
     }
+    if route_hash:  # corrected in the review
+        out["routes"] = route_hash
     text = json.dumps(out, sort_keys=True)
     return out | {"hash": hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}
 

@@ -202,6 +202,8 @@ def _scenarios(
     known = tuple(store.tokens)
     verdicts = _verdicts(config, store)
     usable = known if verdicts is None else verdicts.accepted
+    if not config.all_scenarios and config.split in ("", store.path.name):
+        usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
     chosen = split.tokens[: config.limit] if config.limit else split.tokens
     lacking = sorted(set(chosen) - set(known))
@@ -221,6 +223,8 @@ def _scenarios(
     determining = {"store": store.hash, "tokens": token_hash(chosen)}
     if verdicts is not None:
         determining["filter"] = verdicts.hash
+    if store.reviews.hash:
+        determining["review"] = store.reviews.hash
     return split.name, present, lacking, len(known) - len(usable), determining
 
 

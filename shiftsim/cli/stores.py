@@ -89,7 +89,7 @@ _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": 
 
 
 def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str, ...]:
-    """The scenarios of a split, or all that the filter accepted."""
+    """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
     from shiftsim.filtering import read_verdicts
     from shiftsim.splits import find_split
@@ -104,8 +104,11 @@ def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str
                 hint="name the store that was converted for this split",
             )
         return tokens
-    verdicts = None if every else read_verdicts(store.path, store.hash)
-    return store.tokens if verdicts is None else verdicts.accepted
+    if every:
+        return store.tokens
+    verdicts = read_verdicts(store.path, store.hash)
+    usable = store.tokens if verdicts is None else verdicts.accepted
+    return store.reviews.usable(store.tokens, usable)
 
 
 def export_to_nuplan(

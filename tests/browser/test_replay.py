@@ -1,0 +1,278 @@
+from dataclasses import replace
+
+import pytest
+from worlds import cruise_scenario, standing_tracks
+
+from shiftsim.data.store import open_store
+from shiftsim.planners import load_planner
+from shiftsim.simulation import simulate
+from shiftsim.state import AgentKind
+from shiftsim.viewer.build import Gallery, page_name
+from shiftsim.viewer.page import embedded, replay_page
+from shiftsim.viewer.scene import Shown
+
+SIZES = [(1440, 900), (800, 600)]
+HOSTILE = (
+    "<img src=x onerror=\"document.title='owned'\"></script><script>document.title='owned'</script>"
+)
+VIOLATED = "0001cafe"  # its ego meets a parked car
+
+
+@pytest.fixture(scope="module")
+def folder(clean_run, toy, tmp_path_factory):
+    """Replays of the toy run, and their list."""
+    out = tmp_path_factory.mktemp("view")
+    Gallery([clean_run], open_store(toy)).write(out)
+    return out
+
+
+@pytest.fixture
+def replay(page, folder):
+    """The replay of a scenario with a violation."""
+    page.open(address(folder))
+    return page
+
+
+def address(folder, token=VIOLATED):
+    return (folder / "replay" / page_name(token)).as_uri()
+
+
+def now(page):
+    return page.run("replay.state.t")
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_replay_loads_without_complaints_and_fits_the_window(page, folder, size, tmp_path):
+    page.open(address(folder), size)
+
+    assert VIOLATED in page.text("token")
+    assert page.run("document.documentElement.scrollWidth") <= size[0]
+    assert page.run("document.documentElement.scrollHeight") <= size[1]
+    assert page.run("document.getElementById('scene').clientHeight") >= 0.4 * size[1]
+    page.shoot(tmp_path / "replay.png")
+
+
+def test_play_advances_and_pause_stays(replay):
+    before = replay.pixels()
+
+    replay.press(" ")
+    replay.wait("replay.state.t > 0.3")
+    replay.press(" ")
+    stopped = now(replay)
+
+    assert replay.pixels() != before
+    assert not replay.run("replay.state.playing")
+    assert now(replay) == stopped
+
+
+def test_play_ends_at_the_end(replay):
+    replay.run("replay.seek(2.2)")
+    replay.click("play")
+    replay.wait("!replay.state.playing")
+
+    assert replay.text("clock").startswith("2.30 s of 2.3 s")
+
+
+def test_scrubbing_and_steps_move_in_time(replay):
+    from selenium.webdriver.common.keys import Keys
+
+    replay.browser.execute_script(
+        "const time = document.getElementById('time'); time.value = 1.5;"
+        "time.dispatchEvent(new Event('input'))"
+    )
+    assert now(replay) == pytest.approx(1.5)
+
+    replay.press(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    assert now(replay) == pytest.approx(1.6, abs=1e-3)
+
+    replay.press(Keys.END)
+    assert now(replay) == pytest.approx(2.3, abs=1e-3)
+    replay.press(Keys.HOME)
+    assert now(replay) == 0
+
+
+def test_dragging_on_the_curves_scrubs(replay):
+    replay.browser.execute_script(
+        """const canvas = document.getElementById("curves");
+        canvas.setPointerCapture = () => {};
+        const box = canvas.getBoundingClientRect();
+        const at = {clientX: box.left + 46 + (box.width - 56) / 2, clientY: box.top + 10};
+        canvas.dispatchEvent(new PointerEvent("pointerdown", {...at, bubbles: true}));"""
+    )
+
+    assert now(replay) == pytest.approx(1.15, abs=0.02)
+
+
+def test_rollouts_are_shown_and_hidden(replay):
+    everything = replay.pixels()
+
+    replay.press("1", "2")
+    assert replay.run("replay.state.shown") == [False, False, True, True]
+    assert replay.pixels() != everything
+
+    replay.press("1", "2")
+    assert replay.run("replay.state.shown") == [True] * 4
+
+
+def test_the_last_rollout_cannot_be_hidden(replay):
+    replay.press("1", "2", "3", "4")
+
+    assert sum(replay.run("replay.state.shown")) == 1
+
+
+def test_rollouts_stand_side_by_side(replay):
+    together = replay.pixels()
+
+    replay.click("side")
+
+    assert replay.run("replay.state.side")
+    assert replay.pixels() != together
+
+
+def test_the_next_violation_is_jumped_to_and_its_partner_marked(replay):
+    first = replay.run("Math.min(...meta.rollouts.flatMap((r) => r.violations.map((v) => v.t)))")
+
+    replay.press("v")
+
+    assert now(replay) == pytest.approx(first)
+    times = replay.run("[...violations()].map((v) => v.t)")
+    replay.press("v")
+    later = [t for t in times if t > first]
+    assert now(replay) == pytest.approx(later[0] if later else first)
+
+
+def test_a_violation_button_jumps_to_its_rollout(replay):
+    button = replay.browser.find_elements("css selector", ".rollout button")[-1]
+    seconds = float(button.text.split()[1])
+
+    button.click()
+
+    assert now(replay) == pytest.approx(seconds, abs=0.051)
+    assert replay.run("meta.rollouts[replay.state.focus].violations.length") > 0
+
+
+def test_reloading_keeps_what_was_shown(replay):
+    replay.press("2", "b")
+    replay.run("replay.seek(1.2)")
+    replay.run("setFocus(2)")
+    replay.run("zoom(1.5, 300, 200)")
+    kept = replay.run("JSON.stringify([location.hash, replay.state])")
+
+    replay.browser.refresh()
+    replay.wait("document.documentElement.dataset.ready")
+
+    assert replay.run("JSON.stringify([location.hash, replay.state])") == kept
+
+
+def test_the_link_carries_the_time(page, folder):
+    page.open(f"{address(folder)}#t=1.70&on=3&focus=3")
+
+    assert now(page) == pytest.approx(1.7)
+    assert page.run("replay.state.shown") == [False, False, True, False]
+
+
+@pytest.mark.parametrize("hash", ["#t=abc&on=9&focus=-1&zoom=1e9", "#%%%", "#at=1,x&t=-5"])
+def test_a_broken_link_shows_the_beginning(page, folder, hash):
+    page.open(address(folder) + hash)
+
+    assert now(page) == 0
+    assert any(page.run("replay.state.shown"))
+
+
+def test_zoom_and_drag_change_the_view(replay):
+    before = replay.pixels()
+    replay.press("+")
+    zoomed = replay.pixels()
+    replay.browser.execute_script(
+        """const canvas = document.getElementById("scene");
+        const fire = (target, kind, x) => target.dispatchEvent(
+          new PointerEvent(kind, {clientX: x, clientY: 200, bubbles: true, pointerId: 1}));
+        fire(canvas, "pointerdown", 300); fire(window, "pointermove", 420);
+        fire(window, "pointerup", 420);"""
+    )
+
+    assert before != zoomed
+    assert replay.pixels() != zoomed
+    assert not replay.run("replay.state.follow")
+
+
+def test_hostile_texts_stay_texts(page, tmp_path):
+    scenario = replace(
+        cruise_scenario(iterations=11), token=HOSTILE, city=HOSTILE, scenario_type=HOSTILE
+    )
+    tracks = standing_tracks(len(scenario.time_us), [[20.0, 0.0, 0.0]], [AgentKind.VEHICLE])
+    scenario = replace(scenario, tracks=replace(tracks, tokens=(HOSTILE,)))
+    log = simulate(scenario, load_planner("constant-velocity"))
+    row = {
+        "metric": "no_ego_at_fault_collisions",
+        "first_violation_s": 0.3,
+        "first_violation_value": 1.0,
+        "threshold": 0.0,
+        "unit": HOSTILE,
+        "partner_token": HOSTILE,
+        "score": 0.0,
+    }
+    file = tmp_path / "hostile.html"
+    file.write_text(replay_page(scenario, [Shown(HOSTILE, HOSTILE, 0, log, 0.0, [row])]), "utf-8")
+
+    page.open(file.as_uri())
+    page.press("v")
+
+    assert HOSTILE in page.text("token")
+    assert page.run("document.title") != "owned"
+    assert page.run("document.images.length") == 0
+
+
+def test_a_notebook_frame_plays(page, folder, tmp_path):
+    text = (folder / "replay" / page_name(VIOLATED)).read_text("utf-8")
+    file = tmp_path / "notebook.html"
+    file.write_text(
+        f"<!DOCTYPE html><html data-ready=1><body>{embedded(text)}</body></html>", "utf-8"
+    )
+    page.open(file.as_uri())
+    page.browser.switch_to.frame(0)
+    page.wait("document.documentElement.dataset.ready")
+
+    page.run("replay.seek(1.0)")
+
+    assert page.text("clock").startswith("1.00 s")
+    page.browser.switch_to.default_content()
+
+
+class TestList:
+    @pytest.fixture
+    def listing(self, page, folder):
+        page.open((folder / "index.html").as_uri())
+        return page
+
+    @staticmethod
+    def column(page, number):
+        cells = f"#list tbody td:nth-child({number})"
+        return page.run(f"[...document.querySelectorAll({cells!r})].map((c) => c.textContent)")
+
+    def test_rows_are_sorted_by_a_click_on_the_heading(self, listing):
+        scores = [float(text) for text in self.column(listing, 7)]
+        assert scores == sorted(scores)
+
+        listing.browser.find_element("css selector", "th[data-key=cls]").click()
+
+        scores = [float(text) for text in self.column(listing, 7)]
+        assert scores == sorted(scores, reverse=True)
+
+    def test_rows_are_filtered(self, listing):
+        listing.browser.execute_script(
+            "const s = document.getElementById('planner'); s.value = 'log-future';"
+            "s.dispatchEvent(new Event('input'))"
+        )
+
+        assert set(self.column(listing, 4)) == {"log-future"}
+        assert listing.text("count") == "8 of 16 rollouts"
+
+    def test_a_row_links_into_its_replay_at_the_violation(self, listing):
+        link = listing.browser.find_element("css selector", "#list tbody a")
+        assert "#t=" in link.get_attribute("href")
+
+        link.click()
+        listing.wait("document.documentElement.dataset.ready && window.replay")
+
+        assert now(listing) > 0

@@ -1,0 +1,157 @@
+import json
+from threading import Thread
+
+import pytest
+from stores import write_toy_store
+
+import shiftsim
+from shiftsim.data.review import REVIEW
+from shiftsim.inspection.desk import Desk
+from shiftsim.inspection.server import ReviewServer
+
+SIZES = [(1440, 900), (800, 600)]
+FIRST, SECOND = "0000cafe", "0001cafe"
+
+
+@pytest.fixture
+def store(tmp_path):
+    return write_toy_store(tmp_path / "toy", count=2)
+
+
+@pytest.fixture
+def server(store):
+    with ReviewServer(Desk(store, "me")) as running:
+        thread = Thread(target=running.serve_forever, daemon=True)
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def desk(page, server):
+    page.open(server.address)
+    return page
+
+
+def kept(store):
+    path = store / REVIEW
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {row["token"]: row for row in map(json.loads, lines)}
+
+
+def current(page):
+    return page.text("token")
+
+
+def block_on_screen(page, block):
+    """A point of the scene that shows a roadblock."""
+    return page.run(
+        f"""(() => {{ for (let y = 5; y < panel.height; y += 3)
+          for (let x = 5; x < panel.width; x += 3) if (blockAt(x, y) === {block!r}) return [x, y];
+        }})()"""
+    )
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_page_loads_without_complaints_and_fits_the_window(page, server, size, tmp_path):
+    page.open(server.address, size)
+
+    assert current(page) == FIRST
+    assert page.run("document.documentElement.scrollWidth") <= size[0]
+    assert page.run("document.documentElement.scrollHeight") <= size[1]
+    page.shoot(tmp_path / "review.png")
+
+
+def test_a_decision_is_kept_at_once_and_leads_on(desk, store):
+    desk.press("a")
+    desk.wait(f"document.getElementById('token').textContent === {SECOND!r}")
+
+    assert kept(store)[FIRST]["decision"] == "accept"
+    assert kept(store)[FIRST]["reviewer"] == "me"
+
+
+def test_undo_takes_back_the_last_step(desk, store):
+    desk.press("r")
+    desk.wait(f"document.getElementById('token').textContent === {SECOND!r}")
+    desk.press("u")
+    desk.wait(f"document.getElementById('token').textContent === {FIRST!r}")
+    desk.wait("!document.getElementById('reject').classList.contains('on')")
+
+    assert kept(store) == {}
+
+
+def test_comments_are_kept_and_keys_in_them_are_letters(desk, store):
+    desk.press("c")
+    desk.press("a rare bus")
+    desk.press("\ue00c")  # escape
+    desk.wait("document.getElementById('kept').textContent === 'kept'")
+
+    assert kept(store)[FIRST] | {"version": ""} == {
+        "token": FIRST,
+        "decision": "",
+        "comment": "a rare bus",
+        "route": None,
+        "reviewer": "me",
+        "version": "",
+    }
+    assert current(desk) == FIRST
+
+
+def test_a_click_takes_a_roadblock_out_and_another_puts_it_back(desk, store):
+    x, y = block_on_screen(desk, "1")
+
+    desk.click_at(x, y)
+    desk.wait("document.querySelectorAll('#blocks li').length === 2")
+
+    assert kept(store)[FIRST]["route"] == ["2", "3"]
+    assert "the ego starts on 1" in desk.text("problems")
+
+    desk.click_at(x, y)
+    desk.wait("document.querySelectorAll('#blocks li').length === 3")
+
+    assert kept(store) == {}
+    assert desk.text("problems") == "the route is connected"
+
+
+def test_a_corrected_route_changes_a_run_and_its_fingerprint(desk, store, tmp_path):
+    before = shiftsim.run("log-future", store=str(store), workers=1, out=str(tmp_path / "before"))
+    x, y = block_on_screen(desk, "3")
+
+    desk.click_at(x, y)
+    desk.wait("document.querySelectorAll('#blocks li').length === 2")
+    after = shiftsim.run("log-future", store=str(store), workers=1, out=str(tmp_path / "after"))
+
+    assert before.manifest["determining"] != after.manifest["determining"]
+    opened = shiftsim.open_store(str(store))
+    assert opened.read(FIRST).route == ("1", "2")
+
+
+def test_a_rejected_scenario_is_left_out_of_a_run(desk, store, tmp_path):
+    desk.press("r")
+    desk.wait(f"document.getElementById('token').textContent === {SECOND!r}")
+
+    run = shiftsim.run("log-future", store=str(store), workers=1, out=str(tmp_path / "run"))
+
+    assert run.scores["token"].to_pylist() == [SECOND]
+
+
+def test_reloading_goes_on_where_it_was(desk, store):
+    desk.press("n")
+    desk.wait(f"document.getElementById('token').textContent === {SECOND!r}")
+    desk.press("r")
+    desk.wait("document.getElementById('reject').classList.contains('on')")
+
+    desk.browser.refresh()
+    desk.wait(f"document.documentElement.dataset.ready === {SECOND!r}")
+
+    assert desk.run("document.getElementById('reject').classList.contains('on')")
+
+
+def test_play_moves_the_recording(desk):
+    before = desk.pixels()
+
+    desk.press(" ")
+    desk.wait("now > 0.2")
+
+    assert desk.pixels() != before
