@@ -8,7 +8,7 @@ belongs to the buffer where the curve winds around it.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
 from shiftsim.geometry import point_segment_distance
 from shiftsim.predicates import orientation
 
@@ -21,13 +21,13 @@ _CLOSING = 80.0  # closing points of an inner turn lie this much nearer to the c
 _PER_VERTEX = 4  # most curve vertices of a join, fillets apart
 
 
-@kernel
+@lean_kernel
 def curve_room(num_points: int) -> int:
     """Most vertices the buffer curve of a polyline can have, whatever its turns add up to."""
     return 2 * num_points * (_PER_VERTEX + 2 * QUADRANT_SEGMENTS) + 8
 
 
-@kernel
+@lean_kernel
 def buffer_curve(line: FloatArray, size: int, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
     """Outline of a polyline buffered with flat caps and round joins.
 
@@ -50,7 +50,7 @@ def buffer_curve(line: FloatArray, size: int, distance: float, keep: BoolArray, 
     return count
 
 
-@kernel
+@lean_kernel
 def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: BoolArray) -> None:
     """Mark the vertices that stay when shallow turns to one side are left out."""
     concave = 1 if left else -1
@@ -77,7 +77,7 @@ def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: B
             last = _next_kept(keep, size, middle)
 
 
-@kernel
+@lean_kernel
 def _next_kept(keep: BoolArray, size: int, index: int) -> int:
     index += 1
     while index < size and not keep[index]:
@@ -85,7 +85,7 @@ def _next_kept(keep: BoolArray, size: int, index: int) -> int:
     return index
 
 
-@kernel
+@lean_kernel
 def _is_shallow(
     line: FloatArray, i0: int, i1: int, i2: int, tolerance: float, concave: int
 ) -> bool:
@@ -104,7 +104,7 @@ def _is_shallow(
     return True
 
 
-@kernel
+@lean_kernel
 def _offset_side(
     line: FloatArray,
     size: int,
@@ -142,7 +142,7 @@ def _offset_side(
     return _add(out, count, x2 - ux, y2 - uy, distance)
 
 
-@kernel
+@lean_kernel
 def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
     at += step
     while 0 <= at < size and not keep[at]:
@@ -150,7 +150,7 @@ def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
     return at
 
 
-@kernel
+@lean_kernel
 def _offset(ax: float, ay: float, bx: float, by: float, distance: float) -> tuple[float, float]:
     """Vector from a segment to its offset on the left."""
     dx, dy = bx - ax, by - ay
@@ -158,7 +158,7 @@ def _offset(ax: float, ay: float, bx: float, by: float, distance: float) -> tupl
     return -distance * dy / length, distance * dx / length
 
 
-@kernel
+@lean_kernel
 def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> int:
     if count:
         dx, dy = x - out[count - 1, 0], y - out[count - 1, 1]
@@ -169,7 +169,7 @@ def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> in
     return count + 1
 
 
-@kernel
+@lean_kernel
 def _outer_turn(
     x: float,
     y: float,
@@ -198,7 +198,7 @@ def _outer_turn(
     return _add(out, count, x + ux, y + uy, distance)
 
 
-@kernel
+@lean_kernel
 def _inner_turn(
     x0: float,
     y0: float,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry import box_corners
 from shiftsim.traffic.idm_buffer import buffer_curve
 from shiftsim.traffic.idm_paths import PROGRESS, Fleet, clamp_progress, first_after, pose_on_path
@@ -37,6 +37,23 @@ class Obstacles(NamedTuple):
     curve_size: IntArray
 
 
+class Grid(NamedTuple):
+    """Obstacles by the square cells that their bounding boxes touch, see `idm_grid`.
+
+    Attributes:
+        first: (H + 1,) first entry of each bucket of cells, -1 if none; the last bucket is for
+            obstacles too large to be entered everywhere.
+        entries: (E, 2) an obstacle and the next entry of its bucket, -1 if none.
+        used: (1,) how many entries there are.
+        seen: (M,) the agent for which an obstacle was last looked at.
+    """
+
+    first: IntArray
+    entries: IntArray
+    used: IntArray
+    seen: IntArray
+
+
 class Scratch(NamedTuple):
     """Room for intermediate results of one agent.
 
@@ -49,6 +66,7 @@ class Scratch(NamedTuple):
         apart: (M,) lower bounds of the gaps to them [m].
         stop: (S, 2) a stop polygon [m].
         stop_bounds: (4,) its bounding box [m].
+        grid: Where to look for obstacles.
     """
 
     line: FloatArray
@@ -59,9 +77,10 @@ class Scratch(NamedTuple):
     apart: FloatArray
     stop: FloatArray
     stop_bounds: FloatArray
+    grid: Grid
 
 
-@kernel
+@lean_kernel
 def set_box(
     obstacles: Obstacles,
     index: int,
@@ -80,7 +99,7 @@ def set_box(
     ring_bounds(obstacles.box[index], len(obstacles.box[index]), bounds)
 
 
-@kernel
+@lean_kernel
 def place_replayed(
     obstacles: Obstacles,
     first: int,
@@ -111,7 +130,7 @@ def place_replayed(
     return count
 
 
-@kernel
+@lean_kernel
 def set_speeds(
     obstacles: Obstacles, first: int, replayed: IntArray, valid: BoolArray, velocities: FloatArray
 ) -> None:
@@ -126,14 +145,14 @@ def set_speeds(
             index += 1
 
 
-@kernel
+@lean_kernel
 def remaining_path(fleet: Fleet, agent: int, line: FloatArray) -> int:
     """Write the path ahead of an agent into `line` (K, 2); returns its number of vertices."""
     path, size = fleet.path[agent], fleet.path_size[agent]
     return _cut(path, size, fleet.progress[agent], path[size - 1, PROGRESS], line)
 
 
-@kernel
+@lean_kernel
 def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
     """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
@@ -157,7 +176,7 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
     return count + 1
 
 
-@kernel
+@lean_kernel
 def move_agent(
     fleet: Fleet,
     agent: int,

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.layers import Polygons
 from shiftsim.state import LightStatus
 from shiftsim.traffic.idm_buffer import buffer_curve
 from shiftsim.traffic.idm_footprints import Obstacles, Scratch, remaining_path
+from shiftsim.traffic.idm_grid import list_near
 from shiftsim.traffic.idm_paths import PROGRESS, Fleet, Roads
 from shiftsim.traffic.idm_shapes import (
     MEETING,
@@ -14,7 +15,6 @@ from shiftsim.traffic.idm_shapes import (
     UNSURE,
     bound_pieces,
     last_near_piece,
-    num_pieces,
     ring_gap,
     touches_corridor,
 )
@@ -24,7 +24,7 @@ _RED = int(LightStatus.RED)
 _TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to see ties
 
 
-@kernel
+@lean_kernel
 def find_lead(
     fleet: Fleet,
     agent: int,
@@ -48,12 +48,13 @@ def find_lead(
         obstacles, agent, half_width, size, scratch
     ):
         return LOST, 0.0  # §12 Q13
-    found = _list_near(obstacles, agent, count, half_width, size, scratch)
+    found = list_near(obstacles, agent, half_width, size, scratch)
     best, lead = np.inf, FREE
     for _ in range(found):
         nearest = 0
         for index in range(1, found):
-            if scratch.apart[index] < scratch.apart[nearest]:
+            apart, least = scratch.apart[index], scratch.apart[nearest]
+            if apart < least or (apart == least and scratch.hits[index] < scratch.hits[nearest]):
                 nearest = index
         if scratch.apart[nearest] > best:
             break
@@ -78,37 +79,7 @@ def find_lead(
     return lead, best
 
 
-@kernel
-def _list_near(
-    obstacles: Obstacles, agent: int, count: int, half_width: float, size: int, scratch: Scratch
-) -> int:
-    """List obstacles whose bounding box meets that of the corridor; returns how many."""
-    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for piece in range(num_pieces(size)):
-        low_x, low_y = min(low_x, scratch.pieces[piece, 0]), min(low_y, scratch.pieces[piece, 1])
-        high_x = max(high_x, scratch.pieces[piece, 2])
-        high_y = max(high_y, scratch.pieces[piece, 3])
-    margin = 1.1 * half_width
-    low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
-    bounds, found = obstacles.bounds, np.int64(0)
-    for other in range(count):
-        if (
-            obstacles.present[other]
-            and other != agent
-            and bounds[other, 0] <= high_x
-            and bounds[other, 1] <= high_y
-            and bounds[other, 2] >= low_x
-            and bounds[other, 3] >= low_y
-        ):
-            apart_x = max(bounds[agent, 0] - bounds[other, 2], bounds[other, 0] - bounds[agent, 2])
-            apart_y = max(bounds[agent, 1] - bounds[other, 3], bounds[other, 1] - bounds[agent, 3])
-            scratch.hits[found] = other
-            scratch.apart[found] = max(apart_x, apart_y)
-            found += 1
-    return int(found)
-
-
-@kernel
+@lean_kernel
 def _in_corridor(
     obstacles: Obstacles, other: int, half_width: float, size: int, scratch: Scratch
 ) -> bool:
@@ -122,7 +93,7 @@ def _in_corridor(
     return _meets(half_width, curve, curve_size, bounds, size, scratch)
 
 
-@kernel
+@lean_kernel
 def _meets(
     half_width: float,
     ring: FloatArray,
@@ -142,7 +113,7 @@ def _meets(
     return ring_gap(ring, ring_size, scratch.corridor, outline, 1e-3) == 0.0
 
 
-@kernel
+@lean_kernel
 def _gap(obstacles: Obstacles, agent: int, other: int, limit: float) -> float:
     """Distance between the footprints of an agent and an obstacle, at most `limit` [m]."""
     best = limit
@@ -155,7 +126,7 @@ def _gap(obstacles: Obstacles, agent: int, other: int, limit: float) -> float:
     return best
 
 
-@kernel
+@lean_kernel
 def _ring_gap(
     obstacles: Obstacles, agent: int, ring: FloatArray, ring_size: int, limit: float
 ) -> float:
@@ -170,7 +141,7 @@ def _ring_gap(
     return best
 
 
-@kernel
+@lean_kernel
 def _copy_stop(stops: Polygons, stop: int, scratch: Scratch) -> int:
     """Copy the outline of a stop polygon; maps are read-only, which to a kernel is another type."""
     ring = stops.poly_ptr[stop]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry import point_on_polyline, wrap_angle
 from shiftsim.layers import Lists, Polylines
 from shiftsim.state import LightStatus
@@ -67,13 +67,13 @@ class Fleet(NamedTuple):
     path_size: IntArray
 
 
-@kernel
+@lean_kernel
 def baseline_room(baselines: Polylines, edge: int) -> int:
     """Number of vertices of a baseline."""
     return baselines.ptr[edge + 1] - baselines.ptr[edge]
 
 
-@kernel
+@lean_kernel
 def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int) -> int:
     """Append the vertices of a baseline to a raw path; returns the new number of vertices."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
@@ -88,7 +88,7 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
     return size
 
 
-@kernel
+@lean_kernel
 def finish_path(path: FloatArray, size: int) -> int:
     """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
 
@@ -119,13 +119,13 @@ def finish_path(path: FloatArray, size: int) -> int:
     return kept
 
 
-@kernel
+@lean_kernel
 def clamp_progress(path: FloatArray, size: int, progress: float) -> float:
     """Progress limited to the path [m]."""
     return max(path[0, PROGRESS], min(progress, path[size - 1, PROGRESS]))
 
 
-@kernel
+@lean_kernel
 def first_after(path: FloatArray, size: int, progress: float) -> int:
     """First vertex of a path whose progress exceeds `progress`; `size` if there is none."""
     low, high = 0, size
@@ -138,7 +138,7 @@ def first_after(path: FloatArray, size: int, progress: float) -> int:
     return low
 
 
-@kernel
+@lean_kernel
 def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
     after = min(max(first_after(path, size, progress), 1), size - 1)
@@ -151,7 +151,7 @@ def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, f
     return x, y, wrap_angle(turn * along + path[before, HEADING])
 
 
-@kernel
+@lean_kernel
 def initial_curvature(baselines: Polylines, edge: int) -> float:
     """Absolute curvature of a baseline at its start, of the circle through three points [1/m]."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
@@ -171,7 +171,7 @@ def initial_curvature(baselines: Polylines, edge: int) -> float:
     return np.sqrt(square) / (a * b * c)
 
 
-@kernel
+@lean_kernel
 def choose_successor(roads: Roads, edge: int, status: IntArray) -> int:
     """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open.
 
@@ -195,7 +195,7 @@ def choose_successor(roads: Roads, edge: int, status: IntArray) -> int:
     return chosen
 
 
-@kernel
+@lean_kernel
 def extend_route(
     fleet: Fleet, agent: int, roads: Roads, status: IntArray, min_length: float, headway: float
 ) -> int:
@@ -232,7 +232,7 @@ def extend_route(
         _remember(fleet.route, fleet.route_size, agent, chosen)
 
 
-@kernel
+@lean_kernel
 def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
     after = first_after(path, size, progress)
@@ -254,7 +254,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     return kept
 
 
-@kernel
+@lean_kernel
 def _remember(route: IntArray, route_size: IntArray, agent: int, edge: int) -> None:
     size = route_size[agent]
     if size == MAX_ROUTE:

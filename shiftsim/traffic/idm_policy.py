@@ -5,12 +5,12 @@ Used by reactive agents and by the IDM planner (nuplan-simulation.md §10.3).
 
 import numpy as np
 
-from shiftsim.arrays import kernel
+from shiftsim.arrays import lean_kernel
 
 EXPONENT = 4.0  # of the free-road term, nuPlan
 
 
-@kernel
+@lean_kernel
 def idm_acceleration(
     speed: float,
     gap: float,
@@ -44,7 +44,7 @@ def idm_acceleration(
     return accel_max * (1.0 - (speed / target_speed) ** EXPONENT - ratio**2)
 
 
-@kernel
+@lean_kernel
 def idm_step(
     speed: float,
     gap: float,

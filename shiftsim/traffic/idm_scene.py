@@ -13,6 +13,7 @@ from shiftsim.state import LightStatus, Tracks
 from shiftsim.traffic.idm_agents import Start, more_room
 from shiftsim.traffic.idm_buffer import curve_room
 from shiftsim.traffic.idm_footprints import Obstacles, Scratch, move_agent, set_box
+from shiftsim.traffic.idm_grid import make_grid
 from shiftsim.traffic.idm_paths import Fleet, Roads
 from shiftsim.traffic.idm_shapes import PIECE
 from shiftsim.traffic.idm_step import (
@@ -195,6 +196,7 @@ def make_scratch(fleet: Fleet, stops: Polygons, num_obstacles: int) -> Scratch:
         apart=np.zeros(num_obstacles),
         stop=np.zeros((np.diff(stops.ring_ptr).max(initial=0), 2)),
         stop_bounds=np.zeros(4),
+        grid=make_grid(num_obstacles),
     )
 
 

@@ -7,7 +7,7 @@ bounding boxes, and exact predicates decide whether two edges meet.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry import point_segment_distance
 from shiftsim.predicates import orientation
 
@@ -19,7 +19,7 @@ PIECE = 12  # segments of a corridor that are searched together
 _INNER, _OUTER = 0.97, 1.02
 
 
-@kernel
+@lean_kernel
 def ring_bounds(ring: FloatArray, size: int, bounds: FloatArray) -> None:
     """Widen `bounds` (4,) min x, min y, max x, max y by the first `size` vertices of a ring."""
     for vertex in range(size):
@@ -29,7 +29,7 @@ def ring_bounds(ring: FloatArray, size: int, bounds: FloatArray) -> None:
         bounds[3] = max(bounds[3], ring[vertex, 1])
 
 
-@kernel
+@lean_kernel
 def segments_meet(
     ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
 ) -> bool:
@@ -43,7 +43,7 @@ def segments_meet(
     return orientation(cx, cy, dx, dy, ax, ay) * orientation(cx, cy, dx, dy, bx, by) <= 0
 
 
-@kernel
+@lean_kernel
 def winds_around(ring: FloatArray, size: int, x: float, y: float) -> bool:
     """Whether the first `size` vertices of a ring wind around a point, or have it on an edge."""
     winding = 0
@@ -62,7 +62,7 @@ def winds_around(ring: FloatArray, size: int, x: float, y: float) -> bool:
     return winding != 0
 
 
-@kernel
+@lean_kernel
 def ring_gap(a: FloatArray, a_size: int, b: FloatArray, b_size: int, limit: float) -> float:
     """Distance between what two rings enclose, at most `limit`; 0 where they share a point [m].
 
@@ -95,7 +95,7 @@ def ring_gap(a: FloatArray, a_size: int, b: FloatArray, b_size: int, limit: floa
     return best
 
 
-@kernel
+@lean_kernel
 def _box_apart(
     ring: FloatArray, size: int, low_x: float, low_y: float, high_x: float, high_y: float
 ) -> float:
@@ -107,7 +107,7 @@ def _box_apart(
     return max(low_x - x1, x0 - high_x, low_y - y1, y0 - high_y)
 
 
-@kernel
+@lean_kernel
 def _vertex_distance(a: FloatArray, a_size: int, b: FloatArray, b_size: int) -> float:
     """Distance between two close vertices: an upper bound that makes the search short."""
     found = 0
@@ -130,7 +130,7 @@ def _vertex_distance(a: FloatArray, a_size: int, b: FloatArray, b_size: int) -> 
     return np.sqrt(best)
 
 
-@kernel
+@lean_kernel
 def _edge_gap(
     px: float, py: float, qx: float, qy: float, ring: FloatArray, size: int, best: float
 ) -> float:
@@ -156,7 +156,7 @@ def _edge_gap(
     return best
 
 
-@kernel
+@lean_kernel
 def _nearer(x: float, y: float, ax: float, ay: float, bx: float, by: float, best: float) -> float:
     """Distance from a point to the segment a-b where it is less than `best`, else `best` [m]."""
     if _square_distance(x, y, ax, ay, bx, by) * (1.0 - 1e-9) >= best * best:
@@ -165,7 +165,7 @@ def _nearer(x: float, y: float, ax: float, ay: float, bx: float, by: float, best
     return distance if distance < best else best
 
 
-@kernel
+@lean_kernel
 def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """Square of the distance from a point to the segment a-b, up to rounding [m^2]."""
     dx, dy = bx - ax, by - ay
@@ -180,7 +180,7 @@ def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: fl
     return cross * cross / square
 
 
-@kernel
+@lean_kernel
 def bound_pieces(line: FloatArray, size: int, pieces: FloatArray) -> None:
     """Write the bounding boxes of consecutive pieces of a polyline.
 
@@ -199,13 +199,13 @@ def bound_pieces(line: FloatArray, size: int, pieces: FloatArray) -> None:
         pieces[piece, 2], pieces[piece, 3] = high_x, high_y
 
 
-@kernel
+@lean_kernel
 def num_pieces(size: int) -> int:
     """How many pieces a polyline of `size` vertices has."""
     return (size - 2) // PIECE + 1
 
 
-@kernel
+@lean_kernel
 def last_near_piece(pieces: FloatArray, size: int, half_width: float, bounds: FloatArray) -> int:
     """The last piece of a corridor of `size` vertices that may reach into a bounding box, or 0."""
     reach = half_width * _OUTER
@@ -220,7 +220,7 @@ def last_near_piece(pieces: FloatArray, size: int, half_width: float, bounds: Fl
     return 0
 
 
-@kernel
+@lean_kernel
 def touches_corridor(
     line: FloatArray,
     size: int,
@@ -277,7 +277,7 @@ def touches_corridor(
     return answer
 
 
-@kernel
+@lean_kernel
 def _touches_segment(
     px: float,
     py: float,

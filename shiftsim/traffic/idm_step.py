@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry import wrap_angle
 from shiftsim.layers import Polygons
 from shiftsim.state import HEADING as EGO_HEADING
@@ -17,6 +17,7 @@ from shiftsim.traffic.idm_footprints import (
     set_box,
     set_speeds,
 )
+from shiftsim.traffic.idm_grid import enter, fill_grid
 from shiftsim.traffic.idm_lead import LOST, find_lead
 from shiftsim.traffic.idm_paths import PROGRESS, Fleet, Roads, extend_route
 from shiftsim.traffic.idm_policy import idm_step
@@ -56,7 +57,7 @@ class Row(NamedTuple):
     sizes: FloatArray
 
 
-@kernel
+@lean_kernel
 def advance(
     fleet: Fleet,
     agents: IntArray,
@@ -103,6 +104,7 @@ def advance(
                 )
                 if needed > 0:
                     return LONGER_PATHS, needed
+    fill_grid(scratch.grid, obstacles, count)
     for agent in range(first, len(agents)):
         if not fleet.alive[agent]:
             continue
@@ -112,11 +114,12 @@ def advance(
         _drive(fleet, agent, obstacles, count, roads, driving, span, lead, gap)
         if move_agent(fleet, agent, obstacles, scratch, driving.headway) < 0:
             return LONGER_CURVES, agent
+        enter(scratch.grid, obstacles.bounds, agent)
     write_agents(fleet, agents, row)
     return DONE, 0
 
 
-@kernel
+@lean_kernel
 def _place(
     fleet: Fleet,
     replayed: IntArray,
@@ -146,7 +149,7 @@ def _place(
     return count
 
 
-@kernel
+@lean_kernel
 def _drive(
     fleet: Fleet,
     agent: int,
@@ -186,7 +189,7 @@ def _drive(
     fleet.speed[agent] = max(speed, 0.0)
 
 
-@kernel
+@lean_kernel
 def write_agents(fleet: Fleet, tracks: IntArray, row: Row) -> None:
     """Write the agents, whose tracks are given (A,), into a row; the gone as absent."""
     for agent in range(len(tracks)):
