@@ -2,10 +2,13 @@
 
 A traffic model owns the tracks of a rollout from iteration 0 on. The simulator hands it one buffer
 of tracks whose rows are the past samples followed by the iterations, filled from the log; the model
-rewrites rows as the rollout proceeds. A model is any object with the two methods of `Traffic`.
+rewrites rows as the rollout proceeds. A model is any object with the two methods of `Traffic`;
+`mixed.Mixed` makes one of several, each for some of the tracks (docs/own_traffic.md).
 """
 
+import sys
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol
 
 from shiftsim.arrays import FloatArray
@@ -16,6 +19,7 @@ from shiftsim.state import Tracks
 _MODELS = {
     "nonreactive": "shiftsim.traffic.log_replay:LogReplay",
     "reactive": "shiftsim.traffic.idm:IdmTraffic",
+    "constant-velocity": "shiftsim.traffic.constant_velocity:ConstantVelocity",
     "reactive-fixed": "shiftsim.traffic.idm:FixedIdmTraffic",  # not nuPlan's, never for benchmarks
 }
 _SHORT = {"nr": "nonreactive", "r": "reactive"}
@@ -53,13 +57,27 @@ def traffic_name(name: str) -> str:
     full = _SHORT.get(name, name)
     if full not in _MODELS and ":" not in full:
         raise ConfigError(
-            f"traffic {name!r} unknown", hint=f"available: {', '.join(sorted(_MODELS))}"
+            f"traffic {name!r} unknown",
+            hint=f"available: {', '.join(sorted(_MODELS))}, or package.module:Model of your own",
         )
     return full
 
 
 def make_traffic(name: str) -> Traffic:
-    """A traffic model by name, or by `package.module:Class`."""
+    """A traffic model by name, or by `package.module:Model`, called without arguments.
+
+    Raises:
+        ConfigError: The name is unknown, or what it names is not a traffic model.
+    """
     module, _, attribute = _MODELS.get(full := traffic_name(name), full).partition(":")
+    if full not in _MODELS and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # a model beside the user's files, as for planners
     model: Traffic = getattr(import_module(module), attribute)()
+    for method in ("start", "step"):
+        if not callable(getattr(model, method, None)):
+            raise ConfigError(
+                f"traffic {name!r} has no method {method!r}",
+                hint="a traffic model has start(scenario, tracks, row) and "
+                "step(iteration, ego, tracks, row), see docs/own_traffic.md",
+            )
     return model

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim import geometry
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.scenario import Scenario
 from shiftsim.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
@@ -68,12 +68,20 @@ class IdmTraffic:
         self.parameters = parameters
         self._scene: Scene | None = None
 
-    def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
-        """Put the vehicles of iteration 0 on their lanes; clear what is not simulated."""
+    def start(
+        self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
+    ) -> None:
+        """Put the vehicles of iteration 0 on their lanes; clear what is not simulated.
+
+        With `own`, of these tracks only; what others move stays, and is replayed to the agents.
+        """
         kinds, parameters = tracks.kinds, self.parameters
         ego = scenario.ego[scenario.iteration_rows[0]]
-        open_loop = np.isin(kinds, parameters.open_loop)
-        vehicles = np.flatnonzero(tracks.valid[row] & (kinds == AgentKind.VEHICLE))
+        foreign = np.zeros(len(kinds), np.bool_)
+        if own is not None:
+            foreign = ~np.isin(np.arange(len(kinds)), own)
+        open_loop = np.isin(kinds, parameters.open_loop) | foreign
+        vehicles = np.flatnonzero(tracks.valid[row] & (kinds == AgentKind.VEHICLE) & ~foreign)
         standing = np.flatnonzero(tracks.valid[row] & open_loop)
         poses, sizes = tracks.poses[row], tracks.sizes[row]
         taken = np.concatenate(
