@@ -12,6 +12,19 @@ NAME = "pluto"
 RAW = ("trajectory", "probability", "prediction", "ref_free_trajectory")
 # In the features, but read neither by the network nor by what follows it.
 UNREAD = ("in/agent.target", "in/map.polygon_road_block_id", "in/origin", "in/angle")
+CODES = (
+    "agent.category",
+    "map.polygon_type",
+    "map.polygon_tl_status",
+    "map.polygon_road_block_id",
+    "static_objects.category",
+)
+MASKED = {  # group → what says that an entry exists, and what is 0 where it does not
+    "agent": ("valid_mask", ("position", "heading", "velocity", "shape")),
+    "map": ("polygon_has_speed_limit", ("polygon_speed_limit",)),
+    "static_objects": ("valid_mask", ("position", "heading", "shape", "category")),
+    "reference_line": ("valid_mask", ("position", "vector", "orientation")),
+}
 TURN = 2.0 * np.pi
 
 
@@ -142,8 +155,18 @@ def _compare_redundant(file: ArrayFile, arrays: dict[str, Any]) -> None:
         "map.polygon_orientation": (angles[:, :, 0, 0], arrays["map.polygon_orientation"]),
         "map.point_side": (sides, arrays["map.point_side"]),
         "reference_line.vector": (np.diff(lines, axis=-2) * pairs, steps[..., :-1, :] * pairs),
+        "reference_line.orientation": (
+            np.arctan2(steps[..., 1], steps[..., 0]),
+            arrays["reference_line.orientation"],
+        ),
         "reference_line.future_projection": (np.zeros(future.shape), future),
     }
+    made |= {f"{name} code": (np.rint(arrays[name]), arrays[name]) for name in CODES}
+    for group, (mask, names) in MASKED.items():
+        for name in names:
+            value = arrays[f"{group}.{name}"]
+            absent = value[~arrays[f"{group}.{mask}"]]
+            made[f"{group}.{name} where absent"] = (np.zeros(absent.shape), absent)
     for name, (mine, given) in made.items():
         if name.endswith("orientation"):
             given = given - TURN * np.rint((given - mine) / TURN)
