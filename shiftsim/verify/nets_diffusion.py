@@ -272,32 +272,33 @@ def _verify_loop(path: Path, report: Report, scenes: Scenes, networks: _Networks
     loop = open_loop(path, report, scenes, NAME)
     if loop is None:
         return
-    if loop.error:
-        report.note(f"{path.name}: the official planner failed after the last iteration")
     file, network = loop.file, networks(loop.variant)
-    count = len(loop.ego)
-    stored = file.take("out/trajectory", count, NOISE_SHAPE[1] + 1, len(_PLAN))
+    stored = file.take("out/trajectory", -1, NOISE_SHAPE[1] + 1, len(_PLAN))
+    count = len(stored)  # the official planner may have failed at the next iteration
     times = file.take("out/trajectory_time_us", count, NOISE_SHAPE[1] + 1)
     egos = file.take("out/ego_prediction", count, *NOISE_SHAPE[1:])
+    failed = min(count, len(loop.ego) - 1) if loop.error else -1
     build = FeatureBuilder(loop.info, lane_lines(loop.scenario.map))
     plans: list[Trajectory | Command] = []
-    for iteration in range(count):
+    for iteration in range(len(loop.ego)):
         where, seen = f"iteration {iteration}", loop.observation(iteration)
         key = f"noise:{loop.scenario.token}:{iteration}"
         noise = keyed_normals(key, (1, *NOISE_SHAPE)).astype(np.float32)[0]
         features = build(seen, noise)
-        reason = why_makeshift(features, len(seen.history.ego))
-        loop.compare(f"{NAME} makeshift", where, reason, "")
+        makeshift = bool(why_makeshift(features, len(seen.history.ego)))
+        loop.compare(f"{NAME} makeshift", where, makeshift, iteration == failed)
         made = _infer(network, features)
         _compare_iteration(loop, iteration, features, made)
-        loop.compare(
-            f"{NAME} ego [m]", where, made["prediction"][0], egos[iteration], SAMPLED["drive"]
-        )
+        if iteration >= count:
+            continue
+        ego, atol = made["prediction"][0], SAMPLED[loop.variant]
+        loop.compare(f"{NAME} ego [m]", where, ego, egos[iteration], atol)
         plan = decode_ego(made["prediction"], seen)
         _compare_plan(loop, where, plan, stored[iteration], times[iteration])
         states = np.zeros((len(plan.time_us), NUM_STATE))
         states[:, : len(_PLAN)] = stored[iteration]
         plans.append(Trajectory(times[iteration], states))
+    report.compare(f"{NAME} plans", path.name, len(loop.ego) - len(plans), int(bool(loop.error)))
     compare_driven(loop, plans, NAME)
     file.finish()
 
