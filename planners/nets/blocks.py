@@ -348,4 +348,4 @@ def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
     """(M, C) maximum over the points of each line; points without a value count as zero."""
     dense = values.new_zeros(keep.numel(), values.shape[1])
     dense.index_copy_(0, row, values)
-    return dense.reshape(*keep.shape, -1).amax(dim=1)
+    return dense.reshape(*keep.shape, values.shape[1]).amax(dim=1)
