@@ -303,7 +303,7 @@ class PointsEncoder(nn.Module):
         first, second = _folded(self.first_mlp), _folded(self.second_mlp)
         parts = zip(lines.split(size), valid.split(size), strict=True)
         encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
-        return encoded.reshape(*keep.shape[:2], -1)
+        return encoded.unflatten(0, keep.shape[:2])
 
 
 class _FoldedMlp(NamedTuple):
