@@ -31,7 +31,7 @@ from shiftsim.verify.observing import scene_info
 from shiftsim.verify.report import Report
 
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
-OUTPUT = {"base": 2e-5, "drive": 5e-4}  # network outputs, by variant of the weights
+OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale up, by variant
 DERIVED_HEADING = 5e-4  # rad, arctangent of small vectors
 POSITION, HEADING = 2e-3, 2e-4  # m, rad: plans of closed loops
 STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
