@@ -34,6 +34,8 @@ INPUTS = (
 class DiffusionPlanner(LearnedPlanner[Features, Single]):
     """The Diffusion Planner with a checkpoint."""
 
+    name = "diffusion-planner"
+
     def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
         """Load the network.
 

@@ -66,6 +66,8 @@ class Plans(NamedTuple):
 class PlanTF(LearnedPlanner[Features, Plans]):
     """PlanTF with a checkpoint."""
 
+    name = "plantf"
+
     def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
         """Load the network.
 
