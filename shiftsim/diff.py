@@ -288,8 +288,9 @@ def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
     if first.shape != second.shape:
         return 0
     differ = (first != second) & ~(np.isnan(first) & np.isnan(second))
-    rows = np.flatnonzero(differ.reshape(len(differ), -1).any(axis=1)) if differ.size else []
-    return int(rows[0]) if len(rows) else None
+    if not differ.any():
+        return None
+    return int(np.argmax(differ.reshape(len(differ), -1).any(axis=1)))
 
 
 def _since_start(table: pa.Table, row: int) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from shiftsim.cli import checkpoint, convert, reading, running, stores, viewing
+from shiftsim.cli import bench, checkpoint, convert, reading, running, stores, viewing
 from shiftsim.errors import DataError, ShiftsimError
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
@@ -42,6 +42,7 @@ def _options(
 
 
 running.register(app)
+bench.register(app)
 reading.register(app)
 viewing.register(app)
 convert.register(app)

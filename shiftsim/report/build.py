@@ -3,7 +3,7 @@
 import base64
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shiftsim.config import one_of
@@ -81,7 +81,19 @@ def make_tables(
     if "planning-time" in chosen.tables:
         out.append(details.planning_times(groups))
     out += _data_tables(groups, published, chosen)
-    return [table for table in out if table is not None]
+    return _named_apart([table for table in out if table is not None])
+
+
+def _named_apart(tables: Sequence[Table]) -> list[Table]:
+    """The same tables, numbered where several have one name."""
+    out: list[Table] = []
+    for table in tables:
+        name, number = table.name, 1
+        while name in {other.name for other in out}:
+            number += 1
+            name = f"{table.name}-{number}"
+        out.append(replace(table, name=name))
+    return out
 
 
 def _data_tables(

@@ -4,8 +4,8 @@ Planners differ in colour, marker and dash, so that they stay apart without colo
 of groups whose score is withheld.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +63,8 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
         ) from error
     out = []
     styles = looks(dict.fromkeys(group.planner for group in groups))
-    for data in distinct_sets(groups):
-        mine = [group for group in groups if group.data.key == data.key]
+    for data in _named_apart(distinct_sets(groups)):
+        mine = [group for group in groups if group.data.key[1:] == data.key[1:]]
         shown = [g for g in mine if _estimate(g, allow_partial) is not None]
         out += _robustness(data, shown, styles, allow_partial)
         clean = [group for group in shown if group.noise == "none"]
@@ -72,6 +72,15 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
             out += _cities(data, clean, styles, allow_partial)
             out.append(_metrics(data, clean, styles, allow_partial))
     return out
+
+
+def _named_apart(sets: Sequence[DataSet]) -> list[DataSet]:
+    """The same sets, numbered where several have one name: it becomes that of a file."""
+    names = [data.name for data in sets]
+    return [
+        replace(data, name=f"{data.name}-{i + 1}") if data.name in names[:i] else data
+        for i, data in enumerate(sets)
+    ]
 
 
 def _estimate(
@@ -101,7 +110,8 @@ def _robustness(
                     if (group.traffic, group.planner) == (traffic, planner)
                 }
                 style = _line(styles[planner]) | {"linestyle": _DASHES[place % len(_DASHES)]}
-                _curve(axes, found, kind, planner, place - len(planners) / 2, style)
+                label = _label(planner, found.values())
+                _curve(axes, found, kind, label, place - len(planners) / 2, style)
             axes.set_xticks(range(len(LEVELS)), LEVELS)
             axes.set_title(f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
             _score_axis(axes)
@@ -115,7 +125,7 @@ def _curve(
     axes: Any,
     found: dict[str, Estimate | None],
     kind: str,
-    planner: str,
+    label: str,
     offset: float,
     style: dict[str, Any],
 ) -> None:
@@ -127,7 +137,15 @@ def _curve(
     places = [place + 0.02 * offset for place, _ in points]
     means = [cell.mean for _, cell in points if cell]
     errors = [(cell.std or 0.0) if cell else 0.0 for _, cell in points]
-    axes.errorbar(places, means, yerr=errors, label=planner, capsize=2, **style)
+    axes.errorbar(places, means, yerr=errors, label=label, capsize=2, **style)
+
+
+def _label(planner: str, found: Iterable[Estimate | None]) -> str:
+    return f"{planner} (partial)" if any(cell and cell.label for cell in found) else planner
+
+
+def _named(group: Group) -> str:
+    return group.planner if group.is_complete else f"{group.planner} (partial)"
 
 
 def _line(look: Look) -> dict[str, Any]:
@@ -183,15 +201,16 @@ def _dots(
 ) -> tuple[Any, Any]:
     """Planners side by side at every place, one panel per traffic mode."""
     modes = traffics(groups)
+    planners = list(dict.fromkeys(group.planner for group in groups))
     figure, panels = _panels(len(modes), 1, (max(5.5, 1.05 * len(names)), 2.9))
     for row, traffic in enumerate(modes):
         axes = panels[row][0]
         here = [group for group in groups if group.traffic == traffic]
-        for index, group in enumerate(here):
+        for group in here:
             look = styles[group.planner]
-            shift = _SPREAD * ((index + 0.5) / len(here) - 0.5)
+            shift = _SPREAD * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
             for place in range(len(names)):
-                label = group.planner if place == 0 else None
+                label = _named(group) if place == 0 else None
                 _dot(axes, place + shift, cell(group, place), look, label)
         for place in range(1, len(names)):
             axes.axvline(place - 0.5, color="0.9", linewidth=0.7, zorder=0)

@@ -308,7 +308,9 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
     expected = whole.count if whole is not None else 0
     limit = int(manifest["config"].get("limit") or 0)
     suffix = ""
-    if expected and len(tokens) != expected:
+    if manifest.get("shard"):
+        suffix = f" (shard {manifest['shard']})"
+    elif expected and len(tokens) != expected:
         suffix = f" ({len(tokens)}/{expected})"
     elif not expected and limit:
         suffix = f" (first {len(tokens)})"

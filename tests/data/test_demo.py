@@ -3,6 +3,7 @@ import hashlib
 import numpy as np
 import pytest
 
+from shiftsim.benchmarks import known_sets
 from shiftsim.data.deepplan_windows import overlap_partners
 from shiftsim.data.demo_paths import STEP
 from shiftsim.data.demo_towns import avenue_town, parking_town
@@ -128,6 +129,12 @@ def test_a_way_into_a_parking_space_ends_there():
 
 def test_every_demo_route_has_two_blocks(store):
     assert all(len(scene.route) >= 2 for scene in store)
+
+
+def test_the_benchmarks_know_the_scenarios_of_the_demo(store):
+    lists = {known.name: set(known.tokens) for known in known_sets()}
+    assert lists["demo"] == set(store.tokens)
+    assert lists["demo-mini"] == set(find_split("demo-mini", store.path, store.tokens).tokens)
 
 
 def test_an_existing_demo_store_is_kept(store):

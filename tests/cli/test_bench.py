@@ -1,0 +1,138 @@
+"""A whole track in one command, and its report."""
+
+import csv
+import json
+
+import pytest
+from commands import call
+from stores import write_toy_store
+
+import shiftsim
+
+pytestmark = pytest.mark.slow
+
+TINY = ("-p", "constant-velocity", "-s", "toy", "--workers", "1", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a store `toy` and a finished benchmark of two noises and one seed."""
+    folder = tmp_path_factory.mktemp("bench")
+    write_toy_store(folder / "shiftsim-data" / "toy")
+    words = ("-n", "none", "-n", "ou-high", "--seeds", "0", "--limit", "2", "--out", "runs/b")
+    done = call(folder, "bench", "state-drift", *TINY, *words)
+    assert done.returncode == 0, done.stderr
+    (folder / "printed.txt").write_text(done.stdout)
+    return folder
+
+
+def test_a_track_is_a_run_per_traffic_mode_and_a_report(place):
+    assert {path.name for path in (place / "runs/b").iterdir()} == {
+        "bench.json",
+        "own-nonreactive",
+        "own-reactive",
+        "report",
+    }
+    run = shiftsim.open_run(place / "runs/b/own-reactive")
+    assert run.manifest["determining"]["traffic"] == "reactive"
+    assert run.manifest["determining"]["thresholds"]["name"] == "deepplan"
+    for name in ("report.txt", "report.md", "report.tex", "report.html", "coverage.csv"):
+        assert (place / "runs/b/report" / name).stat().st_size > 0
+
+
+def test_what_is_partial_says_so_everywhere(place):
+    printed = (place / "printed.txt").read_text()
+    # 2 of 4 scenarios, 2 of 19 settings, both modes
+    assert "partial (8/152)" in printed
+    assert "toy (2/4)" in printed
+    assert "not run" in printed
+    with (place / "runs/b/report/coverage.csv").open() as file:
+        verdicts = {row["set"]: row["verdict"] for row in csv.DictReader(file)}
+    assert verdicts == {"toy (2/4)": "partial (8/152)", "Val14": "not run"}
+    for ending in ("txt", "md", "tex", "html"):
+        assert "(2/4)" in (place / f"runs/b/report/report.{ending}").read_text()
+
+
+def test_the_folder_of_a_benchmark_is_reported_as_one(place):
+    done = call(place, "report", "runs/b", "-t", "noise-robustness")
+    assert done.returncode == 0, done.stderr
+    assert "toy (2/4)  NR " in done.stdout
+    assert "toy (2/4)  R " in done.stdout
+    assert "Coverage of the track state-drift" in done.stdout
+
+
+def test_the_same_command_again_keeps_what_is_there(place):
+    words = ("-n", "none", "-n", "ou-high", "--seeds", "0", "--limit", "2", "--out", "runs/b")
+    before = (place / "runs/b/own-nonreactive/scores.parquet").stat().st_mtime_ns
+    done = call(place, "bench", "state-drift", *TINY, *words)
+    assert done.returncode == 0, done.stderr
+    assert (place / "runs/b/own-nonreactive/scores.parquet").stat().st_mtime_ns == before
+
+
+def test_another_benchmark_does_not_go_into_the_same_folder(place):
+    done = call(place, "bench", "semantic-shift", *TINY, "--out", "runs/b")
+    assert done.returncode == 1
+    assert "holds something else than a semantic-shift benchmark" in done.stderr
+    other = call(place, "bench", "state-drift", *TINY, "--seeds", "5", "--out", "runs/b")
+    assert other.returncode == 1
+    assert "holds another run" in other.stderr
+
+
+def test_a_dry_run_checks_and_writes_nothing(place):
+    done = call(place, "bench", "semantic-shift", *TINY, "--dry-run", "--out", "runs/dry")
+    assert done.returncode == 0
+    assert "tasks       8 " in done.stdout
+    assert not (place / "runs/dry").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "fact"),
+    [
+        (("bench", "drift", *TINY), "track 'drift' unknown"),
+        (("bench", "state-drift", "-s", "toy"), "no planner"),
+        (("bench", "state-drift", *TINY, "--val14", "absent"), "no store 'absent'"),
+        (("bench", "state-drift", *TINY, "--noise", "loud"), "noise 'loud' unknown"),
+        (("report", "runs/b", "-f", "pdf"), "format 'pdf' unknown"),
+        (("report", "runs/b", "-t", "score"), "table 'score' unknown"),
+        (("diff", "runs/b/own-reactive", "runs/absent"), "no run folder"),
+    ],
+)
+def test_mistakes_are_found_before_anything_runs(place, words, fact):
+    done = call(place, *words)
+    assert done.returncode in (1, 2)
+    assert fact in done.stderr
+    assert len(done.stderr.splitlines()) <= 2
+
+
+def test_val14_is_driven_under_the_default_thresholds(place):
+    words = ("--val14", "toy", "--traffic", "nonreactive", "--out", "runs/val")
+    done = call(place, "bench", "semantic-shift", *TINY, *words)
+    assert done.returncode == 0, done.stderr
+    run = shiftsim.open_run(place / "runs/val/val14-nonreactive")
+    assert run.manifest["determining"]["thresholds"]["name"] == "nuplan"
+    # the toy store is not that list, and is not called so
+    assert "Val14" not in [line.split()[0] for line in done.stdout.splitlines() if " NR " in line]
+
+
+def test_diff_and_report_speak_json(place):
+    runs = ("runs/b/own-nonreactive", "runs/b/own-reactive")
+    found = json.loads(call(place, "diff", *runs, "--json").stdout)
+    assert found["same"] + found["better"] + found["worse"] == 4
+    assert found["settings"] == ["traffic"]
+    summaries = json.loads(call(place, "report", "runs/b", "--json").stdout)
+    assert [entry["traffic"] for entry in summaries] == ["nonreactive", "reactive"]
+
+
+def test_pictures_are_written_beside_the_run(place):
+    pytest.importorskip("matplotlib")
+    done = call(place, "report", "runs/b/own-nonreactive", "--figures", "-f", "html")
+    assert done.returncode == 0, done.stderr
+    folder = place / "runs/b/own-nonreactive/report"
+    names = {path.suffix for path in folder.iterdir()}
+    assert names == {".png", ".html"}
+    assert "data:image/png;base64" in (folder / "report.html").read_text()
+
+
+def test_planners_of_a_track_may_have_arguments(place):
+    words = ("-p", "simple", "--planner-arg", "max_velocity=3", "-s", "toy", "--dry-run")
+    assert call(place, "bench", "semantic-shift", *words).returncode == 0

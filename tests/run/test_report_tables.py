@@ -1,0 +1,314 @@
+"""The paper's tables, and that nothing in them looks complete that is not."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+from made_runs import random_scores, write_run
+
+from shiftsim.benchmarks import known_sets, published
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.report import KnownSet, read_groups, render
+from shiftsim.report.build import TABLES, Options, make_tables, write_report
+from shiftsim.report.details import planner_comparison, planning_times, scenario_types
+from shiftsim.report.groups import token_digest
+from shiftsim.report.paper import noise_robustness, semantic_shift
+from shiftsim.report.tables import Number, Table, shown
+from shiftsim.report.writers import latex_escape, markdown_escape
+
+TOKENS = ("t0", "t1", "t2", "t3")
+
+
+def cells(table, *labels):
+    """The row that begins with some labels, by column."""
+    (row,) = [row for row in table.rows if row[: len(labels)] == labels]
+    return {name: shown(cell) for name, cell in zip(table.header, row, strict=True)}
+
+
+def test_scores_per_city_are_means_over_its_scenarios(tmp_path):
+    score = random_scores(1)
+    run = write_run(tmp_path / "a", score=score)
+    (table,) = semantic_shift(read_groups([run]))
+    values = [100.0 * score("alpha", "none", 0, number) for number in range(4)]
+    row = cells(table, "NR", "alpha")
+    assert row["made-up"] == f"{np.mean(values):.2f}"
+    assert row["x"] == f"{np.mean(values[:2]):.2f}"
+    assert row["y"] == f"{np.mean(values[2:]):.2f}"
+    assert row["DAC"] == row["made-up"]
+
+
+def test_a_missing_rollout_withholds_its_city_and_the_whole_but_no_other_city(tmp_path):
+    lost = [("alpha", "none", 0, "t3")]
+    run = write_run(tmp_path / "a", planners=("alpha", "beta"), missing=lost)
+    (table,) = semantic_shift(read_groups([run]))
+    row = cells(table, "NR", "alpha")
+    assert row["made-up"] == "– (3/4)"
+    assert row["y"] == "– (1/2)"
+    assert row["x"] == "50.00"
+    assert row["95 % CI"] == ""
+    assert cells(table, "NR", "beta")["made-up"] == "50.00"
+
+
+def test_a_scenario_that_nobody_finished_could_be_in_any_city(tmp_path):
+    run = write_run(tmp_path / "a", missing=[("alpha", "none", 0, "t3")])
+    (table,) = semantic_shift(read_groups([run]))
+    row = cells(table, "NR", "alpha")
+    assert row["x"] == "– (2/3)"
+    assert row["y"] == "– (1/2)"
+
+
+def test_a_partial_mean_is_labelled_wherever_it_stands(tmp_path):
+    run = write_run(tmp_path / "a", missing=[("alpha", "none", 0, "t3")])
+    (table,) = semantic_shift(read_groups([run]), allow_partial=True)
+    assert cells(table, "NR", "alpha")["made-up"] == "50.00 partial (3/4)"
+    for style in ("text", "md", "latex", "html", "csv"):
+        assert "partial (3/4)" in render(table, style)
+
+
+def test_part_of_a_known_list_says_so_in_its_name(tmp_path):
+    whole = tuple(f"t{i}" for i in range(9))
+    known = KnownSet("nine", "Nine", "nuplan", 9, token_digest(whole), whole)
+    run = write_run(tmp_path / "a", split="something")
+    assert read_groups([run], [known])[0].data.label == "Nine (4/9)"
+
+
+def test_a_known_list_is_told_by_its_hash_and_not_by_its_name(tmp_path):
+    hashed = KnownSet("val14", "Val14", "nuplan", 4, token_digest(TOKENS))
+    real = write_run(tmp_path / "a", split="my-copy")
+    other = write_run(tmp_path / "b", split="val14", tokens=("u0", "u1", "u2", "u3"))
+    short = write_run(
+        tmp_path / "c", split="val14", tokens=("u0",), cities="x", logs="l", types=["k"]
+    )
+    labels = [read_groups([run], [hashed])[0].data.label for run in (real, other, short)]
+    assert labels == ["Val14", "val14 (not the published list)", "Val14 (1/4)"]
+
+
+def test_a_limited_run_of_an_unknown_list_says_so(tmp_path):
+    run = write_run(tmp_path / "a", limit=4)
+    assert read_groups([run])[0].data.label == "made-up (first 4)"
+
+
+def test_a_shard_says_so(tmp_path):
+    run = write_run(tmp_path / "a", shard="1/3")
+    assert read_groups([run])[0].data.label == "made-up (shard 1/3)"
+
+
+def test_seeds_have_a_mean_and_a_sample_deviation(tmp_path):
+    score = random_scores(2)
+    run = write_run(tmp_path / "a", noise=("none", "ou-high"), seeds=(0, 1, 2), score=score)
+    means = [
+        np.mean([100.0 * score("alpha", "ou-high", seed, n) for n in range(4)]) for seed in range(3)
+    ]
+    table = noise_robustness(read_groups([run]))
+    row = cells(table, "made-up", "NR", "alpha")
+    assert row["ou-high"] == f"{np.mean(means):.2f} ± {np.std(means, ddof=1):.2f}"
+    assert "±" not in row["none"]
+
+
+def test_clean_runs_have_no_noise_table(tmp_path):
+    assert noise_robustness(read_groups([write_run(tmp_path / "a")])) is None
+
+
+def test_both_traffic_modes_of_two_runs_stand_in_one_table(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", traffic="reactive", score=lambda *key: 0.25),
+        write_run(tmp_path / "b", traffic="nonreactive"),
+    ]
+    (table,) = semantic_shift(read_groups(runs))
+    assert [row[:2] for row in table.rows] == [("NR", "alpha"), ("R", "alpha")]
+    assert cells(table, "R", "alpha")["made-up"] == "25.00"
+
+
+def test_val14_stands_beside_the_own_scenarios(tmp_path):
+    known = [KnownSet("val14", "Val14", "nuplan", 2, token_digest(("v0", "v1")))]
+    runs = [
+        write_run(tmp_path / "own", thresholds="deepplan"),
+        write_run(
+            tmp_path / "val",
+            tokens=("v0", "v1"),
+            cities=("z", "z"),
+            logs=("k", "k"),
+            score=lambda *key: 0.9,
+        ),
+    ]
+    (table,) = semantic_shift(read_groups(runs, known))
+    row = cells(table, "NR", "alpha")
+    assert (row["Val14"], row["made-up"]) == ("90.00", "50.00")
+    assert "z" not in table.header
+
+
+def test_different_thresholds_are_different_tables(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", thresholds="nuplan"),
+        write_run(tmp_path / "b", thresholds="deepplan"),
+    ]
+    tables = make_tables(read_groups(runs), options=Options(tables=("semantic-shift",)))
+    assert ["thresholds nuplan" in t.notes[0] for t in tables] == [True, False]
+    assert len({t.name for t in tables}) == 2
+
+
+def test_a_name_that_means_two_planners_is_told_apart(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", fingerprint="old"),
+        write_run(tmp_path / "b", fingerprint="new", score=lambda *key: 0.75),
+    ]
+    (table,) = semantic_shift(read_groups(runs))
+    assert [row[1] for row in table.rows] == ["alpha @a", "alpha @b"]
+
+
+def test_the_same_result_twice_is_shown_once_and_a_contradiction_is_refused(tmp_path):
+    runs = [write_run(tmp_path / name) for name in "ab"]
+    assert len(read_groups(runs)) == 1
+    other = write_run(tmp_path / "c", score=lambda *key: 0.1)
+    with pytest.raises(DataError, match="both hold alpha none NR"):
+        read_groups([*runs, other])
+
+
+def test_planners_are_compared_on_complete_scores_only(tmp_path):
+    score = {"alpha": 0.5, "beta": 0.75, "gamma": 0.1}
+    run = write_run(
+        tmp_path / "a",
+        planners=tuple(score),
+        score=lambda planner, *key: score[planner],
+        missing=[("gamma", "none", 0, "t0")],
+    )
+    table = planner_comparison(read_groups([run]))
+    row = cells(table, "made-up", "NR", "none", "alpha", "beta")
+    assert len(table.rows) == 1
+    assert (row["difference"], row["better/same/worse"]) == ("-25.00", "0/0/4")
+    # three recordings: all signs alike happens by chance in 2 of 8 patterns
+    assert row["p"] == "0.2500"
+    assert any("few recordings (3)" in note for note in table.notes)
+
+
+def test_scenario_types_are_rows(tmp_path):
+    kinds = ["left", "left", "right", "right"]
+    run = write_run(tmp_path / "a", types=kinds, score=lambda p, n, s, number: number / 4.0)
+    (table,) = scenario_types(read_groups([run]))
+    assert cells(table, "left")["alpha NR"] == "12.50"
+    assert cells(table, "right")["alpha NR"] == "62.50"
+
+
+def test_degraded_steps_are_counted(tmp_path):
+    table = planning_times(read_groups([write_run(tmp_path / "a")]))
+    row = cells(table, "made-up", "NR", "alpha")
+    assert (row["degraded steps"], row["in rollouts"]) == ("6", "3")
+    assert (row["ms per step"], row["95 % ms"]) == ("2.00", "3.00")
+
+
+def test_published_rows_stand_beside_own_ones_of_the_same_cities(tmp_path):
+    cities = ("Sindelfingen", "Berlin", "München", "Stuttgart")
+    run = write_run(tmp_path / "a", planners=("pdm-closed",), cities=cities)
+    (table,) = semantic_shift(read_groups([run]), published(), beside=True)
+    own = cells(table, "NR", "pdm-closed")
+    theirs = cells(table, "NR", "PDM-Closed (published)")
+    assert table.header[4:8] == ("SIFI", "MUC", "STR", "BER")
+    assert own["MUC"] == "50.00"
+    assert (theirs["made-up"], theirs["MUC"], theirs["EIC"]) == ("48.07", "57.02", "72.17")
+    assert any("not the paper's" in note for note in table.notes)
+
+
+def test_published_rows_stand_alone_where_the_cities_are_others(tmp_path):
+    tables = semantic_shift(read_groups([write_run(tmp_path / "a")]), published(), beside=True)
+    assert [t.name for t in tables] == ["semantic-shift_made-up", "semantic-shift_published"]
+    assert cells(tables[1], "R", "CaRL (published)")["SFO"] == "87.67"
+
+
+def test_the_demo_is_never_called_the_benchmark(tmp_path):
+    run = write_run(tmp_path / "a")
+    (table,) = semantic_shift(read_groups([run], known_sets()), published())
+    assert "not a set of the published benchmark" in table.notes
+
+
+HOSTILE = 'a&b_50%#1 {x} $y$ \\z ~^ <i>|"q" *s* `c`'
+
+
+def hostile_table():
+    return Table("t", HOSTILE, ("planner", "CLS"), ((HOSTILE, Number(1.0)),), 1, (HOSTILE,))
+
+
+def test_latex_prints_names_as_they_are():
+    escaped = latex_escape(HOSTILE)
+    assert escaped.startswith(r"a\&b\_50\%\#1 \{x\} \$y\$ \textbackslash{}z")
+    body = render(hostile_table(), "latex")
+    assert body.count(r"\&b\_50\%") == 3
+    assert latex_escape("[1, 2]") == "[1, 2]"
+
+
+def test_a_latex_cell_is_not_taken_for_an_option():
+    table = Table("t", "", ("a", "b"), (("x", None), ("[1]", Number(2.0))), 1)
+    assert "{[1]} & 2.00" in render(table, "latex")
+
+
+def test_html_prints_names_as_they_are():
+    import html.parser
+
+    seen = []
+
+    class Reader(html.parser.HTMLParser):
+        def handle_data(self, data):
+            seen.append(data)
+
+        def handle_starttag(self, tag, attributes):
+            assert tag != "i"
+
+    Reader().feed(render(hostile_table(), "html"))
+    assert seen.count(HOSTILE) == 3
+
+
+def test_markdown_keeps_its_columns():
+    line = render(hostile_table(), "md").splitlines()[-3]
+    assert line.replace(r"\|", "").count("|") == 3
+    assert markdown_escape("a_b\nc") == r"a\_b c"
+
+
+def test_csv_has_every_number_in_full_and_in_its_own_column(tmp_path):
+    score = random_scores(3)
+    run = write_run(tmp_path / "a", noise=("ou-low",), seeds=(0, 1), score=score)
+    table = noise_robustness(read_groups([run]))
+    (row,) = csv.DictReader(io.StringIO(render(table, "csv")))
+    means = [
+        np.mean([100.0 * score("alpha", "ou-low", seed, n) for n in range(4)]) for seed in (0, 1)
+    ]
+    assert float(row["ou-low"]) == pytest.approx(np.mean(means), abs=1e-12)
+    assert float(row["ou-low std"]) == pytest.approx(np.std(means, ddof=1), abs=1e-12)
+    assert "thresholds nuplan" in row["notes"]
+
+
+def test_intervals_are_two_columns_in_csv(tmp_path):
+    run = write_run(tmp_path / "a", score=random_scores(4))
+    (table,) = semantic_shift(read_groups([run]))
+    (row,) = csv.DictReader(io.StringIO(render(table, "csv")))
+    assert float(row["95 % CI low"]) < float(row["made-up"]) < float(row["95 % CI high"])
+
+
+def test_wide_text_is_printed_in_pieces_that_repeat_the_labels(tmp_path):
+    (table,) = semantic_shift(read_groups([write_run(tmp_path / "a")]))
+    text = render(Table("t", "", table.header, table.rows, 2), "text", width=60)
+    assert max(map(len, text.splitlines())) <= 60
+    assert text.count("alpha") == text.count("traffic") > 1
+
+
+def test_a_row_of_the_wrong_length_is_a_mistake():
+    with pytest.raises(ValueError, match="2 cells, 1 columns"):
+        Table("t", "", ("a",), (("x", "y"),), 1)
+
+
+def test_unknown_tables_are_refused():
+    with pytest.raises(ConfigError, match="'semantic-shft' unknown"):
+        Options(tables=("semantic-shft",))
+
+
+def test_a_report_is_a_folder_with_a_file_per_format(tmp_path):
+    run = write_run(tmp_path / "a", planners=("alpha", "beta"), noise=("none", "ou-low"))
+    groups = read_groups([run])
+    kinds = tuple(name for name in TABLES if "data" not in name and "benchmark" not in name)
+    tables = make_tables(groups, published(), Options(tables=kinds))
+    files = write_report(tmp_path / "out", tables, [], ("text", "md", "csv", "latex", "html"))
+    names = {path.name for path in files}
+    assert {"report.txt", "report.md", "report.tex", "report.html", "scores.csv"} <= names
+    for ending in ("txt", "md", "tex", "html"):
+        text = (tmp_path / "out" / f"report.{ending}").read_text("utf-8")
+        assert "thresholds nuplan" in text
+        assert "Noise robustness" in text
