@@ -141,3 +141,70 @@ def test_an_own_model_of_the_wrong_shape_is_refused():
 def test_impossible_parameters_are_refused(arguments):
     with pytest.raises(ConfigError):
         NoiseModel(**arguments)
+
+
+def stationary(name: str, *, tokens: int = 400, num_steps: int = 250) -> np.ndarray:
+    """(scenarios, steps, 2) noise after 50 steps, when the start at 0 is forgotten."""
+    drawn = [sampled(name, token=f"scenario-{i}", num_steps=num_steps + 50) for i in range(tokens)]
+    return np.stack(drawn)[:, 50:]
+
+
+@pytest.mark.parametrize("level", ["low", "mid", "high"])
+def test_white_noise_has_normal_moments_and_no_memory(level):
+    drawn = stationary(f"awgn-{level}") / np.array(noise.SIGMA_BY_LEVEL[level])
+
+    # 200 000 values: standard errors are 0.0022 of the mean, 0.0055 and 0.011 of the moments
+    flat = drawn.reshape(-1)
+    assert abs(flat.mean()) < 0.01
+    assert abs(flat.var() - 1.0) < 0.015
+    assert abs((flat**3).mean()) < 0.03
+    assert abs((flat**4).mean() - 3.0) < 0.08
+    for lag in (1, 2, 10):
+        assert abs(np.mean(drawn[:, lag:] * drawn[:, :-lag])) < 0.012
+
+
+@pytest.mark.parametrize("level", ["low", "mid", "high"])
+def test_correlated_noise_has_the_variance_and_the_memory_of_theory(level):
+    drawn = stationary(f"ou-{level}") / np.array(noise.SIGMA_BY_LEVEL[level])
+
+    variance = drawn.var()
+    assert variance == pytest.approx(1.0 / 3.6, rel=0.03)
+    for lag in (1, 2, 5, 10):
+        correlation = np.mean(drawn[:, lag:] * drawn[:, :-lag]) / variance
+        assert correlation == pytest.approx(0.8**lag, abs=0.02), lag
+    assert abs(drawn.mean()) < 0.02
+    assert (drawn**4).mean() / variance**2 == pytest.approx(3.0, abs=0.2)
+
+
+def test_correlated_noise_starts_at_zero_and_grows_to_its_variance():
+    drawn = np.stack([sampled("ou-high", token=f"s{i}", num_steps=30)[:, 0] for i in range(4000)])
+
+    # variance after k updates of x <- 0.8 x + sqrt(0.1) sigma eps
+    theory = 1.5**2 * 0.1 * (1.0 - 0.64 ** np.arange(1, 31)) / 0.36
+    np.testing.assert_allclose(drawn.var(axis=0), theory, rtol=0.12)
+
+
+@pytest.mark.parametrize("name", ["awgn-mid", "ou-mid"])
+def test_scenarios_seeds_and_channels_are_independent(name):
+    keys = [(seed, f"token-{i}") for seed in range(3) for i in range(20)]
+    drawn = [sampled(name, seed=seed, token=token, num_steps=4000) for seed, token in keys]
+    correlations = np.corrcoef(np.concatenate([values.T for values in drawn]))
+
+    # 120 streams; the memory of ou makes 4000 steps worth about 900 independent ones
+    worst = np.abs(correlations - np.eye(len(correlations))).max()
+    assert worst < (0.09 if name.startswith("awgn") else 0.19)
+    # no pair is related at a shift either, as two parts of one stream would be
+    first, second = drawn[0][:, 0], drawn[1][:, 0]
+    for shift in (1, 150, 1000):
+        assert abs(np.corrcoef(first[shift:], second[:-shift])[0, 1]) < 0.15
+
+
+def test_neighbouring_seeds_and_similar_tokens_share_no_numbers():
+    streams = [
+        noise.keyed_generator(seed, token, channel).integers(0, 2**63, 200)
+        for seed in (0, 1, 2)
+        for token in ("a", "a1", "1a", "b")
+        for channel in noise.CHANNELS
+    ]
+    everything = np.concatenate(streams)
+    assert len(np.unique(everything)) == len(everything)
