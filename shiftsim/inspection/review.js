@@ -210,9 +210,9 @@ async function bestPlace(route, id) {
   return best[1];
 }
 
+const bare = document.createElement("canvas").getContext("2d"); // without any transform
 function blockAt(px, py) {
   const [x, y] = panel.toWorld(px, py);
-  const bare = document.createElement("canvas").getContext("2d");
   const found = blocks.filter(({ path }) => bare.isPointInPath(path, x, y, "evenodd"));
   const onRoute = found.find(({ id }) => open.found.current.includes(id));
   return (onRoute || found[0] || { id: "" }).id;

@@ -101,3 +101,4 @@ byId("more").addEventListener("click", () => {
   show();
 });
 show();
+document.documentElement.dataset.ready = "1";

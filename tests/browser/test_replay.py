@@ -1,8 +1,10 @@
 from dataclasses import replace
 
 import pytest
+from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
+import shiftsim
 from shiftsim.data.store import open_store
 from shiftsim.planners import load_planner
 from shiftsim.simulation import simulate
@@ -19,10 +21,18 @@ VIOLATED = "0001cafe"  # its ego meets a parked car
 
 
 @pytest.fixture(scope="module")
-def folder(clean_run, toy, tmp_path_factory):
-    """Replays of the toy run, and their list."""
+def folder(tmp_path_factory):
+    """Replays of a short run, and their list."""
     out = tmp_path_factory.mktemp("view")
-    Gallery([clean_run], open_store(toy)).write(out)
+    store = write_toy_store(out / "store", count=2, iterations=100)
+    run = shiftsim.run(
+        ["constant-velocity", "log-future"],
+        noise=["none", "ou-high"],
+        store=str(store),
+        workers=1,
+        out=str(out / "run"),
+    )
+    Gallery([run], open_store(store)).write(out)
     return out
 
 
@@ -66,11 +76,11 @@ def test_play_advances_and_pause_stays(replay):
 
 
 def test_play_ends_at_the_end(replay):
-    replay.run("replay.seek(2.2)")
+    replay.run("replay.seek(9.6)")
     replay.click("play")
     replay.wait("!replay.state.playing")
 
-    assert replay.text("clock").startswith("2.30 s of 2.3 s")
+    assert replay.text("clock").startswith("9.80 s of 9.8 s")
 
 
 def test_scrubbing_and_steps_move_in_time(replay):
@@ -86,7 +96,7 @@ def test_scrubbing_and_steps_move_in_time(replay):
     assert now(replay) == pytest.approx(1.6, abs=1e-3)
 
     replay.press(Keys.END)
-    assert now(replay) == pytest.approx(2.3, abs=1e-3)
+    assert now(replay) == pytest.approx(9.8, abs=1e-3)
     replay.press(Keys.HOME)
     assert now(replay) == 0
 
@@ -100,7 +110,7 @@ def test_dragging_on_the_curves_scrubs(replay):
         canvas.dispatchEvent(new PointerEvent("pointerdown", {...at, bubbles: true}));"""
     )
 
-    assert now(replay) == pytest.approx(1.15, abs=0.02)
+    assert now(replay) == pytest.approx(4.9, abs=0.05)
 
 
 def test_rollouts_are_shown_and_hidden(replay):
@@ -266,7 +276,7 @@ class TestList:
         )
 
         assert set(self.column(listing, 4)) == {"log-future"}
-        assert listing.text("count") == "8 of 16 rollouts"
+        assert listing.text("count") == "4 of 8 rollouts"
 
     def test_a_row_links_into_its_replay_at_the_violation(self, listing):
         link = listing.browser.find_element("css selector", "#list tbody a")

@@ -47,8 +47,8 @@ def current(page):
 def block_on_screen(page, block):
     """A point of the scene that shows a roadblock."""
     return page.run(
-        f"""(() => {{ for (let y = 5; y < panel.height; y += 3)
-          for (let x = 5; x < panel.width; x += 3) if (blockAt(x, y) === {block!r}) return [x, y];
+        f"""(() => {{ for (let y = 5; y < panel.height; y += 8)
+          for (let x = 5; x < panel.width; x += 8) if (blockAt(x, y) === {block!r}) return [x, y];
         }})()"""
     )
 
