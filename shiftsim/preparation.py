@@ -49,6 +49,7 @@ class Prepared:
         units: All tasks whose scenario exists, as they are handed out.
         missing: Tasks whose scenario the store does not hold.
         split: Name of the split.
+        tokens: All scenarios of the run, whatever the shard.
         determining: Everything that the scores depend on.
         folder: Where the run folder will be.
         before: What it holds now.
@@ -61,6 +62,7 @@ class Prepared:
     units: tuple[Unit, ...]
     missing: tuple[Task, ...]
     split: str
+    tokens: tuple[str, ...]
     determining: dict[str, Any]
     folder: Path
     before: State
@@ -153,6 +155,7 @@ def prepare(
         tuple(_leading_first(units)),
         tuple(task for (task,) in _of_shard(config.shard, missing)),
         split,
+        (*present, *lacking),
         determining,
         folder,
         before,

@@ -37,7 +37,8 @@ WRITE_OPTIONS: dict[str, Any] = {
 ROW_GROUP = 1 << 16  # rows
 _CHUNK = 256  # results turned into tables at once
 _MAX_TOKEN = 60  # characters of a token in a file name
-_FIELDS = ("status", "scenario_type", "error", "hint", "traceback", "seconds", "scores", "metrics")
+_TEXTS = ("status", "scenario_type", "error", "hint", "traceback")
+_FIELDS = (*_TEXTS, "seconds", "scores", "metrics")
 _DURATIONS = [n for n in TABLES["tasks"].names if n.endswith("_seconds") or "_ms_" in n]
 
 
@@ -103,9 +104,7 @@ class RunWriter:
                 partial.write_bytes(result.rollout)
         elif rollout and name:
             _link(rollout, self.rollouts / name)
-        values = {field: getattr(result, field) for field in _FIELDS}
-        line = {"task": result.task, "rollout": name, **values}
-        data = json.dumps(line, default=_plain).encode() + b"\n"
+        data = _line(result, name).encode()
         try:
             self._file.write(data)
         except OSError:  # the disk is full: without half a line, the next attempt can go on
@@ -178,7 +177,7 @@ class RunWriter:
 
 def _rows(lines: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
     """Rows of the tables, in the order of `TABLES`."""
-    names = ("scenario_type", "status", "error", "hint", "traceback", "rollout")
+    names = (*_TEXTS, "rollout")
     done = [line for line in lines if line["status"] == OK]
     return (
         [{**x["key"], **{name: x[name] for name in names}, **x["seconds"]} for x in lines],
@@ -247,6 +246,13 @@ def _link(source: Path, target: Path) -> None:
             shutil.copyfile(source, partial)
 
 
+def _line(result: TaskResult, rollout: str | None) -> str:
+    """A line of the journal."""
+    values = {field: getattr(result, field) for field in _FIELDS}
+    line = {"task": result.task, "rollout": rollout, **values}
+    return json.dumps(line, default=_plain) + "\n"
+
+
 def _plain(value: Any) -> Any:
     """NumPy scalars as Python's."""
     return value.item()
@@ -307,22 +313,28 @@ def _restore_journal(path: Path) -> None:
     except (ConfigError, DataError):
         return
     with _whole(journal) as partial, partial.open("w", encoding="utf-8") as file:
-        for line in _stored_lines(path):
-            file.write(json.dumps(line) + "\n")
+        for result, rollout in stored_results(path):
+            file.write(_line(result, rollout.name if rollout else None))
 
 
-def _stored_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines that made the tables of a run; a task without a result has none."""
+def stored_results(path: Path) -> Iterator[tuple[TaskResult, Path | None]]:
+    """What made the tables of a run, task by task, and the file of the rollout.
+
+    A task without a result has none.
+    """
     scores, metrics = (_by_task(path / f"{name}.parquet") for name in ("scores", "metrics"))
     for key, (row,) in _by_task(path / "tasks.parquet"):
         if row["status"] == MISSING:
             continue
         done = row["status"] == OK
-        line = {name: row.get(name) for name in (*_FIELDS, "rollout")}
-        line["seconds"] = {name: row[name] for name in _DURATIONS if row[name] is not None}
-        line["scores"] = next(scores)[1][0] if done else {}
-        line["metrics"] = next(metrics)[1] if done else []
-        yield {"task": key, **line}
+        result = TaskResult(
+            Task(*key),
+            **{name: row[name] for name in _TEXTS},
+            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
+            scores=next(scores)[1][0] if done else {},
+            metrics=next(metrics)[1] if done else [],
+        )
+        yield result, path / "rollouts" / row["rollout"] if row["rollout"] else None
 
 
 def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:

@@ -74,8 +74,11 @@ def execute(
         determining=prepared.determining,
         argv=argv,
     )
+    manifest["workers"] = prepared.workers
+    if prepared.config.shard:  # what the whole run would be, for `merge`
+        manifest["tokens"] = sorted(prepared.tokens)
     try:
-        return _execute(prepared, manifest | {"workers": prepared.workers}, on_progress)
+        return _execute(prepared, manifest, on_progress)
     except OSError as error:
         raise DataError(
             f"run {str(prepared.folder)!r} cannot be written: {error.strerror or error}",
@@ -153,6 +156,17 @@ def _outcomes(
     config = prepared.config
     make = partial(_runner, prepared.runner)
     leading = min(len(prepared.runner.planners), len(units))
+    if config.executor == "dask":
+        from shiftsim.cluster import map_on_cluster
+
+        return map_on_cluster(
+            make,
+            units,
+            scheduler=config.scheduler,
+            alone=leading,
+            limit=config.timeout,
+            pieces=_pieces,
+        )
     return map_unordered(
         make,
         units,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli.merging import merge
 
 if TYPE_CHECKING:
     from shiftsim.results import Run
@@ -92,6 +93,7 @@ def register(app: typer.Typer) -> None:
     app.command()(demo)
     app.command()(run)
     app.command()(score)
+    app.command()(merge)
 
 
 def run(
@@ -229,9 +231,7 @@ def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> Non
             typer.echo("error: interrupted", err=True)
             typer.echo(f"hint: kept: {prepared.folder}; go on with: {again}", err=True)
             raise typer.Exit(_INTERRUPTED) from None
-    _show(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
-    if not finished.is_complete:
-        raise typer.Exit(_UNFINISHED)
+    leave_with(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
 
 
 @contextmanager
@@ -300,6 +300,13 @@ def _announce(prepared: "Prepared") -> None:
     if prepared.resumes:
         say(f"resume      {_BEFORE[prepared.before]}")
     say()
+
+
+def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
+    """Print what a run gave, and leave with the code for it."""
+    _show(finished, allow_partial=allow_partial, as_json=as_json)
+    if not finished.is_complete:
+        raise typer.Exit(_UNFINISHED)
 
 
 def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
@@ -391,6 +398,4 @@ def score(
             on_progress=lambda progress: advance(progress.done, progress.total, ""),
             argv=sys.argv,
         )
-    _show(finished, allow_partial=allow_partial, as_json=as_json)
-    if not finished.is_complete:
-        raise typer.Exit(_UNFINISHED)
+    leave_with(finished, allow_partial=allow_partial, as_json=as_json)
