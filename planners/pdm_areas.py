@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import (
     BOUNDARY,
     EXTERIOR,
@@ -75,7 +75,7 @@ def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
     return Areas(polygons, rings, slab_grid, edge_ptr, edge_ends, on_route, edge)
 
 
-@kernel
+@lean_kernel
 def _slice(
     xy: FloatArray, rings: IntArray, slab_grid: FloatArray, fill: IntArray, edge_ends: IntArray
 ) -> None:
@@ -146,7 +146,7 @@ def _admit(
     return count
 
 
-@kernel
+@lean_kernel
 def locate(
     slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
     first: int,
@@ -188,7 +188,7 @@ def locate(
     return INTERIOR if inside else EXTERIOR
 
 
-@kernel
+@lean_kernel
 def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray) -> int:
     """Write the admitted areas that hold a point, boundary included, into `out`; their number.
 
@@ -278,7 +278,7 @@ def cover_poses(
             oncoming[proposal, step] = last[4] < 0
 
 
-@kernel
+@lean_kernel
 def _find_holder(
     slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
     bounds: FloatArray,
@@ -300,7 +300,7 @@ def _find_holder(
     return -1
 
 
-@kernel
+@lean_kernel
 def on_multiple_lanes(areas: Areas, near: IntArray, box: FloatArray) -> bool:
     """Whether the corners (4, 2) of the ego are on several areas, none of which has all (§8.1)."""
     slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import (
     EXTERIOR,
     box_corners,
@@ -34,7 +34,7 @@ class Lanes:
     found: bool
 
 
-@kernel
+@lean_kernel
 def nearest_vertex(
     baselines: Polylines, edge: int, x: float, y: float, heading: float
 ) -> tuple[float, float]:
@@ -153,7 +153,7 @@ def lane_off_road(
     return found
 
 
-@kernel
+@lean_kernel
 def box_to_ring(box: FloatArray, ring: FloatArray) -> float:
     """Distance between a box (4, 2) and the area of a simple ring (V, 2); 0 when they touch [m]."""
     if locate_in_ring(ring, box[0, 0], box[0, 1]) != EXTERIOR:

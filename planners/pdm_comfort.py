@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
 from shiftsim.planners.pdm_parameters import DT, SCORED, ComfortBounds
 from shiftsim.state import AX, AY, HEADING
 
@@ -96,7 +96,7 @@ def comfort(
             is_comfortable[row, signal] = within
 
 
-@kernel
+@lean_kernel
 def _filter(samples: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
     """Write samples @ matrix into `out`, rounded to 8 decimals as nuPlan does."""
     for column in range(len(out)):

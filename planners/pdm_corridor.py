@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.planners.idm_corridor import BAND, CLEAR, HIT, OPEN, segment_distance
 from shiftsim.planners.pdm_centerline import box_to_ring
 from shiftsim.planners.pdm_forecast import NUM_FORECASTS, Occupants, centroid, ring_of
@@ -129,7 +129,7 @@ def _fill(path: PdmPath, corridor: Corridor, occupants: Occupants, first: int, l
     return is_open
 
 
-@kernel
+@lean_kernel
 def _drop_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
     """The stretch without repeated vertices at its ends; 1 vertex if all are the same."""
     while end - begin > 1 and xy[begin, 0] == xy[begin + 1, 0] and xy[begin, 1] == xy[begin + 1, 1]:
@@ -148,7 +148,7 @@ def _bounds(xy: FloatArray, begin: int, end: int, reach: float) -> FloatArray:
     return out
 
 
-@kernel
+@lean_kernel
 def _side(
     xy: FloatArray,
     runs: FloatArray,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import box_corners, convex_intersect, wrap_angle
 from shiftsim.planners.pdm_areas import index_ranks
 from shiftsim.planners.pdm_parameters import STEPS, PdmParameters
@@ -92,7 +92,7 @@ def make_occupants(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray
     return made
 
 
-@kernel
+@lean_kernel
 def _forecast(poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out: Occupants) -> None:
     """Fill in the boxes of all forecast maps."""
     for index in range(len(poses)):
@@ -146,7 +146,7 @@ def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
     return out
 
 
-@kernel
+@lean_kernel
 def _diagonal(box: FloatArray) -> float:
     return np.hypot(box[0, 0] - box[2, 0], box[0, 1] - box[2, 1])
 
@@ -171,7 +171,7 @@ def forecast_ranks(occupants: Occupants, forecast: int) -> IntArray:
     return index_ranks(bounds)
 
 
-@kernel
+@lean_kernel
 def centroid(ring: FloatArray) -> tuple[float, float]:
     """Centroid of the area of a ring (V, 2) [m].
 

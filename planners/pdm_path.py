@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry import point_segment_distance
 
 MIN_PROGRESS = 1e-5  # m, nuPlan: keeps clear of a duplicate vertex at the very start
@@ -52,7 +52,7 @@ def offset_poses(poses: FloatArray, offset: float) -> FloatArray:
     return out
 
 
-@kernel
+@lean_kernel
 def interpolate(path: PdmPath, progress: float, out: FloatArray) -> None:
     """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN."""
     if progress != progress:
@@ -71,7 +71,7 @@ def interpolate(path: PdmPath, progress: float, out: FloatArray) -> None:
     out[2] = np.arctan2(np.sin(turn), np.cos(turn))
 
 
-@kernel
+@lean_kernel
 def project(path: PdmPath, x: float, y: float, guess: int) -> tuple[float, float, int]:
     """The point of the path nearest to (x, y); the first one on ties.
 
@@ -100,7 +100,7 @@ def project(path: PdmPath, x: float, y: float, guess: int) -> tuple[float, float
     return found, best, run_found
 
 
-@kernel
+@lean_kernel
 def _project_on_run(path: PdmPath, run: int, x: float, y: float) -> tuple[float, float]:
     best, found = np.inf, 0.0
     for index in range(run * RUN, min((run + 1) * RUN, len(path.xy) - 1)):
@@ -117,7 +117,7 @@ def _project_on_run(path: PdmPath, run: int, x: float, y: float) -> tuple[float,
     return best, found
 
 
-@kernel
+@lean_kernel
 def window(path: PdmPath, low: float, high: float) -> tuple[int, int]:
     """First vertex, and one past the last one, with a progress in [low, high], both clamped."""
     end = path.progress[-1]

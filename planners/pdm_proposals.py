@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import box_corners, ring_distance, wrap_angle
 from shiftsim.planners.idm_corridor import HIT
 from shiftsim.planners.pdm_centerline import box_to_ring
@@ -219,7 +219,7 @@ def _roll(
     return DONE
 
 
-@kernel
+@lean_kernel
 def _any_ahead(hits: IntArray, centroids: FloatArray, progress: float) -> bool:
     for index in hits:
         if centroids[index] > progress:
@@ -227,7 +227,7 @@ def _any_ahead(hits: IntArray, centroids: FloatArray, progress: float) -> bool:
     return False
 
 
-@kernel
+@lean_kernel
 def _nearest(
     hits: IntArray,
     centroids: FloatArray,
@@ -272,7 +272,7 @@ def _nearest(
     return found, best
 
 
-@kernel
+@lean_kernel
 def acceleration(
     progress: float, speed: float, lead: FloatArray, target: float, model: FollowingModel
 ) -> float:

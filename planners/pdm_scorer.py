@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import (
     EXTERIOR,
     box_corners,
@@ -151,7 +151,7 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
     return np.where(factor > 0.0, 1.0, 0.0)
 
 
-@kernel
+@lean_kernel
 def place_ego(
     states: FloatArray, size: tuple[float, float, float], corners: FloatArray, centers: FloatArray
 ) -> None:
@@ -168,7 +168,7 @@ def place_ego(
             box_corners(x, y, heading, size[0], size[1], corners[row, step])
 
 
-@kernel
+@lean_kernel
 def bearing(state: FloatArray, x: float, y: float) -> float:
     """Angle between the heading and the direction from the rear axle to a point, in [0, pi].
 
@@ -213,7 +213,7 @@ def _near(
     return out[:count]
 
 
-@kernel
+@lean_kernel
 def _front_touches(corners: FloatArray, ring: FloatArray) -> bool:
     """Whether the front bumper of a box (4, 2) touches the area of a convex ring (4, 2)."""
     if locate_in_ring(ring, corners[0, 0], corners[0, 1]) != EXTERIOR:
@@ -266,14 +266,14 @@ def _collisions(
                     forgiven[entry] = True
 
 
-@kernel
+@lean_kernel
 def _circle_of(box: FloatArray) -> tuple[float, float, float]:
     """Centre and radius of a circle around a box (4, 2), a little larger than it [m]."""
     x, y = 0.5 * (box[0, 0] + box[2, 0]), 0.5 * (box[0, 1] + box[2, 1])
     return x, y, np.hypot(box[0, 0] - x, box[0, 1] - y) + 1e-6
 
 
-@kernel
+@lean_kernel
 def _is_at_fault(
     state: FloatArray,
     box: FloatArray,
@@ -356,7 +356,7 @@ def _times_to_collision(
                 break
 
 
-@kernel
+@lean_kernel
 def _travel(
     centers: FloatArray,
     oncoming: BoolArray,

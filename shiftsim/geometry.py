@@ -7,13 +7,13 @@ front-left, rear-left, rear-right, front-right. A ring is a closed or open seque
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.predicates import orientation
 
 INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
 
 
-@kernel
+@lean_kernel
 def wrap_angle(angle: float) -> float:
     """An angle wrapped to [-pi, pi) as nuPlan does: ((angle + pi) mod 2 pi) - pi [rad]."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
@@ -48,7 +48,7 @@ def from_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:
     )
 
 
-@kernel
+@lean_kernel
 def box_corners(x: float, y: float, heading: float, length: float, width: float, out: FloatArray):  # type: ignore[no-untyped-def]
     """Write the corners of a box into `out` (4, 2): front-left, rear-left, rear-right, front-right.
 
@@ -64,7 +64,7 @@ def box_corners(x: float, y: float, heading: float, length: float, width: float,
         out[index, 1] = y + (lat * lat_y + lon * lon_y)
 
 
-@kernel
+@lean_kernel
 def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
     count = len(a)
     for index in range(count):
@@ -83,7 +83,7 @@ def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
     return False
 
 
-@kernel
+@lean_kernel
 def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
     """Whether two convex rings (V, 2), counter-clockwise, share a point; touching counts.
 
@@ -93,7 +93,7 @@ def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
     return not (_separated_by_edges(a, b) or _separated_by_edges(b, a))
 
 
-@kernel
+@lean_kernel
 def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
     """Whether the closed segments a-b and c-d, points (2,) each, share a point."""
     if (
@@ -112,7 +112,7 @@ def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
     return o3 * o4 <= 0
 
 
-@kernel
+@lean_kernel
 def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     """Where a point lies relative to one ring (V, 2): INTERIOR, BOUNDARY or EXTERIOR."""
     parity, on_edge = ray_crossings(ring, len(ring) - 1, 0, len(ring), x, y)
@@ -121,7 +121,7 @@ def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     return INTERIOR if parity else EXTERIOR
 
 
-@kernel
+@lean_kernel
 def ray_crossings(
     xy: FloatArray, before: int, start: int, stop: int, x: float, y: float
 ) -> tuple[bool, bool]:
@@ -157,7 +157,7 @@ def ray_crossings(
     return parity, False
 
 
-@kernel
+@lean_kernel
 def locate_in_polygon(
     xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
 ) -> int:
@@ -182,7 +182,7 @@ def locate_in_polygon(
     return INTERIOR if inside else EXTERIOR
 
 
-@kernel
+@lean_kernel
 def point_segment_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """Distance from a point to the closed segment a-b [m]."""
     dx, dy = bx - ax, by - ay
@@ -197,7 +197,7 @@ def point_segment_distance(x: float, y: float, ax: float, ay: float, bx: float, 
     return abs((ay - y) * dx - (ax - x) * dy) / np.sqrt(square)
 
 
-@kernel
+@lean_kernel
 def polygon_distance(
     xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
 ) -> float:
@@ -219,7 +219,7 @@ def polygon_distance(
     return best
 
 
-@kernel
+@lean_kernel
 def boundary_distance_below(
     xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
 ) -> float:
@@ -248,7 +248,7 @@ def boundary_distance_below(
     return best
 
 
-@kernel
+@lean_kernel
 def ring_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between two convex rings (V, 2), counter-clockwise; 0 when they share a point."""
     if convex_intersect(a, b):
@@ -274,7 +274,7 @@ def ring_distance(a: FloatArray, b: FloatArray) -> float:
     return best
 
 
-@kernel
+@lean_kernel
 def project_on_polyline(
     xy: FloatArray, arc: FloatArray, start: int, stop: int, x: float, y: float
 ) -> float:
@@ -304,7 +304,7 @@ def project_on_polyline(
     return found
 
 
-@kernel
+@lean_kernel
 def point_on_polyline(
     xy: FloatArray, arc: FloatArray, start: int, stop: int, distance: float
 ) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import (
     EXTERIOR,
     INTERIOR,
@@ -167,7 +167,7 @@ def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntAr
     return ptr, items
 
 
-@kernel
+@lean_kernel
 def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
     """Write the polygons that hold a point in their interior into `out`, ascending.
 
@@ -195,7 +195,7 @@ def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
     return found
 
 
-@kernel
+@lean_kernel
 def contains(polygons: Polygons, poly: int, x: float, y: float) -> bool:
     """Whether polygon `poly` holds a point in its interior; the boundary does not count."""
     if (
@@ -215,14 +215,14 @@ def in_any(polygons: Polygons, x: float, y: float) -> bool:
     return containing(polygons, x, y, np.empty(0, np.int64)) > 0
 
 
-@kernel
+@lean_kernel
 def distance_to(polygons: Polygons, poly: int, x: float, y: float) -> float:
     """Distance from a point to polygon `poly`, 0 inside [m]."""
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
     return polygon_distance(polygons.xy, polygons.ring_ptr, first, last, x, y)
 
 
-@kernel
+@lean_kernel
 def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, float]:
     """The polygon nearest to a point and its distance [m]; (-1, inf) when none is within `limit`.
 
@@ -231,7 +231,7 @@ def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, 
     return nearest_of(polygons, 0, len(polygons.bounds), x, y, limit)
 
 
-@kernel
+@lean_kernel
 def nearest_of(
     polygons: Polygons, first: int, stop: int, x: float, y: float, limit: float
 ) -> tuple[int, float]:
@@ -249,7 +249,7 @@ def nearest_of(
     return found, best
 
 
-@kernel
+@lean_kernel
 def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
     """Whether polygon `poly` shares a point with a convex ring (V, 2), counter-clockwise [m]."""
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
@@ -271,7 +271,7 @@ def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
     return False
 
 
-@kernel
+@lean_kernel
 def _in_convex(ring: FloatArray, x: float, y: float) -> bool:
     """Whether a point lies in a convex ring (V, 2), counter-clockwise, or on it."""
     for corner in range(len(ring)):

@@ -8,13 +8,13 @@ distance from the origin, UTM coordinates included.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, kernel, lean_kernel
 
 _SPLITTER = 134217729.0  # 2**27 + 1
 _ERROR_BOUND = 3.3306690738754716e-16  # (3 + 16 eps) eps, eps = 2**-53
 
 
-@kernel
+@lean_kernel
 def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
     """Side of the directed line a -> b on which c lies: 1 left, -1 right, 0 exactly on it."""
     left = (ax - cx) * (by - cy)
@@ -48,7 +48,7 @@ def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy
     return 0
 
 
-@kernel
+@lean_kernel
 def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
     high = a * b
     a_big = _SPLITTER * a
@@ -62,7 +62,7 @@ def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
     return _grow(expansion, size, high)
 
 
-@kernel
+@lean_kernel
 def _grow(expansion: FloatArray, size: int, value: float) -> int:
     carry = value
     for index in range(size):
