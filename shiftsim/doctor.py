@@ -14,7 +14,6 @@ from typing import Any
 from shiftsim.config import default_workers
 
 REFERENCE = Path(__file__).parent / "reference"
-MEMORY_PER_WORKER = 0.4e9  # bytes, without torch
 
 Advance = Callable[[int, int, str], None]
 
@@ -85,14 +84,12 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         cases += report.num_cases
         mismatches += report.mismatches
     advance(len(folders), len(folders), "")
-    cores, memory = default_workers(), _memory()
-    fitting = int(memory / 2 / MEMORY_PER_WORKER) if memory else cores
     return Diagnosis(
         versions=versions(),
         torch=_torch(),
-        cores=cores,
-        memory=memory,
-        workers=max(1, min(cores, fitting)),
+        cores=default_workers(memory_each=1.0),
+        memory=_memory(),
+        workers=default_workers(),
         kernel_cache=str(vars(numba.config)["CACHE_DIR"]),
         seconds=perf_counter() - began,
         cases=cases,
@@ -112,5 +109,7 @@ def _torch() -> str:
         import torch
     except ImportError:
         return "not installed (learned planners: pip install 'shiftsim[learned]')"
-    cuda = f"CUDA {torch.version.cuda}" if torch.cuda.is_available() else "no CUDA device"
-    return f"{torch.__version__}, {cuda}"
+    if not torch.cuda.is_available():
+        return f"{torch.__version__}, no CUDA device"
+    names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return f"{torch.__version__}, CUDA {torch.version.cuda}: {', '.join(names)}"
