@@ -1,7 +1,9 @@
 """PLUTO: a network proposes trajectories along reference lines, rules choose among them.
 
-Official checkpoint: `pluto_1M_aux_cil.ckpt` of jchengai/pluto (planner-pluto.md §1). Here one
-step is put together; everything that belongs to one stage of it is in the `pluto_*` modules.
+Here one step is put together; what belongs to one stage of it is in the `pluto_*` modules. Where
+the official planner would fail (planner-pluto.md §8), this one goes on and says so: without a
+reference line it drives the trajectory that needs none; with a history shorter than 2 s the missing
+samples are masked.
 """
 
 from collections.abc import Sequence
@@ -12,10 +14,10 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry import boxes_to_corners
-from shiftsim.planner import Observation, SceneInfo
+from shiftsim.planner import History, Observation, SceneInfo
 from shiftsim.planners.checkpoint import load_weights
 from shiftsim.planners.device import resolve_device
-from shiftsim.planners.features import AgentFeatures, PerMap, agent_features
+from shiftsim.planners.features import SAMPLES, AgentFeatures, PerMap, agent_features
 from shiftsim.planners.features_map import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned import LearnedPlanner
 from shiftsim.planners.pdm_parameters import STEP_US
@@ -46,13 +48,15 @@ from shiftsim.planners.pluto_world import (
     red_lights,
     static_objects,
 )
-from shiftsim.planners.route_correction import RouteCorrector, known_blocks
+from shiftsim.planners.route_correction import RouteCorrector
 from shiftsim.state import VX, VY, Trajectory
 
 RADIUS = 120.0  # m, of agents and map
 MAX_AGENTS = 48
 START_HALF_SIDE = 2.5  # m, of the square in which the route's start is looked for
-NO_LINE = "no reference line near the ego: the reference-free trajectory is driven"
+NO_LINE = (
+    "no lane of the route is near the ego and fits its heading, the reference-free plan is driven"
+)
 
 _areas_of = PerMap(map_areas)
 
@@ -132,12 +136,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         self.choice: Choice | None = None
 
     def reset(self, scene: SceneInfo) -> None:
-        """Look up the route; it is corrected at the first step.
-
-        Raises:
-            PlannerError: The route is empty or unknown to the map.
-        """
-        self._blocks = known_blocks(scene.map, scene.route, scene.token, self.name)
+        """Look up the route; it is corrected at the first step."""
+        index = scene.map.blocks.index
+        self._blocks = [index[name] for name in dict.fromkeys(scene.route) if name in index]
         self._scene, self._lights = scene, LightLookup(scene.map)
         self.route = self.sight = self.choice = None
         self.degraded = ""
@@ -150,8 +151,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         road, history = scene.map, observation.history
         ego, center = history.ego[-1], observation.ego.center
         if self.route is None:
-            corrected = RouteCorrector(road, self._blocks, START_HALF_SIDE).at(ego[:3])
-            self.route = route_lanes(road, _areas_of(road), corrected)
+            self.route = route_lanes(road, _areas_of(road), self._corrected(ego[:3]))
         route = self.route
         drivable = drivable_near(road, route, center[0], center[1])
         static = static_objects(history.tracks, drivable, center[0], center[1])
@@ -161,6 +161,24 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
         self.sight = Sight(drivable, static, lines, agents, near)
         return scene_inputs(ego, agents, near, static, line_features(lines, ego[:3]))
+
+    def _corrected(self, rear: FloatArray) -> tuple[int, ...]:
+        """Blocks of the corrected route; none where none of the route is on the map."""
+        assert self._scene is not None
+        if not self._blocks:
+            return ()
+        return RouteCorrector(self._scene.map, self._blocks, START_HALF_SIDE).at(rear)
+
+    def _why_makeshift(self, history: History) -> str:
+        """Why the official planner would fail here; empty where it would not."""
+        if not self._blocks:
+            return "the scenario has no route on the map"
+        assert self.sight is not None
+        if not self.sight.lines:
+            return NO_LINE  # planner-pluto.md §8
+        if len(history.ego) < SAMPLES:
+            return f"the history has {len(history.ego)} samples, not {SAMPLES}"
+        return ""
 
     def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
         """One forward pass."""
@@ -186,10 +204,8 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         assert self.sight is not None
         assert self._scene is not None
         rear = observation.history.ego[-1, :3]
-        self.degraded, self.choice = "", None
+        self.degraded, self.choice = self._why_makeshift(observation.history), None
         if not self.sight.lines:
-            # the official code fails here (planner-pluto.md §8)
-            self.degraded = NO_LINE
             free = headings_of(output.ref_free_trajectory)
             return _plan(to_map(free, rear), observation)
         self.choice = choice = self._choose(output, observation)

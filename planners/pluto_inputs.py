@@ -45,6 +45,11 @@ class SceneInputs(NamedTuple):
     line_valid: Array
 
 
+_OF_MAP = SceneInputs._fields[
+    SceneInputs._fields.index("points") : SceneInputs._fields.index("point_valid") + 1
+]
+
+
 def scene_inputs(
     ego: FloatArray,
     agents: AgentFeatures,
@@ -112,12 +117,12 @@ def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
     import torch
 
     out = []
-    for arrays in zip(*scenes, strict=True):
-        batch = arrays[0][None]
-        if len(arrays) > 1:
-            shape = np.max([array.shape for array in arrays], axis=0)
-            batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
-            for row, array in zip(batch, arrays, strict=True):
-                row[tuple(slice(size) for size in array.shape)] = array
-        out.append(torch.from_numpy(np.ascontiguousarray(batch)).to(device))
+    for name, *arrays in zip(SceneInputs._fields, *scenes, strict=True):
+        shape = np.max([array.shape for array in arrays], axis=0)
+        if name in _OF_MAP:
+            shape[0] = max(shape[0], 1)  # the network does not work without any
+        batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
+        for row, array in zip(batch, arrays, strict=True):
+            row[tuple(slice(size) for size in array.shape)] = array
+        out.append(torch.from_numpy(batch).to(device))
     return out
