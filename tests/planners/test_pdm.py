@@ -7,7 +7,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import cruise_scenario, standing_tracks, straight_road
+from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straight_road
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.planners import load_planner
@@ -116,6 +116,26 @@ def test_moving_the_whole_world_moves_the_plan(seed):
     _, other = one_step(there)
     np.testing.assert_allclose(other.scores.total, step.scores.total, atol=1e-9)
     np.testing.assert_allclose(other.poses - [*shift, 0.0], step.poses, atol=1e-9)
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.5, -2.2, 3.0]))
+def test_turning_the_whole_world_turns_the_plan(seed, angle):
+    # random objects are neither exactly ahead, where bearings may be NaN, nor at equal distances
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(30, 60, 3), rng.uniform(-3, 6, 3), rng.uniform(-3, 3, 3)])
+    scenario = scenario_with(poses, [VEHICLE, PEDESTRIAN, CONE])
+    scenario.tracks.velocities[:, :2] = rng.uniform(-3.0, 3.0, (2, 2))
+    shift = np.array([512.0, -2048.0])
+
+    _, step = one_step(scenario)
+    _, other = one_step(moved(scenario, angle, shift))
+
+    assert (other.best, other.braked) == (step.best, step.braked)
+    np.testing.assert_allclose(other.scores.total, step.scores.total, atol=1e-9)
+    expected = moved_poses(step.poses, angle, shift)
+    np.testing.assert_allclose(other.poses[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(np.sin(other.poses[:, 2] - expected[:, 2]), 0.0, atol=1e-9)
 
 
 def test_errors_name_what_to_mend():
