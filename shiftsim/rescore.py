@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from shiftsim.bundle import open_run_store
 from shiftsim.config import default_workers, make_config
 from shiftsim.errors import DataError
 from shiftsim.executors import Outcome, map_unordered
@@ -90,7 +91,7 @@ def rescore(
     """
     for metric in metrics:
         load_metric(metric)
-    folder = _same_store(run, store)
+    folder = open_run_store(run, store).path.resolve()
     determining = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
@@ -113,7 +114,7 @@ def rescore(
         target,
         config=config,
         split=run.manifest["split"],
-        store=folder,
+        store=Path(run.manifest["store"]) if store is None else folder,
         determining=determining,
         argv=argv,
     )
@@ -144,23 +145,6 @@ def _code(simulated: str) -> str:
 
 def _same(rescorer: Rescorer) -> Rescorer:
     return rescorer
-
-
-def _same_store(run: Run, store: str | None) -> Path:
-    from shiftsim.data.store import open_store
-
-    path = Path(store or run.manifest["store"])
-    if not path.exists():
-        raise DataError(
-            f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint="say where it is with --store",
-        )
-    if open_store(path).hash != run.manifest["determining"]["store"]:
-        raise DataError(
-            f"store {str(path)!r} is not the one run {run.path.name!r} was made with",
-            hint="name the right one with --store, or run again",
-        )
-    return path.resolve()
 
 
 def _lost(outcome: Outcome[Task, TaskResult]) -> TaskResult:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from shiftsim.bundle import write_bundle
 from shiftsim.config import make_config
 from shiftsim.errors import DataError
 from shiftsim.executors import Outcome, map_unordered
@@ -95,6 +96,10 @@ def _execute(
         if interrupted and prepared.before == "complete":
             raise KeyboardInterrupt
         state = "interrupted" if interrupted else "finished"
+        if prepared.config.bundle:
+            store = open_named_store(str(prepared.runner.store))
+            tokens = {task.token for task in prepared.tasks}
+            manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
         lacking = set(prepared.missing)
         run = writer.finish(
             {**manifest, "state": state, "ended": now()},

@@ -136,12 +136,12 @@ def _gallery(
     seed: list[int] | None,
     store: str | None,
 ) -> "Gallery":
+    from shiftsim.bundle import open_run_store
     from shiftsim.results import open_run
-    from shiftsim.runner import open_named_store
     from shiftsim.viewer.build import Choice, Gallery
 
     opened = [open_run(path) for path in runs]
-    found = open_named_store(store or opened[0].manifest["store"])
+    found = open_run_store(opened[0], store)
     choice = Choice(tuple(planner or ()), tuple(noise or ()), tuple(seed or ()))
     return Gallery(opened, found, choice)
 

@@ -21,6 +21,7 @@ ROUNDS = int(os.environ.get("KILL_ROUNDS", "2"))
 SECONDS = float(os.environ.get("KILL_SECONDS", "2"))
 PER_TASK = 0.1  # s, of drivers:Slow
 TABLES = ("scores.parquet", "metrics.parquet")
+PATH = [path for path in [os.environ.get("PYTHONPATH")] if path]
 SIGNS = ("manifest.json", JOURNAL, ".tasks.parquet.tmp", "scores.parquet")
 PATIENCE = 60 + 20 * SECONDS
 
@@ -49,7 +50,7 @@ def start(folder, name, *more, seeds=0):
         cwd=folder,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(HERE)},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE), *PATH])},
     )
 
 
