@@ -5,13 +5,14 @@ The LQR tracker reads the poses only; perfect tracking reads the rest too.
 
 import numpy as np
 
-from shiftsim import state
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray
 from shiftsim.planner import History
-from shiftsim.state import NUM_STATE, Trajectory
+from shiftsim.state import AY, HEADING, NUM_STATE, VX, Trajectory
 
 STEP = 0.1  # s, between poses of a plan
-_HALF = 2  # half window of the derivative filter: five samples, second order
+_WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola through five
+_SLOPE = _WINDOW / 10.0
+_BEND = (_WINDOW**2 - 2.0) / 7.0
 
 
 def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
@@ -23,86 +24,61 @@ def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
 
     Args:
         poses: (H, 3) rear axle x [m], y [m], heading [rad] in the map frame, 0.1 s apart, from
-            0.1 s after the present on.
+            0.1 s after the present on; at least 4.
         history: The last samples, the present one included.
 
     Returns:
         (H + 1) states with log time stamps.
     """
-    present = history.time_us[-1] * 1e-6
-    times = np.arange(0.0, len(poses) * STEP - STEP / 2.0, STEP) + STEP + present
+    past_s = np.asarray(history.time_us * 1e-6, np.float64)
+    times = np.arange(0.0, len(poses) * STEP - STEP / 2.0, STEP) + STEP + past_s[-1]
     states = np.zeros((len(poses) + 1, NUM_STATE))
     states[0] = history.ego[-1]
     states[1:, :3] = poses
-    _fill_motion(history.ego, history.time_us * 1e-6, times, states)
+    states[1:, VX : AY + 1] = _motion(history.ego[:, :3], past_s, states[:, :3], times)
     time_us = np.empty(len(states), np.int64)
     time_us[0] = history.time_us[-1]
     time_us[1:] = times * 1e6  # nuPlan: truncated, a microsecond may be lost
     return Trajectory(time_us, states)
 
 
-@kernel
-def _fill_motion(past: FloatArray, past_s: FloatArray, times: FloatArray, out: FloatArray) -> None:
-    """Write velocities and accelerations of the plan into rows 1… of `out` (H + 1, 11)."""
-    count = len(past)
-    step = past_s[-1] - past_s[-2] if count > 1 else STEP
-    planned = int(np.ceil((times[-1] + 1e-6 - past_s[-1]) / step)) - 1
-    total = count + planned
-    samples, seconds = np.empty((total, 3)), np.empty(total)
-    samples[:count], seconds[:count] = past[:, :3], past_s
-    for index in range(planned):
-        seconds[count + index] = past_s[-1] + (index + 1) * step
-        _interpolate(past_s[-1], times, out, seconds[count + index], samples[count + index])
-    spacing = (seconds[-1] - seconds[0]) / (total - 1)
-    motion = np.empty((planned, 4))
-    for index in range(planned):
-        _derive(samples, count + index, spacing, motion[index])
-    for index in range(len(times)):
-        _interpolate_motion(seconds[count:], motion, times[index], out[index + 1])
+def _motion(
+    past: FloatArray, past_s: FloatArray, planned: FloatArray, times: FloatArray
+) -> FloatArray:
+    """(H, 4) velocity and acceleration of a plan, each forward and to the right.
+
+    Args:
+        past: (N, 3) poses of the history.
+        past_s: (N,) their times [s].
+        planned: (H + 1, 3) poses of the plan, from the present on.
+        times: (H,) times of the planned poses behind the present [s].
+    """
+    now = past_s[-1]
+    step = now - past_s[-2] if len(past) > 1 else STEP
+    count = int(np.ceil((times[-1] + 1e-6 - now) / step)) - 1
+    if count < len(_WINDOW):  # after a gap in the recording
+        step, count = STEP, len(times)
+    grid = now + step * np.arange(1, count + 1)
+    even = _interpolate(grid, np.concatenate([[now], times]), planned)
+    samples = np.concatenate([past[:, :2], even[:, :2]])
+    spacing = (grid[-1] - past_s[0]) / (len(samples) - 1)
+    index = np.arange(len(past), len(samples))
+    center = np.clip(index, 2, len(samples) - 3)  # the first and last window serve their ends
+    window = samples[center[:, None] + _WINDOW] - samples[center, None]
+    bend = np.einsum("k,nkc->nc", _BEND, window) / spacing**2
+    ahead = (index - center)[:, None] * spacing
+    slope = np.einsum("k,nkc->nc", _SLOPE, window) / spacing + bend * ahead
+    cos, sin = np.cos(even[:, HEADING]), np.sin(even[:, HEADING])
+    parts = []
+    for x, y in (slope.T, bend.T):
+        parts += [x * cos + y * sin, x * sin - y * cos]  # nuPlan: positive to the right
+    return _interpolate(times, grid, np.stack(parts, axis=1))
 
 
-@kernel
-def _interpolate(
-    start: float, times: FloatArray, states: FloatArray, now: float, out: FloatArray
-) -> None:
-    """Pose between the states at `start` and `times`; the last step goes on beyond its end."""
-    after = min(max(int(np.searchsorted(times, now)), 0), len(times) - 1)
-    before = start if after == 0 else times[after - 1]
-    along = (now - before) / (times[after] - before)
-    for column in range(3):
-        first, last = states[after, column], states[after + 1, column]
-        out[column] = first + along * (last - first)
-
-
-@kernel
-def _derive(samples: FloatArray, index: int, spacing: float, out: FloatArray) -> None:
-    """Velocity and acceleration, forward and to the right, of a parabola through five samples."""
-    center = max(min(index, len(samples) - 1 - _HALF), _HALF)
-    ahead = (index - center) * spacing
-    slope, bend = np.zeros(2), np.zeros(2)
-    for axis in range(2):
-        for k in range(-_HALF, _HALF + 1):
-            value = samples[center + k, axis] - samples[center, axis]
-            slope[axis] += k * value / (10.0 * spacing)
-            bend[axis] += (k * k - 2.0) * value / (7.0 * spacing * spacing)
-        slope[axis] += bend[axis] * ahead
-    cos, sin = np.cos(samples[index, 2]), np.sin(samples[index, 2])
-    out[0] = slope[0] * cos + slope[1] * sin
-    out[1] = slope[0] * sin - slope[1] * cos  # nuPlan: positive to the right
-    out[2] = bend[0] * cos + bend[1] * sin
-    out[3] = bend[0] * sin - bend[1] * cos
-
-
-@kernel
-def _interpolate_motion(
-    seconds: FloatArray, motion: FloatArray, now: float, out: FloatArray
-) -> None:
-    """Motion at a time; the first and the last step go on beyond their ends."""
-    if len(seconds) < 2:
-        out[state.VX : state.AY + 1] = motion[0]
-        return
-    after = min(max(int(np.searchsorted(seconds, now)), 1), len(seconds) - 1)
-    along = (now - seconds[after - 1]) / (seconds[after] - seconds[after - 1])
-    for column in range(4):
-        first, last = motion[after - 1, column], motion[after, column]
-        out[state.VX + column] = first + along * (last - first)
+def _interpolate(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """Rows of `values` between the knots; the outer steps go on beyond their ends."""
+    after = np.clip(np.searchsorted(knots, at), 1, len(knots) - 1)
+    before = after - 1
+    along = (at - knots[before]) / (knots[after] - knots[before])
+    out: FloatArray = values[before] + along[:, None] * (values[after] - values[before])
+    return out
