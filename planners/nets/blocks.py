@@ -301,9 +301,9 @@ class PointsEncoder(nn.Module):
         lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
         size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
         first, second = _folded(self.first_mlp), _folded(self.second_mlp)
-        parts = zip(lines.split(size), valid.split(size), strict=True)
+        parts = zip(torch.split(lines, size), torch.split(valid, size), strict=True)
         encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
-        return encoded.unflatten(0, keep.shape[:2])
+        return encoded.reshape(*keep.shape[:2], encoded.shape[1])
 
 
 class _FoldedMlp(NamedTuple):
