@@ -16,18 +16,17 @@ from shiftsim.geometry import boxes_to_corners
 from shiftsim.map import NONE, VectorMap
 from shiftsim.planner import Observation, SceneInfo
 from shiftsim.planners.carl_raster import Picture
+from shiftsim.planners.carl_roads import Roads, make_roads
 from shiftsim.planners.carl_view import (
     CHANNELS,
     LIGHT_VALUES,
     SIZE,
     Boxes,
-    Roads,
     Room,
     draw_ego,
     draw_objects,
     draw_roads,
     find_areas,
-    make_roads,
     make_room,
     picture_frame,
 )

@@ -8,19 +8,11 @@ roads in the order in which nuPlan's spatial index yields them.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry import box_corners
-from shiftsim.layers import (
-    Lists,
-    Polygons,
-    Polylines,
-    index_polygons,
-    make_polylines,
-    meets_convex,
-)
-from shiftsim.map import NONE, VectorMap
+from shiftsim.layers import Polygons, meets_convex
+from shiftsim.map import NONE
 from shiftsim.planners.carl_raster import (
     Crossings,
     Picture,
@@ -29,7 +21,7 @@ from shiftsim.planners.carl_raster import (
     fill_box,
     make_crossings,
 )
-from shiftsim.planners.pdm_areas import index_ranks
+from shiftsim.planners.carl_roads import CHUNK, MAX_SPEED, YES, Lines, Roads, Values, level
 from shiftsim.state import LAST_AGENT_KIND, AgentKind
 
 SIZE = 256  # pixels along each side
@@ -41,61 +33,12 @@ CHANNELS = (
     *("vehicles", "pedestrians_and_static", "ego"),
 )
 DRIVABLE, ROUTE, BOUNDARIES, LIGHTS, _STOPS, LIMITS, VEHICLES, PEDESTRIANS, EGO = range(9)
-YES, STANDING = 255, 127
-MAX_SPEED, MAX_WALK = 30.0, 4.0  # m/s
+STANDING = 127
+MAX_WALK = 4.0  # m/s
 LIGHT_VALUES = np.array([80, 170, 255, 0], np.uint8)  # by LightStatus; 0 is not drawn
-_CHUNK = 16  # segments of a line that are left out together where they cannot be seen
 
-_VEHICLE, _PEDESTRIAN, _BICYCLE = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE
+_PEDESTRIAN = AgentKind.PEDESTRIAN
 _LAST_AGENT = LAST_AGENT_KIND
-
-Values = NDArray[np.uint8]
-
-
-class Lines(NamedTuple):
-    """Polylines in chunks that are left out together where they cannot be seen.
-
-    Attributes:
-        xy: (V, 2) vertices [m].
-        ptr: (M + 1,) first vertex of each line.
-        chunk_ptr: (M + 1,) first chunk of each line.
-        circles: (C, 3) a circle around each chunk: x, y, radius [m].
-    """
-
-    xy: FloatArray
-    ptr: IntArray
-    chunk_ptr: IntArray
-    circles: FloatArray
-
-
-class Roads(NamedTuple):
-    """The map as CaRL sees it. I areas: roadblocks, roadblock connectors, car parks. E edges.
-
-    Attributes:
-        areas: I polygons.
-        order: (I,) areas in the order of the spatial index.
-        num_roadblocks: How many of the areas are roadblocks.
-        num_blocks: How many are roadblocks or roadblock connectors.
-        block_edges: Edges of a block.
-        intersection_of: (B,) intersection of a block, or NONE.
-        intersections: Polygons.
-        baselines: E lines.
-        limits: (E,) value of the speed limit.
-        border_of: (E, 2) left and right boundary of an edge among `borders`, or NONE.
-        borders: Boundary lines of lanes, each once.
-    """
-
-    areas: Polygons
-    order: IntArray
-    num_roadblocks: int
-    num_blocks: int
-    block_edges: Lists
-    intersection_of: IntArray
-    intersections: Polygons
-    baselines: Lines
-    limits: Values
-    border_of: IntArray
-    borders: Lines
 
 
 class Room(NamedTuple):
@@ -104,10 +47,14 @@ class Room(NamedTuple):
     Attributes:
         ring: (V, 2) pixels of one ring.
         crossings: Of its outline.
+        filled: Areas that are drawn already.
+        drawn: Lines that are drawn already.
     """
 
     ring: IntArray
     crossings: Crossings
+    filled: BoolArray
+    drawn: BoolArray
 
 
 class Boxes(NamedTuple):
@@ -126,91 +73,17 @@ class Boxes(NamedTuple):
     kinds: IntArray
 
 
-def make_roads(road: VectorMap) -> Roads:
-    """Lay out a map."""
-    first, second = road.blocks.polygons, road.car_parks.polygons
-    areas = index_polygons(
-        np.concatenate([first.xy, second.xy]),
-        np.concatenate([first.ring_ptr, second.ring_ptr[1:] + len(first.xy)]),
-        np.concatenate([first.poly_ptr, second.poly_ptr[1:] + len(first.ring_ptr) - 1]),
-    )
-    order = np.argsort(index_ranks(areas.bounds)) if len(areas.bounds) else np.zeros(0, np.int64)
-    intersection_of = np.full(len(road.blocks), NONE)
-    for block in range(road.num_roadblocks, len(road.blocks)):
-        crossed = road.intersection_of[road.block_edges.at(block)]
-        intersection_of[block] = next(iter(crossed[crossed != NONE]), NONE)
-    border_of, borders = _borders(road)
-    return Roads(
-        areas,
-        order,
-        road.num_roadblocks,
-        len(road.blocks),
-        road.block_edges,
-        intersection_of,
-        road.intersections.polygons,
-        _in_chunks(road.baselines),
-        np.array([level(limit, MAX_SPEED) for limit in road.speed_limits.tolist()], np.uint8),
-        border_of,
-        borders,
-    )
-
-
-def _borders(road: VectorMap) -> tuple[IntArray, Lines]:
-    """The boundaries of lanes; neighbours share theirs."""
-    known: dict[bytes, int] = {}
-    lines: list[FloatArray] = []
-    border_of = np.full((len(road.edges), 2), NONE)
-    for side, boundaries in enumerate((road.left_boundaries, road.right_boundaries)):
-        for edge in range(road.num_lanes):
-            line = boundaries.at(edge)
-            if len(line) < 2:
-                continue
-            number = known.setdefault(line.tobytes(), len(lines))
-            if number == len(lines):
-                lines.append(line)
-            border_of[edge, side] = number
-    return border_of, _in_chunks(make_polylines(lines))
-
-
-def _in_chunks(lines: Polylines) -> Lines:
-    segments = np.maximum(np.diff(lines.ptr) - 1, 0)
-    chunk_ptr = np.concatenate([[0], np.cumsum(-(-segments // _CHUNK))])
-    circles = np.empty((chunk_ptr[-1], 3))
-    _surround(lines.xy, lines.ptr, chunk_ptr, circles)
-    return Lines(lines.xy, lines.ptr, chunk_ptr, circles)
-
-
-@kernel
-def _surround(xy: FloatArray, ptr: IntArray, chunk_ptr: IntArray, circles: FloatArray) -> None:
-    """Write a circle around every chunk into `circles` (C, 3)."""
-    for line in range(len(ptr) - 1):
-        for chunk in range(chunk_ptr[line], chunk_ptr[line + 1]):
-            start = ptr[line] + (chunk - chunk_ptr[line]) * _CHUNK
-            stop = min(start + _CHUNK + 1, ptr[line + 1])
-            x = 0.5 * (xy[start:stop, 0].min() + xy[start:stop, 0].max())
-            y = 0.5 * (xy[start:stop, 1].min() + xy[start:stop, 1].max())
-            radius = 0.0
-            for vertex in range(start, stop):
-                radius = max(radius, np.hypot(xy[vertex, 0] - x, xy[vertex, 1] - y))
-            circles[chunk, 0], circles[chunk, 1], circles[chunk, 2] = x, y, radius
-
-
 def make_room(roads: Roads) -> Room:
     """Scratch for a map."""
-    longest = 4
-    for polygons in (roads.areas, roads.intersections):
-        shells = polygons.poly_ptr[:-1]
-        sizes = polygons.ring_ptr[shells + 1] - polygons.ring_ptr[shells]
-        longest = max(longest, *sizes.tolist(), 0)
-    return Room(np.empty((longest, 2), np.int64), make_crossings(SIZE, longest))
-
-
-@kernel
-def level(value: float, highest: float) -> int:
-    """127 for zero, 255 for `highest` and more, and for NaN."""
-    if np.isnan(value):
-        return YES
-    return int(127.5 * min(max(value / highest, 0.0), 1.0) + 127.5)
+    shells = roads.areas.poly_ptr[:-1]
+    sizes = roads.areas.ring_ptr[shells + 1] - roads.areas.ring_ptr[shells]
+    longest = max(4, *sizes.tolist())
+    return Room(
+        np.empty((longest, 2), np.int64),
+        make_crossings(SIZE, longest),
+        np.zeros(len(roads.areas.bounds), np.bool_),
+        np.zeros(len(roads.lines.ptr), np.bool_),
+    )
 
 
 @kernel
@@ -288,38 +161,44 @@ def draw_roads(
         on_route: (B,) blocks of the route.
         lights: (E,) value of the light of every connector, 0 where it has none.
     """
-    drawn = np.zeros(len(roads.intersections.bounds), np.bool_)
-    bordered = np.zeros(len(roads.borders.ptr), np.bool_)
+    room.filled[:] = False
+    room.drawn[:] = False
     for area in found:
-        is_block = area < roads.num_blocks
-        if is_block and on_route[area]:
-            _fill_shell(pictures[ROUTE], roads.areas, area, frame, room)
-        if area < roads.num_roadblocks or not is_block:
-            _fill_shell(pictures[DRIVABLE], roads.areas, area, frame, room)
-            continue
-        crossed = roads.intersection_of[area]
-        if crossed != NONE and not drawn[crossed]:
-            drawn[crossed] = True
-            _fill_shell(pictures[DRIVABLE], roads.intersections, crossed, frame, room)
-    for area in found:
-        if area >= roads.num_roadblocks:
-            continue
-        for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
-            edge = roads.block_edges.items[entry]
-            _draw_line_of(pictures[LIMITS], roads.baselines, edge, frame, roads.limits[edge])
-            for side in range(2):
-                border = roads.border_of[edge, side]
-                if border != NONE and not bordered[border]:
-                    bordered[border] = True
-                    _draw_line_of(pictures[BOUNDARIES], roads.borders, border, frame, YES)
-    for area in found:
-        if not roads.num_roadblocks <= area < roads.num_blocks:
-            continue
-        for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
-            edge = roads.block_edges.items[entry]
-            _draw_line_of(pictures[LIMITS], roads.baselines, edge, frame, roads.limits[edge])
-            if lights[edge] > 0:
-                _draw_line_of(pictures[LIGHTS], roads.baselines, edge, frame, lights[edge])
+        for channel in (DRIVABLE, ROUTE):
+            shape = roads.drivable[area] if channel == DRIVABLE else area
+            if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
+                continue
+            if channel == DRIVABLE and (shape == NONE or room.filled[shape]):
+                continue
+            if channel == DRIVABLE:
+                room.filled[shape] = True
+            _fill_shell(pictures[channel], roads.areas, shape, frame, room)
+    for connectors in (False, True):  # lanes first
+        for area in found:
+            if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:
+                continue
+            for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
+                edge = roads.block_edges.items[entry]
+                _draw_edge(pictures, roads, room, frame, edge, lights[edge] if connectors else 0)
+
+
+@kernel
+def _draw_edge(
+    pictures: Picture, roads: Roads, room: Room, frame: FloatArray, edge: int, light: int
+) -> None:
+    for slot in range(4):
+        line = roads.lines_of[edge, slot]
+        channel, value = BOUNDARIES, YES
+        if slot == 0:
+            channel, value = LIMITS, int(roads.limits[edge])
+        elif slot == 3:
+            channel, value = LIGHTS, int(light)
+        elif line != NONE:
+            if room.drawn[line]:
+                continue
+            room.drawn[line] = True
+        if line != NONE and value > 0:
+            _draw_line_of(pictures[channel], roads.lines, line, frame, value)
 
 
 @kernel
@@ -340,13 +219,13 @@ def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, 
     """Draw a line, chunk by chunk."""
     first, last = lines.ptr[line], lines.ptr[line + 1] - 1
     for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
-        start = first + (chunk - lines.chunk_ptr[line]) * _CHUNK
+        start = first + (chunk - lines.chunk_ptr[line]) * CHUNK
         dx, dy = lines.circles[chunk, 0] - frame[0], lines.circles[chunk, 1] - frame[1]
         reach = HALF_SIDE + lines.circles[chunk, 2] + 1.0  # a pixel more than needed
         if abs(frame[2] * dx + frame[3] * dy) > reach or abs(frame[2] * dy - frame[3] * dx) > reach:
             continue
         px, py = _to_pixel(frame, lines.xy[start, 0], lines.xy[start, 1])
-        for vertex in range(start + 1, min(start + _CHUNK, last) + 1):
+        for vertex in range(start + 1, min(start + CHUNK, last) + 1):
             x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
             if x != px or y != py or vertex == start + 1:
                 draw_line(picture, px, py, x, y, value)
@@ -363,17 +242,13 @@ def draw_objects(pictures: Picture, frame: FloatArray, boxes: Boxes, room: Room)
             if (kind > _LAST_AGENT) != is_static or not in_picture(frame, x, y):
                 continue
             speed = np.hypot(boxes.velocities[index, 0], boxes.velocities[index, 1])
-            length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
+            channel, value = VEHICLES, level(speed, MAX_SPEED)
             if is_static:
-                _draw_box(
-                    pictures[PEDESTRIANS], frame, x, y, heading, length, width, STANDING, room
-                )
+                channel, value = PEDESTRIANS, STANDING
             elif kind == _PEDESTRIAN:
-                value = level(speed, MAX_WALK)
-                _draw_box(pictures[PEDESTRIANS], frame, x, y, heading, length, width, value, room)
-            else:
-                value = level(speed, MAX_SPEED)
-                _draw_box(pictures[VEHICLES], frame, x, y, heading, length, width, value, room)
+                channel, value = PEDESTRIANS, level(speed, MAX_WALK)
+            length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
+            _draw_box(pictures[channel], frame, x, y, heading, length, width, value, room)
 
 
 @kernel
