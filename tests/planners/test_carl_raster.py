@@ -16,7 +16,7 @@ from shiftsim.planners.carl_raster import (
     make_crossings,
 )
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "nets" / "carl_shapes.npz"
+GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "opencv_shapes.npz"
 SIZE = 64
 LINE, AREA, BOX = range(3)
 CROSSINGS = make_crossings(SIZE, 100)
