@@ -7,7 +7,7 @@ import numpy as np
 from shiftsim.benchmarks import Track
 from shiftsim.report.groups import TRAFFIC, Group
 from shiftsim.report.paper import distinct_sets
-from shiftsim.report.tables import Table
+from shiftsim.report.tables import Cell, Number, Table
 
 
 def coverage(track: Track, groups: Sequence[Group]) -> Table:
@@ -18,14 +18,22 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
     inside = [group for group in groups if _belongs(group, track)]
     sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
     sets.setdefault(track.reference.name, (track.reference.label, track.reference.count))
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for name, (label, whole) in sets.items():
         for planner in dict.fromkeys(group.planner for group in inside):
             mine = [g for g in inside if (g.data.name, g.planner) == (name, planner)]
             done = sum(_finished(group, track) for group in mine)
             expected = whole * track.rollouts_per_scenario
             verdict = "complete" if done == expected else f"partial ({done}/{expected})"
-            rows.append((label, planner, str(done), str(expected), verdict if done else "not run"))
+            rows.append(
+                (
+                    label,
+                    planner,
+                    Number(done, 0),
+                    Number(expected, 0),
+                    verdict if done else "not run",
+                )
+            )
     lacking = [name for name in track.planners if name not in {g.planner for g in inside}]
     others = f"planners of the paper that are not here: {', '.join(lacking)}" if lacking else ""
     return Table(
@@ -33,7 +41,7 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
         f"Coverage of the track {track.name}",
         ("set", "planner", "rollouts", "of", "verdict"),
         tuple(rows),
-        5,
+        2,
         tuple(
             filter(
                 None,

@@ -66,6 +66,7 @@ def report(
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.config import one_of
     from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
 
@@ -74,13 +75,16 @@ def report(
         say_json([summary(run) for run in opened])
         return
     for name in style or ():
-        one_of_formats(name, FORMATS)
+        one_of("format", name, FORMATS)
     groups = read_groups(opened, (*known_sets(), *own_lists))
     if figures and out is None:
         out = runs[0] / "report"
-    chosen = tuple(table or (TABLES if out else BRIEF))
-    options = Options(chosen, by, published, allow_partial)
-    tables = [*make_tables(groups, published_figures(), options), *extra(groups)]
+    kind = (style or ["text"])[0]
+    default = TABLES if out else ("scores",) if kind == "csv" else BRIEF
+    options = Options(tuple(table or default), by, published, allow_partial)
+    tables = make_tables(groups, published_figures(), options)
+    if not table and options.tables != ("scores",):
+        tables = [*extra(groups), *tables]
     if out is not None:
         from shiftsim.report.figures import figures as draw
 
@@ -88,9 +92,6 @@ def report(
         files = write_report(out, tables, drawn, style or FORMATS)
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
         return
-    kind = (style or ["text"])[0]
-    if kind == "csv" and not table:
-        tables = tables[:1]
     say("\n\n".join(render(one, kind, width=terminal_width()) for one in tables))
     if kind == "text" and not table:
         _say_worst(opened, worst)
@@ -99,13 +100,6 @@ def report(
 def terminal_width() -> int:
     """Columns of the terminal; 0 where the output goes elsewhere."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
-
-
-def one_of_formats(name: str, formats: Sequence[str]) -> None:
-    """Refuse an unknown format."""
-    from shiftsim.config import one_of
-
-    one_of("format", name, formats)
 
 
 def _say_worst(runs: "Sequence[Run]", count: int) -> None:

@@ -17,12 +17,12 @@ from shiftsim.report.writers import ENDINGS, render
 
 # the kinds of tables: names up to the first "_"
 TABLES = (
-    "scores",
     "semantic-shift",
     "noise-robustness",
     "planner-comparison",
     "planner-comparison-noise",
     "scenario-types",
+    "scores",
     "planning-time",
     "data-statistics",
     "benchmark-comparison",
@@ -66,8 +66,6 @@ def make_tables(
     partial = chosen.allow_partial
     beside = published if chosen.beside else None
     out: list[Table | None] = []
-    if "scores" in chosen.tables:
-        out.append(scores(groups, by=chosen.by, allow_partial=partial))
     if "semantic-shift" in chosen.tables:
         out += paper.semantic_shift(groups, published, beside=chosen.beside, allow_partial=partial)
     if "noise-robustness" in chosen.tables:
@@ -78,6 +76,8 @@ def make_tables(
         out.append(details.planner_comparison(groups, noisy=True))
     if "scenario-types" in chosen.tables:
         out += details.scenario_types(groups, allow_partial=partial)
+    if "scores" in chosen.tables:
+        out.append(scores(groups, by=chosen.by, allow_partial=partial))
     if "planning-time" in chosen.tables:
         out.append(details.planning_times(groups))
     out += _data_tables(groups, published, chosen)

@@ -7,7 +7,7 @@ printed, or one that says so.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -128,7 +128,7 @@ def score_table(
     """
     one_of("format", style, FORMATS)
     table = scores(read_groups(runs), by=by, allow_partial=allow_partial)
-    return render(table, style, width=width)
+    return render(replace(table, title=""), style, width=width)
 
 
 def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: bool = False) -> Table:
@@ -141,7 +141,7 @@ def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: boo
             rows += _cells(first, row, allow_partial)
     return Table(
         "scores",
-        "",
+        "All planners and noises, scores x 100",
         (*heading, *COLUMNS.values()),
         tuple(rows),
         len(heading),

@@ -108,7 +108,7 @@ def _plain(cell: Cell) -> str:
     if cell is None or isinstance(cell, str):
         return cell or ""
     if isinstance(cell, Number):
-        return _full(cell.value)
+        return f"{cell.value:.0f}" if cell.digits == 0 else _full(cell.value)
     assert isinstance(cell, Estimate)
     return _full(cell.mean)
 

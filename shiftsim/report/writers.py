@@ -121,12 +121,13 @@ def _latex(table: Table) -> str:
         safe = (f"{{{cell}}}" if cell.startswith("[") else cell for cell in cells)
         return f"  {' & '.join(safe)} \\\\"
 
-    caption = ". ".join(latex_escape(text).rstrip(".") for text in (table.title, *table.notes))
+    notes = "; ".join(latex_escape(note) for note in table.notes)
+    caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
     return "\n".join(
         [
             r"\begin{table}  % needs \usepackage{booktabs}",
             r"\centering",
-            f"\\caption{{{caption}.}}",
+            f"\\caption{{{caption}}}",
             f"\\label{{tab:{table.name}}}",
             f"\\begin{{tabular}}{{{columns}}}",
             r"\toprule",

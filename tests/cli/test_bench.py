@@ -54,7 +54,7 @@ def test_what_is_partial_says_so_everywhere(place):
 
 
 def test_the_folder_of_a_benchmark_is_reported_as_one(place):
-    done = call(place, "report", "runs/b", "-t", "noise-robustness")
+    done = call(place, "report", "runs/b")
     assert done.returncode == 0, done.stderr
     assert "toy (2/4)  NR " in done.stdout
     assert "toy (2/4)  R " in done.stdout
