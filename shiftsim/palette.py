@@ -46,8 +46,16 @@ _OTHERS = (
 
 
 def looks(planners: Iterable[str]) -> dict[str, Look]:
-    """A look per planner; those without one of their own get one by their order."""
-    names = list(dict.fromkeys(planners))
-    unknown = [name for name in names if name not in _KNOWN]
-    given = {name: _OTHERS[i % len(_OTHERS)] for i, name in enumerate(unknown)}
-    return {name: _KNOWN.get(name) or given[name] for name in names}
+    """A look per planner; those without one of their own get one by their order.
+
+    A name may end in a remark, as in `idm (reactive)`; the first of a planner's names gets its look.
+    """
+    out: dict[str, Look] = {}
+    others = 0
+    for name in dict.fromkeys(planners):
+        look = _KNOWN.get(name.partition(" (")[0])
+        if look is None or look in out.values():
+            look = _OTHERS[others % len(_OTHERS)]
+            others += 1
+        out[name] = look
+    return out

@@ -55,7 +55,7 @@ def view(
     debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
-    from shiftsim.viewer.build import page_name
+    from shiftsim.viewer.build import page_name, write_site
 
     gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
     folder = out or run / "view"
@@ -66,11 +66,15 @@ def view(
         page.write_text(gallery.page(token), encoding="utf-8")
     else:
         with progress_bar(quiet=quiet) as advance:
-            tokens = gallery.write(
-                folder, limit=limit, on_progress=lambda done, total: advance(done, total, "")
+            count = write_site(
+                folder,
+                [gallery],
+                title=f"Replays of {run.name}",
+                limit=limit,
+                on_progress=lambda done, total: advance(done, total, ""),
             )
-        left = len(gallery.tokens) - len(tokens)
-        say(f"{plural(len(tokens), 'replay')}{f', {left} more with --limit 0' if left else ''}")
+        left = len(gallery.tokens) - count
+        say(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")
         page = folder / "index.html"
     say(f"written: {page}")
     if browser:

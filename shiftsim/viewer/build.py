@@ -61,7 +61,7 @@ class Gallery:
         self.store = store
         self.choice = choice or Choice()
         self._runs: dict[Task, tuple[Run, Task]] = {}
-        for run in runs:
+        for run, name in zip(runs, _names(runs), strict=True):
             if run.manifest["determining"]["store"] != store.hash:
                 raise DataError(
                     f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
@@ -69,8 +69,8 @@ class Gallery:
                 )
             for task, file in run.rollout_files.items():
                 if file is not None:
-                    shown = task._replace(planner=_unique(task, run, self._runs))
-                    self._runs[shown] = (run, task)
+                    planner = f"{task.planner} ({name})" if name else task.planner
+                    self._runs[task._replace(planner=planner)] = (run, task)
         self._scores = {run.path: _by_task(run.scores.to_pylist()) for run in runs}
         self._metrics = {run.path: _grouped(run.metrics.to_pylist()) for run in runs}
         self._tokens: dict[str, list[Task]] = {}
@@ -80,10 +80,11 @@ class Gallery:
     @property
     def tokens(self) -> list[str]:
         """Scenarios with rollouts to show, the lowest score first."""
-        return sorted(self._tokens, key=lambda token: (self._lowest(token), token))
+        found = [token for token, tasks in self._tokens.items() if self.choice.of(tasks)]
+        return sorted(found, key=lambda token: (self._lowest(token), token))
 
     def _lowest(self, token: str) -> float:
-        return min((self._cls(task) for task in self.choice.of(self._tokens[token])), default=2.0)
+        return min(self._cls(task) for task in self.choice.of(self._tokens[token]))
 
     def _cls(self, task: Task) -> float:
         run, key = self._runs[task]
@@ -134,41 +135,11 @@ class Gallery:
         scenario = self.store.read(token)
         return replay_page(scenario, self.shown(token, scenario), back=back)
 
-    def write(
-        self,
-        folder: Path,
-        *,
-        limit: int = 0,
-        title: str = "Replays",
-        above: str = "",
-        on_progress: Callable[[int, int], None] = lambda done, total: None,
-    ) -> list[str]:
-        """Write one page per scenario and `index.html`; returns the scenarios that have one.
-
-        Args:
-            folder: Where the list goes; the pages go to its subfolder `replay`.
-            limit: At most so many, the lowest scores first; 0 for all.
-            title: Heading of the list.
-            above: HTML between heading and list; the caller escapes what comes from data.
-            on_progress: Called with the number of pages written and their total.
-        """
-        pages = folder / "replay"
-        pages.mkdir(parents=True, exist_ok=True)
-        tokens = [token for token in self.tokens if self.choice.of(self._tokens[token])]
-        tokens = tokens[:limit] if limit else tokens
-        for done, token in enumerate(tokens):
-            page = self.page(token, back="../index.html")
-            (pages / page_name(token)).write_text(page, encoding="utf-8")
-            on_progress(done + 1, len(tokens))
-        listing = list_page(title, self.rows(tokens), above=above)
-        (folder / "index.html").write_text(listing, encoding="utf-8")
-        return tokens
-
-    def rows(self, tokens: Sequence[str]) -> list[dict[str, Any]]:
+    def rows(self, token: str) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""
-        return [self._row(task) for token in tokens for task in self.tasks(token)]
+        return [self._row(task, index) for index, task in enumerate(self.tasks(token))]
 
-    def _row(self, task: Task) -> dict[str, Any]:
+    def _row(self, task: Task, index: int) -> dict[str, Any]:
         run, key = self._runs[task]
         score = self._scores[run.path].get(key, {})
         metrics = self._metrics[run.path].get(key, [])
@@ -186,7 +157,7 @@ class Gallery:
             "seed": task.seed,
             "cls": score.get("cls"),
             "violated": firsts,
-            "index": self.tasks(task.token).index(task),
+            "index": index,
             "page": f"replay/{page_name(task.token)}",
         }
 
@@ -217,9 +188,59 @@ def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "")
     )
 
 
-def _unique(task: Task, run: Run, taken: Mapping[Task, Any]) -> str:
-    """The planner's name; with the run's where two runs drove the same task."""
-    return f"{task.planner} ({run.path.name})" if task in taken else task.planner
+def write_site(
+    folder: Path,
+    galleries: Sequence[Gallery],
+    *,
+    title: str,
+    limit: int = 0,
+    above: str = "",
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Write one page per scenario and `index.html`, which lists them; returns how many pages.
+
+    Args:
+        folder: Where the list goes; the pages go to its subfolder `replay`.
+        galleries: One per store.
+        title: Heading of the list.
+        limit: At most so many pages, the lowest scores first; 0 for all.
+        above: HTML between heading and list; the caller escapes what comes from data.
+        on_progress: Called with the number of pages written and their total.
+    """
+    pages = folder / "replay"
+    pages.mkdir(parents=True, exist_ok=True)
+    found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
+    found = found[:limit] if limit else found
+    rows: list[dict[str, Any]] = []
+    for done, (gallery, token) in enumerate(found):
+        page = gallery.page(token, back="../index.html")
+        (pages / page_name(token)).write_text(page, encoding="utf-8")
+        rows += gallery.rows(token)
+        on_progress(done + 1, len(found))
+    (folder / "index.html").write_text(list_page(title, rows, above=above), encoding="utf-8")
+    return len(found)
+
+
+def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
+    """One gallery per store.
+
+    Args:
+        runs: The runs.
+        stores: The open store of each run.
+        choice: Which rollouts to show.
+    """
+    by_store: dict[str, tuple[Any, list[Run]]] = {}
+    for run, store in zip(runs, stores, strict=True):
+        by_store.setdefault(store.hash, (store, []))[1].append(run)
+    return [Gallery(members, store, choice) for store, members in by_store.values()]
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """What tells the rollouts of each run from those of the others: traffic, or the run's name."""
+    if len(runs) == 1:
+        return [""]
+    traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
+    return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]
 
 
 def _by_task(rows: Sequence[Mapping[str, Any]]) -> dict[Task, Mapping[str, Any]]:

@@ -74,7 +74,9 @@ def _matplotlib() -> Any:
         import matplotlib
 
         matplotlib.use("Agg")
-        matplotlib.rcParams["svg.hashsalt"] = "shiftsim"  # ids in SVG files are then always the same
+        matplotlib.rcParams["svg.hashsalt"] = (
+            "shiftsim"  # ids in SVG files are then always the same
+        )
         from matplotlib import pyplot
     except ImportError as error:
         raise MissingExtraError(

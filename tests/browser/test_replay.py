@@ -9,7 +9,7 @@ from shiftsim.data.store import open_store
 from shiftsim.planners import load_planner
 from shiftsim.simulation import simulate
 from shiftsim.state import AgentKind
-from shiftsim.viewer.build import Gallery, page_name
+from shiftsim.viewer.build import Gallery, page_name, write_site
 from shiftsim.viewer.page import embedded, replay_page
 from shiftsim.viewer.scene import Shown
 
@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
         workers=1,
         out=str(out / "run"),
     )
-    Gallery([run], open_store(store)).write(out)
+    write_site(out, [Gallery([run], open_store(store))], title="toy")
     return out
 
 

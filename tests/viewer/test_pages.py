@@ -13,7 +13,7 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners import load_planner
 from shiftsim.simulation import simulate
 from shiftsim.state import AgentKind
-from shiftsim.viewer.build import Choice, Gallery, list_page, page_name
+from shiftsim.viewer.build import Choice, Gallery, list_page, page_name, write_site
 from shiftsim.viewer.figure import save_figure
 from shiftsim.viewer.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
 from shiftsim.viewer.scene import Shown
@@ -178,11 +178,11 @@ class TestGallery:
         assert [t.seed for t in gallery.tasks(gallery.tokens[0])] == [1]
 
     def test_a_folder_of_pages_links_every_rollout(self, gallery, tmp_path):
-        tokens = gallery.write(tmp_path)
+        count = write_site(tmp_path, [gallery], title="toy")
 
         rows = json.loads(sections((tmp_path / "index.html").read_text())["rows"])
-        assert len(tokens) == 4
-        assert {row["page"] for row in rows} == {f"replay/{page_name(t)}" for t in tokens}
+        assert count == 4
+        assert {row["page"] for row in rows} == {f"replay/{page_name(t)}" for t in gallery.tokens}
         assert all((tmp_path / row["page"]).is_file() for row in rows)
         lowest = min(rows, key=lambda row: row["cls"])
         assert rows[0]["token"] == lowest["token"]
