@@ -56,7 +56,7 @@ def verify_loop(path: Path, report: Report, scenes: Scenes) -> None:
             report.fail("pluto reference lines", f"{file.name} {at}", "none found")
             continue
         _compare_scores(loop, f"{at}/post", choice)
-        if f"{at}/post/cand" in file.arrays:
+        if f"{at}/agent_tokens" in file.arrays:  # one of the iterations stored in full
             _compare_from_stored(loop, f"{at}/post", planner, seen)
         if _may_differ(loop, f"{at}/post", choice.best, int(best[iteration])):
             continue

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.errors import DataError
 from shiftsim.planners.pluto_candidates import headings_of
 from shiftsim.verify.array_file import ArrayFile
 from shiftsim.verify.nets_common import DERIVED_HEADING, FEATURE, OUTPUT, make_network
@@ -34,6 +35,8 @@ def verify_forward(file: ArrayFile) -> None:
 
     variant = str(file["meta/variant"])
     arrays = {name[3:]: file[name] for name in file.arrays if name.startswith("in/")}
+    if missing := [name for name in RAW if f"out/{name}" not in file.arrays]:
+        raise DataError(f"array 'out/{missing[0]}' is missing")
     inputs = network_inputs(arrays)
     network = make_network(NAME, variant, {"misordered_masks": True})
     with torch.inference_mode():
