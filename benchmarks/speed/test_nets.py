@@ -172,7 +172,7 @@ def test_batch_against_one_alone(scenes, loaded, name):
     planner = loaded(name)
     forks, observations = started(planner, [scenes[n] for n in NAMES if n in scenes], BATCH)
     ratios, together_ms = [], []
-    for _ in range(8):
+    for _ in range(5):
         began = process_time()
         for fork, observation in zip(forks, observations, strict=True):
             fork.plan(observation)

@@ -9,7 +9,7 @@ from pathlib import Path
 from shiftsim.config import one_of
 from shiftsim.report import data_tables, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import Group
+from shiftsim.report.groups import Group, made_up_note
 from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
@@ -80,8 +80,17 @@ def make_tables(
         out.append(scores(groups, by=chosen.by, allow_partial=partial))
     if "planning-time" in chosen.tables:
         out.append(details.planning_times(groups))
-    out += _data_tables(groups, published, chosen)
-    return _named_apart([table for table in out if table is not None])
+    made_up = made_up_note(group.run for group in groups)
+    driven = [_noted(table, made_up) for table in out if table is not None]
+    about_data = [table for table in _data_tables(groups, published, chosen) if table is not None]
+    return _named_apart([*driven, *about_data])
+
+
+def _noted(table: Table, note: str) -> Table:
+    """The table with one more note, unless it says so already."""
+    if not note or any(note in other for other in table.notes):
+        return table
+    return replace(table, notes=(*table.notes, note))
 
 
 def _named_apart(tables: Sequence[Table]) -> list[Table]:

@@ -188,6 +188,17 @@ class Group:
         )
 
 
+def made_up_note(runs: Iterable[Run]) -> str:
+    """Which planners drove with deterministic weights, so that no score of theirs is believed."""
+    names = {
+        name
+        for run in runs
+        for name, identity in run.manifest["determining"]["planners"].items()
+        if str(identity.get("checkpoint", "")).startswith("deterministic:")
+    }
+    return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
+
+
 def token_digest(tokens: Iterable[str]) -> str:
     """SHA-256 of a set of tokens, as lists of nuPlan scenarios are identified."""
     return hashlib.sha256("\n".join(sorted(tokens)).encode()).hexdigest()

@@ -15,7 +15,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.config import one_of
 from shiftsim.metrics import MULTIPLIERS
-from shiftsim.report.groups import COLUMNS, Group, KnownSet, read_groups
+from shiftsim.report.groups import COLUMNS, Group, KnownSet, made_up_note, read_groups
 from shiftsim.report.tables import Cell, Number, Table
 from shiftsim.report.writers import FORMATS, render
 from shiftsim.results import Run
@@ -179,10 +179,12 @@ def describe_run(run: Run, group: Group | None = None, known: Sequence[KnownSet]
     data = (group or read_groups([run], known)[0]).data
     determining = run.manifest["determining"]
     split = run.manifest["split"] if data.label == run.manifest["split"] else data.label
+    made_up = made_up_note([run])
     return (
         f"split {split} ({len(data.tokens)} scenarios) · "
         f"traffic {determining['traffic']} · controller {data.controller} · "
         f"thresholds {data.thresholds} · metrics v{data.metric_version} · scores x 100"
+        f"{' · ' * bool(made_up)}{made_up}"
     )
 
 

@@ -6,14 +6,18 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks, straight_road
 
+import shiftsim
 from shiftsim.data import demo_files
 from shiftsim.data.deepplan import convert_dsc3d
 from shiftsim.data.store import open_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners import load_planner
 from shiftsim.planners.contract import check_planner
+from shiftsim.report.build import make_tables
+from shiftsim.report.groups import read_groups
 from shiftsim.simulation import Rollout, simulate, simulate_together
 from shiftsim.state import AgentKind
 
@@ -136,6 +140,20 @@ def test_scenarios_in_lock_step_are_driven_as_each_alone(demo, planners, name):
         np.testing.assert_allclose(log.ego, alone.ego, rtol=0.0, atol=DRIVEN)
         a, b = (compute_metrics(one, scene.map).score for one in (log, alone))
         assert a == pytest.approx(b, abs=OUTPUT)
+
+
+def test_a_run_with_made_up_weights_says_so_beside_its_scores(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_toy_store(tmp_path / "toy", count=2, iterations=6)
+    arguments = {"planner_args": {"plantf": {"checkpoint": "deterministic:drive"}}}
+    run = shiftsim.run("plantf", store="./toy", workers=1, **arguments)
+    marked = "MEANINGLESS: made-up weights of plantf"
+    assert marked in run.table()
+    notes = {table.name: " ".join(table.notes) for table in make_tables(read_groups([run]))}
+    assert marked in notes["scores"]
+    assert marked in notes["planning-time"]
+    honest = shiftsim.run("constant-velocity", store="./toy", workers=1)
+    assert "MEANINGLESS" not in honest.table()
 
 
 def crowd(scene, count):
