@@ -1,7 +1,8 @@
 """How planners look in every picture: a colour, a marker and a dash of their own.
 
-The colours stay apart under the common kinds of colour-blindness; in grey, where some come close,
-marker and dash tell them apart.
+The colours of the known planners were searched for being far apart in every pair: at least 18 in
+CIELAB to normal eyes and under all kinds of colour-blindness, at least 6 in lightness in grey.
+Markers, and dashes where lines are drawn, tell planners apart without any colour.
 """
 
 from collections.abc import Iterable
@@ -26,14 +27,14 @@ class Look:
 # the planners of the paper in its colours' names: log grey, CaRL blue, Diffusion Planner orange,
 # PLUTO red, PlanTF purple, PDM-Closed green
 _KNOWN = {
-    "log-future": Look("#6e6e6e", "o"),
-    "carl": Look("#0b62c4", "s"),
-    "diffusion-planner": Look("#e08a00", "^"),
-    "pluto": Look("#c4121a", "D"),
-    "plantf": Look("#7a3fa8", "v"),
-    "pdm-closed": Look("#12855a", "P"),
-    "idm": Look("#2fa8d5", "X"),
-    "constant-velocity": Look("#7c5a1e", "*"),
+    "log-future": Look("#787878", "o"),
+    "carl": Look("#125ced", "s"),
+    "diffusion-planner": Look("#f09a1e", "^"),
+    "pluto": Look("#840e17", "D"),
+    "plantf": Look("#411e6d", "v"),
+    "pdm-closed": Look("#2d9b62", "P"),
+    "idm": Look("#26576c", "X"),
+    "constant-velocity": Look("#bf9647", "*"),
 }
 _OTHERS = (
     Look("#c2569a", "o", (6, 2)),
@@ -48,7 +49,7 @@ _OTHERS = (
 def looks(planners: Iterable[str]) -> dict[str, Look]:
     """A look per planner; those without one of their own get one by their order.
 
-    A name may end in a remark, as in `idm (reactive)`; the first of a planner's names gets its look.
+    A name may end in a remark, as in `idm (reactive)`; the first of these has the planner's look.
     """
     out: dict[str, Look] = {}
     others = 0
