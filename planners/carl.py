@@ -169,12 +169,14 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
             self._light_names = lights.connector_ids
             index = road.edges.index
             self._light_edges = np.array([index.get(i, NONE) for i in lights.connector_ids], int)
+        values = np.zeros(len(road.edges), np.uint8)
+        if not lights.connector_ids:
+            return values
         status = lights.status[0]
         lit = (self._light_edges >= road.num_lanes) & (status != LightStatus.ABSENT)
         edges, status = self._light_edges[lit], status[lit]
         # an unknown status, at which the official code fails, is not drawn
         self._unknown_lights = edges[status == LightStatus.UNKNOWN]
-        values = np.zeros(len(road.edges), np.uint8)
         values[edges] = LIGHT_VALUES[status]
         return values
 
@@ -199,7 +201,8 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         """Why the official code would have failed at the picture; empty where it would not."""
         if not len(self.found):
             return "no road within the picture"
-        if np.isin(road.block_of[self._unknown_lights], self.found).any():
+        unknown = self._unknown_lights
+        if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
             return "a light in the picture has an unknown status"
         return ""
 

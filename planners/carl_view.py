@@ -227,7 +227,10 @@ def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, 
         px, py = _to_pixel(frame, lines.xy[start, 0], lines.xy[start, 1])
         for vertex in range(start + 1, min(start + CHUNK, last) + 1):
             x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
-            if x != px or y != py or vertex == start + 1:
+            if vertex > start + 1 and abs(x - px) <= 1 and abs(y - py) <= 1:
+                if 0 <= x < SIZE and 0 <= y < SIZE:  # the pixel before is drawn already
+                    picture[y, x] = value
+            else:
                 draw_line(picture, px, py, x, y, value)
             px, py = x, y
 
