@@ -15,6 +15,7 @@ POSITION = 7  # x, y, cos, sin, and one-hot agent, static object, lane
 TOKENS, CHANNELS = 64, 128  # inside the mixers
 MIDDLE = 10  # point of a lane that stands for its position
 NO_KEY = float("-inf")
+TOGETHER = 16  # rows that pass through the mixers at a time: what they make stays in the cache
 
 
 class MixerEncoder(nn.Module):
@@ -31,6 +32,11 @@ class MixerEncoder(nn.Module):
 
     def mean(self, x: Tensor) -> Tensor:
         """(N, samples, columns) to (N, CHANNELS)."""
+        if x.is_cuda or len(x) <= TOGETHER:
+            return self._mean(x)
+        return torch.cat([self._mean(part) for part in torch.split(x, TOGETHER)])
+
+    def _mean(self, x: Tensor) -> Tensor:
         x = self.token_pre_project.over_rows(self.channel_pre_project(x))
         for block in self.blocks[:-1]:
             x = block(x)

@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from shiftsim.errors import CheckpointError
 from shiftsim.planners.nets.diffusion_decoder import DiT, Prepared
 from shiftsim.planners.nets.diffusion_encoder import SceneEncoder
 from shiftsim.planners.nets.diffusion_sampler import SCHEDULE, STATE, sample
 
+ROWS = 4  # of agents; a matrix product of 12 rows is faster than one of 11
 PREFIXES = ("module.",)  # of the official file; left by distributed training
 _XY = ([10.0, 0.0], [20.0, 20.0])  # mean and std [m]
 
@@ -51,6 +53,7 @@ DEFAULT_ARGS: Mapping[str, Any] = {
     },
 }
 
+_FIXED = {name for name in DEFAULT_ARGS if name.endswith(("_num", "_len"))}  # by the features
 _FINAL = "decoder.decoder.dit.final_layer.proj.4"
 _DRIVE_AMPLITUDES = (0.3, 0.05, 0.0, 0.05)
 _DRIVE_STEP, _DRIVE_OFFSET, _DRIVE_SCALE = 0.6, 10.0, 20.0  # m per step; x is stored (x - 10) / 20
@@ -157,15 +160,22 @@ class DiffusionNetwork(nn.Module):
         """
         scene = self.normalise(inputs)
         current, absent = self.present(scene)
+        if len(noise) == 1:
+            current, absent, noise = (_padded(part) for part in (current, absent, noise))
         prepared = self.prepare(scene, absent)
         dit = self.dit[0]
-        return self.denormalise(
-            sample(lambda x, call: dit(x, prepared, call), current, noise)[:, :, 1:]
-        )
+        states = sample(lambda x, call: dit(x, prepared, call), current, noise)
+        return self.denormalise(states[:, : self.num_agents, 1:])
 
     def denormalise(self, states: Tensor) -> Tensor:
         """(..., 4) x, y [m], cos, sin of normalised ones."""
         return states * self.state_normaliser.std + self.state_normaliser.mean
+
+
+def _padded(x: Tensor) -> Tensor:
+    """(B, A, ...) with rows added up to a multiple of `ROWS`: zeros, or True in a mask."""
+    missing = (len(x), -x.shape[1] % ROWS, *x.shape[2:])
+    return torch.cat([x, torch.full(missing, x.dtype == torch.bool).to(x)], dim=1)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
@@ -173,8 +183,36 @@ def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
 
     Args:
         args: Content of the checkpoint's args.json; None for the official dimensions.
+
+    Raises:
+        CheckpointError: The settings lack something, or are of a network that reads other features.
     """
-    return DiffusionNetwork({**DEFAULT_ARGS, **(args or {})})
+    if args is not None:
+        _check(args)
+    return DiffusionNetwork(DEFAULT_ARGS if args is None else args)
+
+
+def _check(args: Mapping[str, Any]) -> None:
+    hint = "use the args.json that was published with the checkpoint"
+    for name, value in DEFAULT_ARGS.items():
+        if name not in args:
+            raise CheckpointError(f"args of diffusion-planner: {name!r} is missing", hint)
+        if name in _FIXED and args[name] != value:
+            what = f"args of diffusion-planner: {name} is {args[name]!r}, the features have {value}"
+            raise CheckpointError(what, hint)
+    kind = args.get("diffusion_model_type", "x_start")
+    if kind != "x_start":
+        raise CheckpointError(
+            f"args of diffusion-planner: diffusion_model_type is {kind!r}, known is 'x_start'", hint
+        )
+    given = {**args["observation_normalizer"], "state": args["state_normalizer"]}
+    known = {**DEFAULT_ARGS["observation_normalizer"], "state": DEFAULT_ARGS["state_normalizer"]}
+    for name, row in known.items():
+        for part in ("mean", "std"):
+            values = np.asarray(given.get(name, {}).get(part, []), np.float64)
+            if values.ndim == 0 or values.shape[-1] != len(row[part]) or not values.size:
+                what = f"args of diffusion-planner: {part} of the normaliser of {name!r} has shape "
+                raise CheckpointError(f"{what}{values.shape}, not ({len(row[part])},)", hint)
 
 
 def drive_overrides(state: dict[str, np.ndarray]) -> None:

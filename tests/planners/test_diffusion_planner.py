@@ -7,7 +7,7 @@ import pytest
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
 from shiftsim.data.synthetic import bench_scene
-from shiftsim.errors import PlannerError
+from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.simulation import Rollout, simulate, simulate_together
 from shiftsim.state import AgentKind
 from shiftsim.verify.observing import scene_info
@@ -161,9 +161,27 @@ def test_scenarios_in_lock_step_go_the_same_way_as_alone(planner, rng):
 
 
 def test_dimensions_and_units_come_from_the_settings():
-    network = build_network(
-        {"hidden_dim": 96, "state_normalizer": {"mean": [0.0] * 4, "std": [1.0] * 4}}
-    )
+    units = {"mean": [[[0.0] * 4]] * 11, "std": [[[1.0] * 4]] * 11}
+    network = build_network({**DEFAULT_ARGS, "hidden_dim": 96, "state_normalizer": units})
     assert network.state_dict()["decoder.decoder.dit.preproj.fc2.weight"].shape == (96, 512)
     assert network.denormalise(torch.ones(4)).tolist() == [1.0] * 4
     assert build_network().state_dict().keys() == build_network(DEFAULT_ARGS).state_dict().keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lane_num": 80}, "lane_num is 80"),
+        ({"diffusion_model_type": "score"}, "'score'"),
+        ({"state_normalizer": {"mean": [0.0], "std": [1.0]}}, r"'state' has shape \(1,\)"),
+        ({"observation_normalizer": {}}, "normaliser of 'ego_current_state'"),
+    ],
+)
+def test_settings_of_another_network_are_refused(change, message):
+    with pytest.raises(CheckpointError, match=message):
+        build_network({**DEFAULT_ARGS, **change})
+
+
+def test_missing_settings_are_named():
+    with pytest.raises(CheckpointError, match="'num_heads' is missing"):
+        build_network({name: value for name, value in DEFAULT_ARGS.items() if name != "num_heads"})
