@@ -22,7 +22,6 @@ from shiftsim.cli.running import (
     Planners,
     SaveRollouts,
     Scheduler,
-    Seeds,
     Strict,
     Timeout,
     Workers,
@@ -54,17 +53,19 @@ def bench(
     track: Annotated[str, typer.Argument(help="semantic-shift or state-drift.")],
     planner: Planners = None,
     store: Annotated[
-        str | None, typer.Option("--store", "-s", help="Own scenarios: name or folder. [demo]")
+        str | None, typer.Option("--store", "-s", help="Own scenarios: name or folder (demo).")
     ] = None,
     split: Annotated[
-        str | None, typer.Option(help="Name or file. [whole store; demo-mini of the demo]")
+        str | None, typer.Option(help="Name or file (the whole store; demo-mini of the demo).")
     ] = None,
     val14: Annotated[
-        str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14. [left out]")
+        str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14 (left out).")
     ] = None,
     checkpoint: Checkpoints = None,
     planner_arg: PlannerArgs = None,
-    seeds: Seeds = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Only these, such as 0,1; the result is partial.")
+    ] = None,
     noise: Annotated[
         list[str] | None, typer.Option("--noise", "-n", help="Only these; the result is partial.")
     ] = None,

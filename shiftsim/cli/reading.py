@@ -39,11 +39,13 @@ def report(
     runs: RunFolders,
     style: Annotated[
         list[str] | None,
-        typer.Option("--format", "-f", help="text, md, csv, latex, html; repeatable. [text]"),
+        typer.Option("--format", "-f", help="text, md, csv, latex or html; repeatable with --out."),
     ] = None,
     table: Annotated[
         list[str] | None,
-        typer.Option("--table", "-t", help="Only this table; repeatable. A wrong name lists them."),
+        typer.Option(
+            "--table", "-t", help="Only this table; repeatable. A wrong name shows the names."
+        ),
     ] = None,
     by: Annotated[
         str | None, typer.Option(help="Scores per scenario_type, city or seed as well.")
@@ -52,7 +54,7 @@ def report(
         bool, typer.Option("--published", help="The paper's figures beside the own ones.")
     ] = False,
     figures: Annotated[
-        bool, typer.Option("--figures", help="Pictures as well, into --out [RUN/report].")
+        bool, typer.Option("--figures", help="Pictures as well, into --out (RUN/report).")
     ] = False,
     worst: Annotated[int, typer.Option(help="Name the N worst rollouts.")] = 5,
     out: Annotated[Path | None, typer.Option(help="Write everything into this folder.")] = None,
