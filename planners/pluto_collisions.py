@@ -23,6 +23,7 @@ STOPPED = 5e-2  # m/s, of the ego and of objects in a collision
 TTC_STOPPED = 5e-3  # m/s
 TTC_STEPS = (2, 4, 6, 8)  # how far ahead a pose is projected
 MULTIPLE, OFF_ROAD, ONCOMING = 0, 1, 2  # flags
+ALL_CORNERS, WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
 NEVER = np.inf
 
 
@@ -49,31 +50,54 @@ def judge_places(
     """
     slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
     bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
-    held = np.empty(4, np.bool_)
+    highest = 0.0
+    for area in near:
+        highest = max(highest, limits[area])
+    guess = -1  # the area that held the whole ego last is tried first
     for row in range(states.shape[0]):
         for step in range(states.shape[1]):
             box = corners[row, step]
             x, y = states[row, step, X], states[row, step, Y]
-            held[:] = False
-            num_touched, is_within, is_on_route, limit = 0, False, False, 0.0
-            for area in near:
-                if not bounds_meet(bounds[area], box):
+            num_touched, held, is_on_route, limit = 0, 0, False, 0.0
+            for entry in range(-1, len(near)):
+                area = guess if entry < 0 else near[entry]
+                if area < 0 or (entry >= 0 and area == guess):
+                    continue
+                is_known = is_on_route and limit >= highest
+                if (held == WHOLE and is_known) or not bounds_meet(bounds[area], box):
                     continue
                 first, last = poly_ptr[area], poly_ptr[area + 1]
-                if _holds(slabs, bounds[area], first, last, x, y):
+                if not is_known and _holds(slabs, bounds[area], first, last, x, y):
                     limit = max(limit, limits[area])
                     is_on_route = is_on_route or areas.on_route[area]
-                num_held = 0
-                for corner in range(4):
-                    if _holds(slabs, bounds[area], first, last, box[corner, 0], box[corner, 1]):
-                        held[corner] = True
-                        num_held += 1
-                is_within = is_within or num_held == 4
-                num_touched += num_held > 0
-            flags[row, step, MULTIPLE] = num_touched > 1 and not is_within
-            flags[row, step, OFF_ROAD] = not held.all()
+                if held == WHOLE:
+                    continue
+                within = _corners_within(slabs, bounds[area], first, last, box)
+                if within == ALL_CORNERS:
+                    held, guess = WHOLE, area
+                elif within > 0:
+                    held |= within
+                    num_touched += 1
+            flags[row, step, MULTIPLE] = num_touched > 1 and held != WHOLE
+            flags[row, step, OFF_ROAD] = held != WHOLE and held != ALL_CORNERS
             flags[row, step, ONCOMING] = not is_on_route
             speed_limits[row, step] = limit
+
+
+@kernel
+def _corners_within(
+    slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
+    bounds: FloatArray,
+    first: int,
+    last: int,
+    box: FloatArray,
+) -> int:
+    """Which corners of a box (4, 2) the rings `first` … `last` - 1 hold, a bit for each."""
+    within = 0
+    for corner in range(4):
+        if _holds(slabs, bounds, first, last, box[corner, 0], box[corner, 1]):
+            within |= 1 << corner
+    return within
 
 
 @kernel
@@ -146,7 +170,8 @@ def collisions(
     listed = np.empty(len(world.touched), np.bool_)
     for row in range(states.shape[0]):
         scores[row], fault_times[row] = 1.0, NEVER
-        listed[:] = world.touched
+        for index in near:
+            listed[index] = world.touched[index]
         for step in range(1, states.shape[1]):
             box, state = corners[row, step], states[row, step]
             # nuPlan: a red light counts also where the ego stands in it already

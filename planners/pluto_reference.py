@@ -244,23 +244,31 @@ def _cut(baselines: Polylines, path: IntArray, x: float, y: float) -> tuple[Floa
                 progress[row] = progress[row - 1] + np.sqrt(dx * dx + dy * dy)
             row += 1
     here = project_on_polyline(xy, progress, 0, total, x, y)
+    count = 0
     # nuPlan: a vertex goes when the next one repeats it, and so does always the very last one
-    kept = np.flatnonzero(np.diff(progress) > REPEATED)
-    last = progress[kept[-1]]
-    start, end = min(max(here, progress[kept[0]]), last), min(here + LINE_LENGTH, last)
-    ahead = np.searchsorted(progress[kept], start, side="right")
-    if ahead == len(kept):
-        first, count = max(len(kept) - 2, 0), min(len(kept), 2)
-    else:
-        first, count = ahead, np.searchsorted(progress[kept], end, side="left") - ahead
-    is_cut = ahead < len(kept)
-    out = np.empty((count + 2 if is_cut else count, 3))
-    for step in range(count):
-        vertex, place = kept[first + step], step + 1 if is_cut else step
+    for row in range(total - 1):
+        if progress[row + 1] - progress[row] > REPEATED:
+            xy[count, 0], xy[count, 1] = xy[row, 0], xy[row, 1]
+            heading[count], progress[count] = heading[row], progress[row]
+            count += 1
+    last = progress[count - 1]
+    start, end = min(max(here, progress[0]), last), min(here + LINE_LENGTH, last)
+    ahead = 0
+    while ahead < count and progress[ahead] <= start:
+        ahead += 1
+    is_cut = ahead < count
+    first = ahead if is_cut else max(count - 2, 0)
+    stop = first if is_cut else count
+    while stop < count and progress[stop] < end:
+        stop += 1
+    margin = 1 if is_cut else 0  # an interpolated pose at either end
+    out = np.empty((stop - first + 2 * margin, 3))
+    for vertex in range(first, stop):
+        place = vertex - first + margin
         out[place, 0], out[place, 1], out[place, 2] = xy[vertex, 0], xy[vertex, 1], heading[vertex]
     if is_cut:
-        _interpolate(xy, heading, progress, kept, start, out[0])
-        _interpolate(xy, heading, progress, kept, end, out[-1])
+        _interpolate(xy, heading, progress, count, start, out[0])
+        _interpolate(xy, heading, progress, count, end, out[len(out) - 1])
     return out, end - start
 
 
@@ -269,17 +277,19 @@ def _interpolate(
     xy: FloatArray,
     heading: FloatArray,
     progress: FloatArray,
-    kept: IntArray,
+    count: int,
     at: float,
     out: FloatArray,
 ) -> None:
-    """Write the pose at a progress between the kept vertices into `out` (3,)."""
-    upper = min(max(int(np.searchsorted(progress[kept], at)), 1), len(kept) - 1)
-    low, high = kept[upper - 1], kept[upper]
-    share = (at - progress[low]) / (progress[high] - progress[low])
-    out[0] = xy[low, 0] + share * (xy[high, 0] - xy[low, 0])
-    out[1] = xy[low, 1] + share * (xy[high, 1] - xy[low, 1])
-    out[2] = wrap_angle(heading[low] + share * wrap_angle(heading[high] - heading[low]))
+    """Write the pose at a progress between the first `count` vertices into `out` (3,)."""
+    upper = 1
+    while upper < count - 1 and progress[upper] < at:
+        upper += 1
+    low = upper - 1
+    share = (at - progress[low]) / (progress[upper] - progress[low])
+    out[0] = xy[low, 0] + share * (xy[upper, 0] - xy[low, 0])
+    out[1] = xy[low, 1] + share * (xy[upper, 1] - xy[low, 1])
+    out[2] = wrap_angle(heading[low] + share * wrap_angle(heading[upper] - heading[low]))
 
 
 class LineFeatures(NamedTuple):
