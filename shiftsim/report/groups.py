@@ -194,7 +194,8 @@ def made_up_note(runs: Iterable[Run]) -> str:
         name
         for run in runs
         for name, identity in run.manifest["determining"]["planners"].items()
-        if str(identity.get("checkpoint", "")).startswith("deterministic:")
+        if isinstance(identity, dict)
+        and str(identity.get("checkpoint", "")).startswith("deterministic:")
     }
     return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
 
