@@ -18,7 +18,7 @@ from shiftsim.scenario import Scenario
 from shiftsim.state import AgentKind, Tracks, TrafficLights
 
 _NODES = 26  # junctions along each axis: 2600 roadblocks of two lanes
-_SPACING, _HALF = 90.0, 15.0  # m between junctions, m from a junction's middle to its streets
+_SPACING, _HALF = 72.0, 15.0  # m between junctions, m from a junction's middle to its streets
 _WIDTH = 3.5  # m
 _ORIGIN = np.array([331_000.0, 4_690_000.0])  # m
 _STEP = 0.5  # m between baseline vertices
