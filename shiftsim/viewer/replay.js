@@ -601,6 +601,7 @@ async function start() {
   syncOptions();
   byId("time").value = state.t;
   changed();
+  window.firstFrame = performance.now(); // ms since the page was opened
   document.documentElement.dataset.ready = "1";
 }
 
