@@ -6,7 +6,7 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -226,7 +226,27 @@ def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Gro
                 f"{group.planner} {group.noise} {group.traffic} on {group.data.name}, and differ",
                 hint="name one of them, or compare them with `shiftsim diff`",
             )
-    return list(seen.values())
+    return _labelled_apart(list(seen.values()))
+
+
+def _labelled_apart(groups: list[Group]) -> list[Group]:
+    """The same groups; sets of one label say what tells them apart, such as their thresholds."""
+    kinds: dict[str, dict[tuple[str, ...], None]] = {}
+    for group in groups:
+        kinds.setdefault(group.data.label, {})[_traits(group.data)] = None
+    out = []
+    for group in groups:
+        traits = list(zip(*kinds[group.data.label], strict=True))
+        own = zip(_traits(group.data), traits, strict=True)
+        telling = [value for value, values in own if len(set(values)) > 1]
+        label = ", ".join([group.data.label, *telling])
+        out.append(replace(group, data=replace(group.data, label=label)) if telling else group)
+    return out
+
+
+def _traits(data: DataSet) -> tuple[str, ...]:
+    listed = f"list {token_digest(data.tokens)[:8]}"
+    return (data.thresholds, data.controller, f"metrics v{data.metric_version}", listed)
 
 
 def _is_equal(one: Group, other: Group) -> bool:

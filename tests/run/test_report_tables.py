@@ -148,6 +148,16 @@ def test_different_thresholds_are_different_tables(tmp_path):
     assert len({t.name for t in tables}) == 2
 
 
+def test_sets_of_one_name_say_what_tells_them_apart(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", thresholds="nuplan", noise=("none", "ou-low")),
+        write_run(tmp_path / "b", thresholds="deepplan", noise=("none", "ou-low")),
+        write_run(tmp_path / "c", split="third"),
+    ]
+    table = noise_robustness(read_groups(runs))
+    assert [row[0] for row in table.rows] == ["made-up, nuplan", "made-up, deepplan", "third"]
+
+
 def test_a_name_that_means_two_planners_is_told_apart(tmp_path):
     runs = [
         write_run(tmp_path / "a", fingerprint="old"),
