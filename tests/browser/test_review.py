@@ -116,6 +116,7 @@ def test_a_click_takes_a_roadblock_out_and_another_puts_it_back(desk, store):
 
 def test_a_corrected_route_changes_a_run_and_its_fingerprint(desk, store, tmp_path):
     before = shiftsim.run("log-future", store=str(store), workers=1, out=str(tmp_path / "before"))
+    desk.press("-", "-", "-", "-", "-", "-", "-", "-")
     x, y = block_on_screen(desk, "3")
 
     desk.click_at(x, y)
