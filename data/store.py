@@ -45,6 +45,7 @@ class ScenarioStore:
 
     Attributes:
         path: Its folder.
+        source: Where others find it: the folder, or the URL it is copied from.
         tokens: Tokens of all scenarios, sorted.
         hash: Digest of the content; equal content has an equal hash.
         reviews: What people say of the scenarios; an overlay that is not part of the hash.
@@ -52,6 +53,7 @@ class ScenarioStore:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.source = str(path.resolve())
         manifest = read_manifest(path)
         self.hash = str(manifest["hash"])
         self._table = Table(path / SCENARIOS, schema.SCENARIOS).read()
@@ -127,20 +129,28 @@ class ScenarioStore:
             DataError: The store has no such map, or its file is damaged.
         """
         if city not in self._maps:
-            self._maps[city] = read_map_file(map_file(self.path, city))
+            self._maps[city] = read_map_file(self.map_file(city))
         return self._maps[city]
+
+    def map_file(self, city: str) -> Path:
+        """File of a map."""
+        return map_file(self.path, city)
+
+    def recording_folder(self, name: str) -> Path:
+        """Folder of a recording."""
+        return recording_folder(self.path, name)
 
     def _recording(self, name: str) -> StoredRecording:
         if name not in self._recordings:
             _make_room(self._recordings)
-            self._recordings[name] = open_recording(recording_folder(self.path, name))
+            self._recordings[name] = open_recording(self.recording_folder(name))
         return self._recordings[name]
 
     def _ego(self, recording: str, name: str) -> Table:
         key = (recording, name)
         if key not in self._egos:
             _make_room(self._egos)
-            self._egos[key] = open_ego(recording_folder(self.path, recording), name)
+            self._egos[key] = open_ego(self.recording_folder(recording), name)
         return self._egos[key]
 
 
@@ -153,11 +163,15 @@ def open_store(path: str | Path) -> ScenarioStore:
     """Open a store.
 
     Args:
-        path: Its folder.
+        path: Its folder, or the URL of one.
 
     Raises:
         DataError: There is no store, or it is damaged or of another version.
     """
+    if "://" in str(path):
+        from shiftsim.data.remote_store import RemoteStore
+
+        return RemoteStore(str(path))
     return ScenarioStore(Path(path))
 
 

@@ -15,7 +15,6 @@ from shiftsim.data.store import (
     ScenarioStore,
     StoreWriter,
     open_store,
-    recording_folder,
     window_row,
 )
 from shiftsim.errors import DataError
@@ -52,6 +51,8 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
 
 def _open(run: Run, store: str | None) -> ScenarioStore:
     place = store or run.manifest["store"]
+    if "://" in place:
+        return open_store(place)
     path = store_path(place)
     if not path.exists():
         raise DataError(
@@ -94,7 +95,7 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
                 if name == recording
             ]
             copied = target / ".recording"
-            shutil.copytree(recording_folder(store.path, recording), copied)
+            shutil.copytree(store.recording_folder(recording), copied)
             writer.take_recording(copied, recording, rows)
     if (store.path / REVIEW).is_file():
         (target / REVIEW).parent.mkdir()

@@ -300,6 +300,11 @@ def checkpoint_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
 
 
+def remote_store_folder() -> Path:
+    """Folder of what was copied from stores behind a URL: `SHIFTSIM_CACHE`, or below the cache."""
+    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
+
+
 def default_workers(memory_each: float = 0.5e9) -> int:
     """Worker processes when nothing is said: one per core, as long as they fit into the memory.
 

@@ -22,6 +22,8 @@ _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
 _SOURCES = (
     "data/recording.py",
     "data/schema.py",
+    "data/remote_store.py",
+    "data/review.py",
     "data/store*.py",
     "dynamics/*.py",
     "metrics/*.py",
@@ -53,7 +55,7 @@ def make_manifest(
     *,
     config: RunConfig,
     split: str,
-    store: Path,
+    store: str,
     determining: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
@@ -66,7 +68,7 @@ def make_manifest(
         "config": replace(config, resume=False, retry_failed=False).to_dict(),
         "split": split,
         "shard": config.shard,
-        "store": str(store),
+        "store": store,
         "counts": {},
         "determining": determining,
         "started": now(),

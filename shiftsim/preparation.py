@@ -86,9 +86,11 @@ class Prepared:
 
 
 def open_named_store(name: str) -> Any:
-    """A store by name or path; the demo store is made when it is not there yet."""
+    """A store by name, path or URL; the demo store is made when it is not there yet."""
     from shiftsim.data.store import open_store
 
+    if "://" in name:
+        return open_store(name)
     path = store_path(name)
     if name == DEFAULT_STORE and not path.exists():
         from shiftsim.data.synthetic import demo_store
@@ -136,7 +138,7 @@ def prepare(
     folder = Path(config.out) if config.out else RUNS / run_name(config, split, determining)
     before = _check_folder(config, folder, determining)
     runner = TaskRunner(
-        Path(store.path).resolve(),
+        store.source,
         {entry.name: entry for entry in entries},
         {model.name: model for model in models},
         config.traffic,

@@ -34,7 +34,7 @@ class Rescorer:
     """
 
     run: Path
-    store: Path
+    store: str
     thresholds: str
     metrics: tuple[str, ...]
     traffic: str
@@ -91,7 +91,7 @@ def rescore(
     """
     for metric in metrics:
         load_metric(metric)
-    folder = open_run_store(run, store).path.resolve()
+    found = open_run_store(run, store)
     determining = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
@@ -109,12 +109,14 @@ def rescore(
             f"run {run.path.name!r} holds no rollouts for {len(lacking)} of {len(tasks)} tasks",
             hint="run again with --save-rollouts all",
         )
-    rescorer = Rescorer(run.path.resolve(), folder, thresholds, metrics, determining["traffic"])
+    rescorer = Rescorer(
+        run.path.resolve(), found.source, thresholds, metrics, determining["traffic"]
+    )
     manifest = make_manifest(
         target,
         config=config,
         split=run.manifest["split"],
-        store=Path(run.manifest["store"]) if store is None else folder,
+        store=run.manifest["store"] if store is None else found.source,
         determining=determining,
         argv=argv,
     )

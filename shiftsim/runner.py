@@ -97,7 +97,7 @@ def _execute(
             raise KeyboardInterrupt
         state = "interrupted" if interrupted else "finished"
         if prepared.config.bundle:
-            store = open_named_store(str(prepared.runner.store))
+            store = open_named_store(prepared.runner.store)
             tokens = {task.token for task in prepared.tasks}
             manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
         lacking = set(prepared.missing)

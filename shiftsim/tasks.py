@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -34,7 +33,7 @@ class TaskRunner:
     """Does units of tasks, one after the other.
 
     Attributes:
-        store: Folder of the scenario store.
+        store: Folder or URL of the scenario store.
         planners: The planners, by name.
         noises: The noise models, by name.
         traffic: Traffic mode.
@@ -45,7 +44,7 @@ class TaskRunner:
         strict: Whether a step with a makeshift plan fails its task.
     """
 
-    store: Path
+    store: str
     planners: Mapping[str, PlannerEntry]
     noises: Mapping[str, NoiseModel]
     traffic: str
