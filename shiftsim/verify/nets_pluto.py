@@ -6,7 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from shiftsim import state
+from shiftsim.planners.features import SAMPLES
+from shiftsim.planners.plan_states import STEP
+from shiftsim.planners.pluto import MAX_AGENTS, RADIUS
 from shiftsim.planners.pluto_brake import brake, must_brake
+from shiftsim.planners.pluto_candidates import STEPS
 from shiftsim.verify.array_file import ArrayFile
 from shiftsim.verify.nets_common import ERRORS, FILE_COLUMNS, STATE, Scenes, verify_state_dict
 from shiftsim.verify.nets_pluto_loops import verify_loop
@@ -39,24 +43,22 @@ def verify_pluto(folder: Path, report: Report, scenes: Scenes) -> None:
 
 
 def _verify_manifest(path: Path, report: Report) -> None:
-    from shiftsim.planners import pluto_reference
     from shiftsim.planners.nets import pluto
 
     network = pluto.build_network()
-    weights = [value for value in network.parameters()]
-    trained = sum(value.numel() for value in weights)
+    trained = sum(value.numel() for value in network.parameters())
     everything = sum(value.numel() for value in network.state_dict().values())
     heads = {
         name: {"C": len(head.gain), **{k: list(v) for k, v in dataclasses.asdict(head).items()}}
         for name, head in pluto.DRIVE_HEADS.items()
     }
     builder = {
-        "radius": 120,
-        "history_horizon": 2,
-        "future_horizon": 8,
-        "sample_interval": 0.1,
-        "max_agents": 48,
-        "build_reference_line": bool(pluto_reference.NUM_POINTS),
+        "radius": RADIUS,
+        "history_horizon": (SAMPLES - 1) * STEP,
+        "future_horizon": STEPS * STEP,
+        "sample_interval": STEP,
+        "max_agents": MAX_AGENTS,
+        "build_reference_line": True,
     }
     verify_state_dict(
         path,
