@@ -21,6 +21,7 @@ from checkpoint_files import (
     AttributeDict,
     Callback,
     Hostile,
+    diffusion_args,
     lightning_entries,
     save,
     state_of,
@@ -329,9 +330,10 @@ def test_a_truncated_file_is_called_damaged(tmp_path, plantf):
 
 def test_diffusion_planner_wants_its_args(tmp_path):
     path = write_diffusion(tmp_path, state_of("diffusion-planner"))
-    (tmp_path / "args.json").write_text('{"hidden_dim": "wide"}')
-    with pytest.raises(CheckpointError, match=r"no network of diffusion-planner can be built"):
-        load_weights(str(path), "diffusion-planner")
+    for wrong in ({"hidden_dim": "wide"}, {**diffusion_args(), "state_normalizer": None}):
+        (tmp_path / "args.json").write_text(json.dumps(wrong))
+        with pytest.raises(CheckpointError, match=r"args of diffusion-planner|from its args"):
+            load_weights(str(path), "diffusion-planner")
     (tmp_path / "args.json").write_text("[1]")
     with pytest.raises(CheckpointError, match="holds list, not an object"):
         load_weights(str(path), "diffusion-planner")
