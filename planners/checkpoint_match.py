@@ -15,6 +15,14 @@ Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 
 LIKENESS = 0.5  # share of equal names and shapes from which on a file is said to be of a planner
 _NAMED = 3  # tensors named in a message
+_CANNOT_BUILD = (  # what args of any content make a network's constructor raise
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 
 
 def learned_planners() -> tuple[str, ...]:
@@ -40,7 +48,7 @@ def empty_state(planner: str, args: Mapping[str, Any] | None = None) -> dict[str
         with torch.device("meta"):
             state: dict[str, Any] = module.build_network(args).state_dict()
             return state
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except _CANNOT_BUILD as error:
         raise CheckpointError(
             f"no network of {planner} can be built from its args ({type(error).__name__}: {error})",
             hint="use the args.json that was published with the checkpoint",
