@@ -8,6 +8,7 @@ tasks, 130 interrupted; `verify` has its own.
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -24,6 +25,7 @@ app = typer.Typer(
     help="Closed-loop evaluation of driving planners with nuPlan's semantics.",
     epilog="Every command explains itself: shiftsim COMMAND --help",
     no_args_is_help=True,
+    rich_markup_mode=None,  # square brackets in help texts are defaults, not markup
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -53,6 +55,8 @@ checkpoint.register(app)
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # own planners, noises, metrics and traffic beside the user's files
     debug = "--debug" in words
     try:
         code = _run([word for word in words if word != "--debug"], debug)
