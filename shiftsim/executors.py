@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
@@ -27,6 +28,7 @@ R = TypeVar("R")
 
 MakeFunction = Callable[[], Callable[[T], R]]
 _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a task
+_LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
 _TIME_TO_COMPILE = 60.0  # s, on top of the limit of a leading task
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 # one thread per worker: the parallelism is across scenarios
@@ -66,6 +68,7 @@ def map_unordered(
     alone: int = 0,
     limit: float = 0.0,
     pieces: Callable[[T], Sequence[T]] | None = None,
+    group: Callable[[T], object] | None = None,
 ) -> Generator[Outcome[T, R], None, None]:
     """Apply a function to every task, in whatever order they finish.
 
@@ -81,6 +84,7 @@ def map_unordered(
             or the first one to compile, does not count.
         pieces: Splits a task that is several in one; when its worker dies, they are done one by
             one, so that only one of them is lost.
+        group: What a worker should stay with, as it has read it already; neighbours only.
 
     Yields:
         One outcome per task, or per piece of one whose worker died.
@@ -95,7 +99,8 @@ def map_unordered(
         raise ConfigError(
             "worker processes need a POSIX system", hint="use --workers 1 and no --timeout"
         )
-    pool = Pool(pickle.dumps((sys.path, pickle.dumps(make))), max(1, workers), limit, pieces)
+    payload = pickle.dumps((sys.path, pickle.dumps(make)))
+    pool = Pool(payload, max(1, workers), limit, pieces, group)
     try:
         yield from pool.run(tasks, alone)
     finally:
@@ -187,10 +192,12 @@ class Pool:
         size: int,
         limit: float = 0.0,
         pieces: Callable[[Any], Sequence[Any]] | None = None,
+        group: Callable[[Any], object] | None = None,
     ) -> None:
         """A pool without workers; `payload` holds `sys.path` and the pickled maker."""
         self.payload, self.size, self.limit = payload, size, limit
         self.pieces = pieces or (lambda task: (task,))
+        self.group = group
         self.workers: list[_Worker] = []
         self.failed_starts = 0
 
@@ -205,7 +212,7 @@ class Pool:
             if done < alone:
                 ready = [] if self._in("busy") else ready[:1]
             for worker in ready[: len(waiting)]:
-                task = waiting.popleft()
+                task = self._taken(waiting, worker)
                 worker.give(task, self._seconds(task) + _TIME_TO_COMPILE * (done < alone))
             for outcome in self._heard():
                 done += 1
@@ -214,6 +221,19 @@ class Pool:
                     waiting.extendleft(reversed(parts))
                 else:
                     yield outcome
+
+    def _taken(self, waiting: deque[Any], worker: _Worker) -> Any:
+        """The next task for a worker: of its own group, else of one that no other is at."""
+        place = 0
+        if self.group is not None:
+            groups = [self.group(task) for task in islice(waiting, _LOOK_AHEAD)]
+            own = None if worker.task is None else self.group(worker.task)
+            others = {self.group(other.task) for other in self._in("busy")}
+            fresh = (i for i, found in enumerate(groups) if found not in others)
+            place = groups.index(own) if own in groups else next(fresh, 0)
+        task = waiting[place]
+        del waiting[place]
+        return task
 
     def _seconds(self, task: object) -> float:
         return self.limit * len(self.pieces(task)) if self.limit else inf

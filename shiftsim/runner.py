@@ -179,7 +179,12 @@ def _outcomes(
         alone=leading,
         limit=config.timeout,
         pieces=_pieces,
+        group=_scenario,
     )
+
+
+def _scenario(unit: Unit) -> str:
+    return unit[0].token
 
 
 def _runner(runner: TaskRunner) -> TaskRunner:

@@ -269,7 +269,7 @@ def _announce(prepared: "Prepared") -> None:
     found = len({task.token for task in prepared.tasks})
     lacking = len({task.token for task in prepared.missing})
     for name in config.planners:
-        arguments = config.planner_args.get(name, {})
+        arguments = prepared.runner.planners[name].arguments
         given = "".join(f"  {key}={value}" for key, value in arguments.items())
         say(f"planner     {name}{given}")
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
@@ -287,7 +287,7 @@ def _announce(prepared: "Prepared") -> None:
         say(f"metrics     {' '.join(config.metrics)}")
     if any(entry.in_batches for entry in prepared.runner.planners.values()):
         strict = "   strict" if config.strict else ""
-        say(f"networks    device {config.device}   batch size {config.batch_size}{strict}")
+        say(f"networks    batch size {config.batch_size}{strict}")
     where = f"workers {prepared.workers} x 1 thread"
     if config.executor == "dask":
         where = f"dask {config.scheduler}"

@@ -4,6 +4,8 @@ import sys
 import time
 from functools import partial
 from itertools import pairwise
+from operator import itemgetter
+from pathlib import Path
 
 import pytest
 
@@ -86,6 +88,77 @@ class Closing:
 def test_functions_are_closed_at_the_end(workers, tmp_path):
     list(map_unordered(partial(Closing, tmp_path / "log"), range(4), workers=workers))
     assert set((tmp_path / "log").read_text().split()) == {"closed"}
+
+
+class Named:
+    def __call__(self, task):
+        time.sleep(0.01)
+        return os.getpid()
+
+
+def test_workers_stay_with_a_group_and_leave_those_of_others():
+    tasks = [(name, i) for name in "abcdef" for i in range(8)]
+    outcomes = list(map_unordered(Named, tasks, workers=2, group=itemgetter(0)))
+    assert sorted(o.task for o in outcomes) == tasks
+    at = {name: {o.result for o in outcomes if o.task[0] == name} for name in "abcdef"}
+    assert sum(len(pids) for pids in at.values()) <= 7  # the last one may be shared
+
+
+class Late:
+    def __call__(self, task):
+        while task == 13:
+            pass
+        return task
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_task_that_takes_too_long_is_ended_and_named(workers):
+    outcomes = {o.task: o for o in map_unordered(Late, [1, 13, 2], workers=workers, limit=1.0)}
+    assert [outcomes[n].result for n in (1, 2)] == [1, 2]
+    assert outcomes[13].is_late
+    assert outcomes[13].death == "took longer than 1 s"
+
+
+class Both:
+    def __call__(self, task):
+        if 13 in task:
+            os._exit(7)
+        return sum(task)
+
+
+def singles(task):
+    return [(number,) for number in task]
+
+
+def test_what_was_with_a_task_whose_worker_died_is_done_alone():
+    tasks = [(1, 2), (3, 13, 4), (5,)]
+    outcomes = {
+        o.task: o.result or o.death for o in map_unordered(Both, tasks, workers=2, pieces=singles)
+    }
+    assert outcomes.pop((13,)) == "worker process ended with exit code 7"
+    assert outcomes == {(1, 2): 3, (3,): 3, (4,): 4, (5,): 5}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere they notice at the next message")
+def test_workers_end_with_their_parent_even_in_an_endless_task(tmp_path):
+    code = (
+        "import sys; sys.path.append(sys.argv[1])\n"
+        "from test_executors import Late\n"
+        "from shiftsim.executors import map_unordered\n"
+        "for outcome in map_unordered(Late, [1, 13, 13], workers=2):\n"
+        "    print(outcome.result, flush=True)\n"
+    )
+    here = str(Path(__file__).parent)
+    parent = subprocess.Popen([sys.executable, "-c", code, here], stdout=subprocess.PIPE)
+    parent.stdout.readline()
+    listed = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in listed):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert listed
 
 
 class Sleep:

@@ -1,0 +1,127 @@
+"""Settings of long runs on the command line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import shiftsim
+from shiftsim.cli import main
+
+HERE = Path(__file__).parent
+sys.path.append(str(HERE))  # worker processes import `drivers`, too
+
+
+@pytest.fixture
+def call(capsys, toy):
+    """Exit code, output and errors of a command on the toy store."""
+
+    def run(*words, store=True):
+        more = ("--store", str(toy)) if store else ()
+        with pytest.raises(SystemExit) as left:
+            main([*map(str, words), *more])
+        printed = capsys.readouterr()
+        return left.value.code, printed.out, printed.err
+
+    return run
+
+
+def test_shards_are_run_and_merged(call, tmp_path):
+    folders = [tmp_path / str(i) for i in (1, 2)]
+    for i, folder in enumerate(folders, start=1):
+        words = ("-p", "constant-velocity", "--shard", f"{i}/2", "--workers", 1, "--out", folder)
+        code, out, _ = call("run", *words)
+        assert code == 0
+        assert f"(shard {i}/2)" in out
+    code, _, err = call("merge", folders[0], "--out", tmp_path / "all", store=False)
+    assert (code, "shards are missing: 2/2" in err) == (1, True)
+    code, out, _ = call("merge", *folders, "--out", tmp_path / "all", store=False)
+    assert code == 0
+    assert len(shiftsim.open_run(tmp_path / "all").scores) == 4
+    code, out, _ = call(
+        "merge", folders[0], "--out", tmp_path / "part", "--allow-partial", store=False
+    )
+    assert code == 3
+    assert "partial" in out
+
+
+def test_resuming_and_its_state_are_printed(call, tmp_path):
+    words = ("run", "-p", "constant-velocity", "--workers", 1, "--out", tmp_path / "run")
+    assert "nothing there yet" in call(*words, "--resume")[1]
+    code, out, _ = call(*words, "--resume")
+    assert code == 0
+    assert "is complete already" in out
+    code, _, err = call(*words, "--resume", "--thresholds", "deepplan")
+    assert code == 1
+    assert "thresholds differ" in err
+
+
+def test_checkpoint_device_and_batch_size_are_printed(call, tmp_path):
+    pytest.importorskip("torch")
+    words = ("run", "-p", "plantf", "-p", "idm", "--dry-run", "--batch-size", 8, "--strict")
+    checkpoint = ("--checkpoint", "deterministic:drive")
+    code, out, _ = call(*words, *checkpoint, "--out", tmp_path / "run")
+    assert code == 0
+    assert "checkpoint=deterministic:drive" in out
+    assert "device=cpu" in out
+    assert "batch size 8   strict" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "fact"),
+    [
+        (("--checkpoint", "x.ckpt"), "does not say which planner is meant"),
+        (("--checkpoint", "constant-velocity=x.ckpt"), "planner with a checkpoint"),
+        (("--device", "gpu"), "device 'gpu' unknown"),
+        (("--batch-size", "0"), "batch_size is 0"),
+        (("--timeout", "-1"), "timeout is -1.0"),
+        (("--executor", "ray"), "executor 'ray' unknown"),
+        (("--executor", "dask"), "needs a scheduler"),
+        (("--shard", "3/2"), "is not i/n"),
+        (("--save-rollouts", "some"), "save_rollouts 'some' unknown"),
+    ],
+)
+def test_wrong_settings_are_found_before_the_first_task(call, tmp_path, words, fact):
+    code, _, err = call("run", "-p", "constant-velocity", *words, "--out", tmp_path / "run")
+    assert code == 1
+    assert fact in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_only_failed_rollouts_are_kept_where_asked_for(call, tmp_path):
+    words = ("-p", "constant-velocity", "-n", "ou-high", "--seeds", "0,1", "--workers", 1)
+    call("run", *words, "--save-rollouts", "failed", "--out", tmp_path / "run")
+    run = shiftsim.open_run(tmp_path / "run")
+    scores = {(row["seed"], row["token"]): row["cls"] for row in run.scores.to_pylist()}
+    kept = {(t.seed, t.token) for t, file in run.rollout_files.items() if file is not None}
+    assert kept == {key for key, score in scores.items() if score == 0.0}
+    assert 0 < len(kept) < len(scores)
+    assert len(list((run.path / "rollouts").iterdir())) == len(kept)
+
+
+@pytest.mark.slow
+def test_a_request_to_end_keeps_what_is_finished_and_says_how_to_go_on(toy, tmp_path):
+    words = ["run", "-p", "drivers:Slow", "--noise", "ou-high", "--seeds", "0,1,2,3,4,5,6,7"]
+    words += ["--store", str(toy), "--out", "run", "--workers", "2", "--quiet"]
+    command = [sys.executable, "-m", "shiftsim", *words]
+    paths = [str(HERE), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    journal = tmp_path / "run" / "unfinished.jsonl"
+    while not (journal.exists() and journal.stat().st_size):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "kept: run; go on with: shiftsim run -p drivers:Slow" in err
+    assert err.rstrip().endswith("--resume")
+    done = subprocess.run([*command, "--resume"], cwd=tmp_path, env=environment, check=False)
+    assert done.returncode == 0
+    assert shiftsim.open_run(tmp_path / "run").is_complete
