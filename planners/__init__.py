@@ -1,5 +1,7 @@
 """Planners by name, and users' own ones by `package.module:Class`.
 
+`nuplan:package.module:Class` is a planner written against nuPlan's interface.
+
 Nothing is imported before it is asked for.
 """
 
@@ -16,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.config import checkpoint_folder, one_of
-from shiftsim.errors import CheckpointError, ConfigError
+from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
 from shiftsim.planner import Planner
 
 
@@ -147,6 +149,9 @@ _ENTRIES = (
 )
 PLANNERS = types.MappingProxyType({entry.name: entry for entry in _ENTRIES})
 
+# planners of another interface: prefix -> module with install() and factory(class)
+_ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
+
 _WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
@@ -155,7 +160,7 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
 
     Args:
         spec: Registered name, or `package.module:Class` of an own planner, which may lie in the
-            current directory.
+            current directory; with `nuplan:` before it where it is written for nuPlan.
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
     A learned planner without a `checkpoint` takes its published file from the folder of
@@ -178,7 +183,13 @@ def planner_factory(spec: str) -> Any:
 
     Raises:
         ConfigError: There is none.
+        MissingExtraError: It needs more of nuPlan's devkit than its stand-ins have.
     """
+    for prefix, adapter in _ADAPTERS.items():
+        if spec.startswith(prefix) and spec.count(":") > 1:
+            compat = importlib.import_module(adapter)
+            compat.install()
+            return compat.factory(planner_factory(spec.removeprefix(prefix)))
     entry = PLANNERS.get(spec)
     if entry is None and ":" not in spec:
         one_of("planner", spec, PLANNERS)
@@ -192,6 +203,8 @@ def planner_factory(spec: str) -> Any:
         sys.path.append(here)
     try:
         module = importlib.import_module(module_name)
+    except MissingExtraError:
+        raise
     except ImportError as error:
         raise ConfigError(
             f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",

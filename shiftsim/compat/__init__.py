@@ -1,0 +1,1 @@
+"""Planners written against other simulators' interfaces."""
