@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from shiftsim.state import EgoState as EgoState
     from shiftsim.state import Tracks as Tracks
     from shiftsim.state import Trajectory as Trajectory
+    from shiftsim.viewer.page import show as show
 
 # public name -> where it is; imported when it is first used, so that `import shiftsim` is instant
 _PUBLIC = {
@@ -43,6 +44,7 @@ _PUBLIC = {
     "open_store": "shiftsim.runner:open_named_store",
     "run": "shiftsim.runner:run",
     "score": "shiftsim.metrics:compute_metrics",
+    "show": "shiftsim.viewer.page:show",
     "simulate": "shiftsim.simulation:simulate",
 }
 
@@ -64,6 +66,7 @@ __all__ = [
     "open_store",
     "run",
     "score",
+    "show",
     "simulate",
 ]
 

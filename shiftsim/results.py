@@ -179,6 +179,19 @@ class Run:
 
         return worst_rollouts(self, count)
 
+    def view(self, token: str) -> Any:
+        """The replay of one scenario: a page that notebooks show, and that has `.save(path)`.
+
+        Raises:
+            ConfigError: There is no stored rollout of it.
+            DataError: The store of the run is not there.
+        """
+        from shiftsim.bundle import open_run_store
+        from shiftsim.viewer.build import Gallery
+
+        gallery = Gallery([self], open_run_store(self))
+        return gallery.page(gallery.find(token))
+
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})\n{self.table()}"
 

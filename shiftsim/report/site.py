@@ -4,11 +4,11 @@ import html
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from shiftsim.bundle import open_run_store
 from shiftsim.report.figures import Figure
 from shiftsim.report.tables import Table
 from shiftsim.report.writers import render
 from shiftsim.results import Run
-from shiftsim.runner import open_named_store
 from shiftsim.viewer.build import Choice, galleries, write_site
 
 
@@ -44,7 +44,7 @@ def write_report_site(
         name, title = html.escape(picture.name), html.escape(figure.title)
         parts.append(f'<figure><img src="{name}" alt="{title}"></figure>')
     stored = [run for run in runs if any(file is not None for file in run.rollout_files.values())]
-    stores = [open_named_store(str(run.manifest["store"])) for run in stored]
+    stores = [open_run_store(run) for run in stored]
     write_site(
         folder,
         galleries(stored, stores, Choice()),

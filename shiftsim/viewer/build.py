@@ -11,7 +11,7 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.results import Run
 from shiftsim.rollouts import Task
-from shiftsim.viewer.page import MAX_ROLLOUTS, asset, fill, json_text, replay_page
+from shiftsim.viewer.page import MAX_ROLLOUTS, Page, asset, fill, json_text, replay_page
 from shiftsim.viewer.scene import Shown
 
 
@@ -130,7 +130,7 @@ class Gallery:
             out.append(Shown(task.planner, task.noise, task.seed, log, row.get("cls"), rows))
         return out
 
-    def page(self, token: str, *, back: str = "") -> str:
+    def page(self, token: str, *, back: str = "") -> Page:
         """The replay of one scenario as HTML."""
         scenario = self.store.read(token)
         return replay_page(scenario, self.shown(token, scenario), back=back)

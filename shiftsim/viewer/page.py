@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from shiftsim.log import SimulationLog
 from shiftsim.scenario import Scenario
 from shiftsim.viewer.pack import pack
 from shiftsim.viewer.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
@@ -16,7 +17,39 @@ _SCRIPTS = ("codec.js", "world.js", "strips.js", "replay.js")
 MAX_ROLLOUTS = 6
 
 
-def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -> str:
+class Page(str):
+    """The text of a page; notebooks show it as a frame."""
+
+    __slots__ = ()
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to a file."""
+        file = Path(path)
+        file.write_text(self, encoding="utf-8")
+        return file
+
+    def _repr_html_(self) -> str:
+        return embedded(self)
+
+
+def show(scenario: Scenario, **logs: SimulationLog) -> Page:
+    """A replay of rollouts of one scenario, as `shiftsim.show(scenario, mine=log)`.
+
+    Args:
+        scenario: The scenario that was driven.
+        logs: One to six rollouts by name; underscores stand for hyphens.
+
+    Raises:
+        ValueError: There are no rollouts, or more than six.
+    """
+    shown = [
+        Shown(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)
+        for name, log in logs.items()
+    ]
+    return replay_page(scenario, shown)
+
+
+def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -> Page:
     """One self-contained HTML page.
 
     Args:
@@ -36,13 +69,14 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
         sections[f"rollout{index}"] = pack(rollout_fields(replay, index))
     data = [_data("meta", "application/json", json_text(meta))]
     data += [_data(name, "text/plain", text) for name, text in sections.items()]
-    return fill(
+    text = fill(
         asset("replay.html"),
         title=html.escape(f"{scenario.token} · shiftsim"),
         style=asset("replay.css"),
         data="\n".join(data),
         script="\n".join(asset(name) for name in _SCRIPTS),
     )
+    return Page(text)
 
 
 @cache

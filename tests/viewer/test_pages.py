@@ -8,6 +8,7 @@ from pages import sections, unpack
 from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
+import shiftsim
 from shiftsim.data.store import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners import load_planner
@@ -136,6 +137,23 @@ def test_a_page_in_a_notebook_is_a_frame_of_its_own(scenario):
 
     assert frame.count("<") == 2  # the frame's own tag, opened and closed
     assert 'sandbox="allow-scripts"' in frame
+
+
+def test_rollouts_are_shown_by_name_and_in_notebooks(scenario, tmp_path):
+    log = shown(scenario).log
+
+    page = shiftsim.show(scenario, mine=log, pdm_closed=log)
+
+    names = [item["planner"] for item in json.loads(sections(page)["meta"])["rollouts"]]
+    assert names == ["mine", "pdm-closed"]
+    assert page._repr_html_().startswith("<iframe")
+    assert page.save(tmp_path / "a.html").read_text("utf-8") == page
+
+
+def test_a_run_shows_the_replay_of_a_scenario(clean_run):
+    page = clean_run.view("0001")
+
+    assert json.loads(sections(page)["meta"])["token"] == "0001cafe"
 
 
 def test_more_than_six_rollouts_are_refused(scenario):
