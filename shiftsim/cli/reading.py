@@ -58,9 +58,16 @@ def report(
     ] = False,
     worst: Annotated[int, typer.Option(help="Name the N worst rollouts.")] = 5,
     out: Annotated[Path | None, typer.Option(help="Write everything into this folder.")] = None,
+    site: Annotated[
+        Path | None,
+        typer.Option(
+            "--html", help="Pages into this folder: tables, pictures, scenarios with replays."
+        ),
+    ] = None,
     allow_partial: Annotated[
         bool, typer.Option("--allow-partial", help="Print a labelled mean over what finished.")
     ] = False,
+    quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -82,17 +89,32 @@ def report(
     if figures and out is None:
         out = runs[0] / "report"
     kind = (style or ["text"])[0]
-    default = TABLES if out else ("scores",) if kind == "csv" else BRIEF
+    default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)
     tables = make_tables(groups, published_figures(), options)
     if not table and options.tables != ("scores",):
         tables = [*extra(groups), *tables]
-    if out is not None:
+    drawn = []
+    if figures or site is not None:
         from shiftsim.report.figures import figures as draw
 
-        drawn = draw(groups, allow_partial=allow_partial) if figures else []
+        drawn = draw(groups, allow_partial=allow_partial)
+    if out is not None:
         files = write_report(out, tables, drawn, style or FORMATS)
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
+    if site is not None:
+        from shiftsim.report.site import write_report_site
+
+        with progress_bar(quiet=quiet) as advance:
+            page = write_report_site(
+                site,
+                opened,
+                tables,
+                drawn,
+                on_progress=lambda done, total: advance(done, total, ""),
+            )
+        say(f"written: {page}")
+    if out is not None or site is not None:
         return
     say("\n\n".join(render(one, kind, width=terminal_width()) for one in tables))
     if kind == "text" and not table:

@@ -1,0 +1,76 @@
+import json
+
+import pytest
+from pages import sections
+from typer.testing import CliRunner
+
+from shiftsim.cli import app, main
+
+
+@pytest.fixture
+def call():
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_view_writes_one_page_for_a_scenario(call, clean_run, tmp_path):
+    done = call("view", clean_run.path, "0001", "--out", tmp_path, "--no-open")
+
+    assert done.exit_code == 0, done.output
+    assert [path.name for path in tmp_path.iterdir()] == ["0001cafe.html"]
+
+
+def test_view_writes_a_list_with_all_scenarios(call, clean_run, tmp_path):
+    done = call("view", clean_run.path, "-p", "log-future", "--out", tmp_path, "--no-open", "-q")
+
+    rows = json.loads(sections((tmp_path / "index.html").read_text("utf-8"))["rows"])
+    assert "4 replays" in done.output
+    assert {row["planner"] for row in rows} == {"log-future"}
+
+
+def test_view_says_how_many_it_left_out(call, clean_run, tmp_path):
+    done = call("view", clean_run.path, "--limit", 1, "--out", tmp_path, "--no-open", "-q")
+
+    assert "1 replay, 3 more with --limit 0" in done.output
+
+
+def test_the_report_page_holds_tables_pictures_and_replays(call, clean_run, tmp_path):
+    pytest.importorskip("matplotlib")
+
+    done = call("report", clean_run.path, "--html", tmp_path, "-q")
+
+    page = (tmp_path / "index.html").read_text("utf-8")
+    rows = json.loads(sections(page)["rows"])
+    assert done.exit_code == 0, done.output
+    assert "All planners and noises" in page
+    assert list(tmp_path.glob("*.png"))
+    assert all((tmp_path / row["page"]).is_file() for row in rows)
+    assert len(rows) == 16
+
+
+def test_plot_writes_a_figure(call, clean_run, tmp_path):
+    pytest.importorskip("matplotlib")
+
+    done = call("plot", clean_run.path, "0001cafe", "--at", 1.0, "-o", tmp_path / "a.svg")
+
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("view", "{run}", "ffff"), "hint:"),
+        (("view", "{run}", "0001", "-p", "nobody"), "check --planner"),
+        (("plot", "{run}", "0001cafe", "-o", "a.bmp"), "pictures: .pdf"),
+        (("view", "nowhere"), "hint:"),
+    ],
+)
+def test_mistakes_end_in_two_lines(clean_run, capsys, words, hint):
+    with pytest.raises(SystemExit) as left:
+        main([word.format(run=clean_run.path) for word in words])
+
+    lines = capsys.readouterr().err.splitlines()
+    assert left.value.code == 1
+    assert len(lines) == 2
+    assert lines[0].startswith("error: ")
+    assert hint in lines[1]
