@@ -35,7 +35,7 @@ _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
 # states hardly compress and are never searched: what costs time brings nothing
 _WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
-    "compression_level": 1,
+    "compression_level": -3,
     "use_dictionary": ["planner", "noise", "token"],
     "write_statistics": False,
 }
