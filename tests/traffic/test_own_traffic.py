@@ -1,10 +1,4 @@
-"""Traffic models of one's own, mixtures of policies, and the page that explains them."""
-
-import re
-import shlex
-import subprocess
-import sys
-from pathlib import Path
+"""Traffic models of one's own, and mixtures of policies."""
 
 import numpy as np
 import pytest
@@ -19,7 +13,6 @@ from shiftsim.traffic.idm import FixedIdmTraffic, IdmTraffic
 from shiftsim.traffic.log_replay import LogReplay
 from shiftsim.traffic.mixed import Mixed
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "own_traffic.md"
 VEHICLE, PEDESTRIAN = AgentKind.VEHICLE, AgentKind.PEDESTRIAN
 BICYCLE, CONE = AgentKind.BICYCLE, AgentKind.TRAFFIC_CONE
 KINDS = [VEHICLE, VEHICLE, PEDESTRIAN, BICYCLE, CONE]
@@ -118,17 +111,3 @@ def test_wrong_names_say_what_there_is() -> None:
     assert "constant-velocity" in str(caught.value.hint)
     with pytest.raises(ConfigError, match="'pathlib:Path' has no method 'start'"):
         make_traffic("pathlib:Path")
-
-
-@pytest.mark.slow
-def test_the_page_runs_as_it_stands(tmp_path: Path, toy: Path) -> None:
-    text = PAGE.read_text()
-    (module,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    (commands,) = re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)
-    (tmp_path / "my_traffic.py").write_text(module)
-
-    for command in commands.replace("--store demo", f"--store {toy}").splitlines():
-        words = [sys.executable, "-m", *shlex.split(command), "--workers", "1"]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "2 of 2" in done.stdout or "2/2" in done.stdout, done.stdout

@@ -1,0 +1,355 @@
+"""Every block of every page runs as it stands; links, flags and tables of columns are right."""
+
+import importlib.util
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from doc_pages import (
+    PAGES,
+    PLAIN,
+    REPOSITORY,
+    RUN,
+    SHOWN,
+    Block,
+    Session,
+    anchors,
+    click_commands,
+    links,
+    parse_only,
+    read_blocks,
+    shiftsim_calls,
+    table_below,
+)
+
+from shiftsim import config
+from shiftsim.data import schema, store_map, synthetic
+from shiftsim.data.deepplan_states import resample
+from shiftsim.data.deepplan_windows import find_runs
+from shiftsim.data.dsc3d import find_map, open_site, read_recording
+from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
+from shiftsim.planners import PLANNERS
+from shiftsim.results import TABLES
+
+DOCS = REPOSITORY / "docs"
+BLOCKS = [block for page in PAGES for block in read_blocks(page)]
+MOST_NOT_RUN = 20
+UNITS = {
+    "_us": "µs",
+    "_s": "s",
+    "_m": "m",
+    "_rad": "rad",
+    "_mps": "m/s",
+    "_mps2": "m/s²",
+    "_radps": "rad/s",
+    "_radps2": "rad/s²",
+    "_seconds": "s",
+    "_ms_mean": "ms",
+    "_ms_p95": "ms",
+}
+TYPES = {
+    pa.string(): "string",
+    pa.float64(): "float64",
+    pa.int64(): "int64",
+    pa.int32(): "int32",
+    pa.int8(): "int8",
+    pa.bool_(): "bool",
+}
+
+
+# --- what a reader has at hand
+
+
+@pytest.fixture(scope="session")
+def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo store, recordings, logs, tables and maps that the pages speak of."""
+    folder = tmp_path_factory.mktemp("material")
+    synthetic.write_demo(folder / "towns")
+    synthetic.convert_demo(folder / "towns", folder / "shiftsim-data" / "demo")
+    (folder / "dsc3d").mkdir()
+    (folder / "towns" / "junction").rename(folder / "dsc3d" / "sindelfingen")
+    shutil.rmtree(folder / "towns")
+    _write_tracks(folder, folder / "dsc3d" / "sindelfingen")
+    golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
+    for name in ("logs", "maps"):
+        shutil.copytree(golden / name, folder / "nuplan" / name)
+    shutil.copytree(REPOSITORY / "shiftsim" / "reference", folder / "reference")
+    if importlib.util.find_spec("torch"):
+        from checkpoint_files import state_of, write_published
+
+        made = write_published(folder / "downloads", "plantf", state_of("plantf"))
+        made.rename(made.with_name("planTF.ckpt"))
+    return folder
+
+
+def _write_tracks(folder: Path, recording: Path) -> None:
+    """A CSV and a map of docs/own_scenarios.md."""
+    site = open_site(recording)
+    (folder / "map.xodr").write_bytes(find_map(site).read_bytes())
+    source = read_recording(site, site.recordings[0])
+    runs = find_runs(source, 0.5)
+    tracks = resample(source, runs, log_name="", city="", offset=np.zeros(2)).tracks
+    row, column = np.nonzero(tracks.valid[:200])
+    values = (tracks.poses, tracks.velocities, tracks.sizes)
+    columns = [row, column, tracks.kinds[column], *(array[row, column] for array in values)]
+    header = "row,track,kind,x_m,y_m,heading_rad,vx_mps,vy_mps,length_m,width_m"
+    table = np.column_stack(columns)
+    np.savetxt(folder / "tracks.csv", table, delimiter=",", header=header, comments="")
+
+
+@pytest.fixture
+def desk(material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with that material; what a page imports is forgotten afterwards."""
+    shutil.copytree(material, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SHIFTSIM_DATA", raising=False)
+    monkeypatch.setenv("SHIFTSIM_CHECKPOINTS", str(tmp_path / "checkpoints"))
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(config, "_cores", lambda: 1)  # no worker processes: kernels stay warm
+    before, search = set(sys.modules), list(sys.path)
+    yield tmp_path
+    sys.path[:] = search
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+# --- blocks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_runs_as_it_stands(page: Path, desk: Path) -> None:
+    session = Session()
+    for block in read_blocks(page):
+        if not block.reason and (block.kind in (*RUN, *SHOWN) or block.file):
+            session.do(block)
+
+
+def test_tracks_and_a_map_become_scores_in_fifty_lines() -> None:
+    (code,) = (b for b in BLOCKS if b.page == "own_scenarios.md" and b.kind == "python")
+    assert len(code.text.splitlines()) <= 50
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_says_what_it_is(page: Path) -> None:
+    kinds = {block.kind for block in read_blocks(page)}
+    assert kinds <= {*RUN, *SHOWN, *PLAIN}
+
+
+def test_few_blocks_are_not_run_and_those_parse(capsys: pytest.CaptureFixture[str]) -> None:
+    idle = [block for block in BLOCKS if block.reason]
+    for block in idle:
+        if block.kind == "sh":
+            _parse(block)
+        elif block.kind == "python":
+            compile(block.text, block.where, "exec")
+    counted = [block for block in BLOCKS if block.kind in RUN]
+    with capsys.disabled():
+        print(f"\n{len(idle)} of {len(counted)} blocks of the documentation are not run:")
+        for block in idle:
+            print(f"  {block.where}: {block.reason}")
+    assert len(idle) <= MOST_NOT_RUN
+
+
+def _parse(block: Block) -> None:
+    targets = re.findall(r"^([\w-]+):", (REPOSITORY / "Makefile").read_text(), flags=re.M)
+    for line in block.commands:
+        words = line.split()
+        if words[0] == "make":
+            assert words[1] in targets, f"{block.where}: make {words[1]}"
+        for call in shiftsim_calls(line):
+            try:
+                parse_only(call)
+            except Exception as error:
+                raise AssertionError(f"{block.where}: {line}: {error}") from error
+
+
+def test_blocks_that_install_name_extras_that_exist() -> None:
+    import tomllib
+
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    extras = set(project["project"]["optional-dependencies"])
+    text = "".join(page.read_text("utf-8") for page in PAGES)
+    found = re.findall(r"(?:shiftsim|\.)\[([\w,]+)\]", text)
+    named = {name for names in found for name in names.split(",")}
+    assert named
+    assert named <= extras
+
+
+# --- commands and flags
+
+
+def test_every_command_is_in_the_documentation() -> None:
+    called = set()
+    for block in BLOCKS:
+        for line in block.commands if block.kind == "sh" else ():
+            called |= {parse_only([*call, *block.words]) for call in shiftsim_calls(line)}
+    leaves = {
+        words for words, command in click_commands().items() if not hasattr(command, "commands")
+    }
+    assert sorted(leaves - called) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_flags_in_the_text_exist(page: Path) -> None:
+    commands = click_commands().values()
+    known = {name for command in commands for option in command.params for name in option.opts}
+    known |= {name for command in commands for one in command.params for name in one.secondary_opts}
+    known |= {"--help"}
+    prose = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    said = {
+        flag
+        for code in re.findall(r"`([^`\n]+)`", prose)
+        for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code)
+    }
+    foreign = {"--array", "--gres"}  # of SLURM
+    assert sorted(said - known - foreign) == []
+
+
+# --- links
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in links(page):
+        name, _, anchor = link.partition("#")
+        if re.match(r"[a-z]+:", link):
+            continue
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        if anchor:
+            assert anchor in anchors(target), f"{page.name}: {link}"
+
+
+def test_every_page_is_in_the_index_and_in_the_navigation() -> None:
+    pages = {page.name for page in PAGES if page.parent == DOCS}
+    navigation = set(re.findall(r"([\w.]+\.md)$", (REPOSITORY / "mkdocs.yml").read_text(), re.M))
+    assert {link.partition("#")[0] for link in links(DOCS / "index.md")} >= pages - {"index.md"}
+    assert navigation == pages
+
+
+# --- tables that say what the code says
+
+
+def _unit(column: str) -> str:
+    endings = (ending for ending in sorted(UNITS, key=len, reverse=True) if column.endswith(ending))
+    return UNITS.get(next(endings, ""), "")
+
+
+def _described(table: pa.Schema) -> list[list[str]]:
+    out = []
+    for column in table:
+        is_list = pa.types.is_list(column.type)
+        name = TYPES[column.type.value_type if is_list else column.type]
+        out.append([column.name, f"list of {name}" if is_list else name, _unit(column.name)])
+    return out
+
+
+STORE_TABLES = {
+    "### scenarios.parquet": schema.SCENARIOS,
+    "### frames.parquet": schema.FRAMES,
+    "### tracks.parquet": schema.TRACKS,
+    "### ego-NAME.parquet": schema.EGO,
+}
+RUN_TABLES = {f"### {name}.parquet": table for name, table in TABLES.items()}
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "table"),
+    [
+        *((DOCS / "store_format.md", *item) for item in STORE_TABLES.items()),
+        *((DOCS / "run_folder.md", *item) for item in RUN_TABLES.items()),
+    ],
+    ids=[*STORE_TABLES, *RUN_TABLES],
+)
+def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: pa.Schema) -> None:
+    assert [row[:3] for row in table_below(page, heading)] == _described(table)
+
+
+def test_verdicts_of_the_filter_are_described() -> None:
+    from shiftsim.filtering import _SCHEMA
+
+    rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
+    assert [row[:3] for row in rows] == _described(_SCHEMA)
+
+
+def test_columns_of_a_map_are_those_of_the_file() -> None:
+    rows = table_below(DOCS / "store_format.md", "### maps/CITY.parquet")
+    found = [
+        ["".join(parts), kind]
+        for columns, kind, *_ in rows
+        for parts in itertools.product(
+            *(piece.strip("{}").split(", ") for piece in re.findall(r"\{[^}]*\}|[^{]+", columns))
+        )
+    ]
+    expected = [[name, kind] for name, kind, _ in _described(store_map.SCHEMA)]
+    assert sorted(found) == sorted(expected)
+
+
+@pytest.mark.slow
+def test_columns_of_a_rollout_are_those_of_the_file(desk: Path) -> None:
+    import shiftsim
+
+    split = {"store": "demo", "split": "demo-mini", "limit": 1, "workers": 1}
+    run = shiftsim.run("log-future", traffic="reactive", out="run", **split)
+    (path,) = (run.path / "rollouts").iterdir()
+    table = pa.parquet.read_schema(path)
+    plain = pa.schema(
+        [(c.name, c.type.value_type if pa.types.is_dictionary(c.type) else c.type) for c in table]
+    )
+    rows = table_below(DOCS / "run_folder.md", "### rollouts/")
+    assert [row[:3] for row in rows] == _described(plain)
+
+
+def test_thresholds_are_those_of_the_profiles() -> None:
+    rows = table_below(DOCS / "metrics.md", "## Thresholds")
+    names = [name for name in PROFILES["nuplan"].__dataclass_fields__ if name != "name"]
+    expected = [
+        [name, *(f"{getattr(PROFILES[profile], name):g}" for profile in ("nuplan", "deepplan"))]
+        for name in names
+    ]
+    assert [row[:3] for row in rows] == expected
+
+
+def test_weights_are_those_of_the_score() -> None:
+    rows = table_below(DOCS / "metrics.md", "## The score")
+    roles: dict[str, Any] = dict.fromkeys(MULTIPLIERS, "factor")
+    roles |= {name: f"weight {weight:g}" for name, weight in WEIGHTS.items()}
+    assert [row[:3] for row in rows] == [[SHORT_NAMES[n], n, role] for n, role in roles.items()]
+
+
+def test_checkpoints_are_those_of_the_planners() -> None:
+    rows = table_below(DOCS / "learned_planners.md", "## Which file")
+    expected = [
+        [entry.name, entry.checkpoint.project, entry.checkpoint.file, entry.checkpoint.name]
+        for entry in PLANNERS.values()
+        if entry.checkpoint
+    ]
+    assert sorted(row[:4] for row in rows) == sorted(expected)
+
+
+# --- the site
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="needs the dependency group `docs`")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for page in DOCS.glob("*.md"):
+        place = "index.html" if page.stem == "index" else f"{page.stem}/index.html"
+        assert (tmp_path / place).is_file()
+    assert json.loads((tmp_path / "search" / "search_index.json").read_text())["docs"]
+    assert not os.path.exists(REPOSITORY / "site")
