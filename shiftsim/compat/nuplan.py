@@ -69,7 +69,17 @@ def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
 
 
 def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
-    """What makes wrapped planners of a class; it takes the arguments of the class's constructor."""
+    """What makes wrapped planners of a class; it takes the arguments of the class's constructor.
+
+    Raises:
+        ConfigError: It is no class of nuPlan planners, or asks for what shiftsim does not have.
+    """
+    if not inspect.isclass(kind):
+        raise ConfigError(
+            f"{getattr(kind, '__name__', kind)!r} is not a class",
+            hint="nuplan:package.module:Class",
+        )
+    _check(kind)
 
     def make(**arguments: Any) -> "NuplanPlanner":
         return wrap(kind, **arguments)
