@@ -116,11 +116,12 @@ def desk(material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.setattr(config, "_cores", lambda: 1)  # no worker processes: kernels stay warm
-    before, search = set(sys.modules), list(sys.path)
+    before, search, finders = set(sys.modules), list(sys.path), list(sys.meta_path)
     yield tmp_path
-    sys.path[:] = search
+    sys.path[:], sys.meta_path[:] = search, finders
     for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(str(tmp_path)):
+        file = str(getattr(sys.modules[name], "__file__", None) or "")
+        if file.startswith(str(tmp_path)) or name.partition(".")[0] == "nuplan":
             del sys.modules[name]
 
 
