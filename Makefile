@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-kill lint types bench verify dist clean-cache
+.PHONY: install demo test test-fast test-kill test-browser lint types docs bench verify dist clean-cache
 
 install: .venv/installed
 
@@ -31,6 +31,9 @@ lint: install
 
 types: install
 	$(BIN)/mypy
+
+docs: install
+	$(BIN)/python -m mkdocs build --strict --site-dir build/docs
 
 bench: install
 	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s -p no:cacheprovider --benchmark-disable-gc --benchmark-columns=median,iqr
