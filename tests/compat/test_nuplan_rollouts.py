@@ -13,14 +13,16 @@ from shiftsim.planners import load_planner
 from shiftsim.simulation import simulate
 from shiftsim.state import AgentKind, LightStatus, TrafficLights, Trajectory, center_poses
 
-nuplan.install()
+# the devkit's own footprint loses the last bit of the rear axle
+TOLERANCE = 0.0 if nuplan.install() else 1e-9
 import nuplan_planners as planners  # noqa: E402  # the names must exist first
 
 
 def _same(one, other):
-    np.testing.assert_array_equal(one.ego, other.ego)
-    np.testing.assert_array_equal(one.commands, other.commands)
-    np.testing.assert_array_equal(one.plans, other.plans)
+    for name in ("ego", "commands", "plans"):
+        np.testing.assert_allclose(
+            getattr(one, name), getattr(other, name), rtol=0, atol=TOLERANCE, err_msg=name
+        )
 
 
 def _turned(scenario):
