@@ -32,6 +32,7 @@ from doc_pages import (
 )
 
 from shiftsim import config
+from shiftsim.benchmarks import load_track
 from shiftsim.data import schema, store_map, synthetic
 from shiftsim.data.deepplan_states import resample
 from shiftsim.data.deepplan_windows import find_runs
@@ -113,6 +114,7 @@ def desk(material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SHIFTSIM_DATA", raising=False)
     monkeypatch.setenv("SHIFTSIM_CHECKPOINTS", str(tmp_path / "checkpoints"))
+    monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.setattr(config, "_cores", lambda: 1)  # no worker processes: kernels stay warm
@@ -338,6 +340,18 @@ def test_checkpoints_are_those_of_the_planners() -> None:
         if entry.checkpoint
     ]
     assert sorted(row[:4] for row in rows) == sorted(expected)
+
+
+def test_the_planning_arithmetic_adds_up() -> None:
+    *rows, total = table_below(DOCS / "reproducing.md", "### An example")
+    rollouts = 2_300 * load_track("state-drift").rollouts_per_scenario
+    hours = [rollouts / 2 * (float(row[1]) + float(row[2])) / 3600 for row in rows]
+    expected = [*((rollouts, each) for each in hours), (len(rows) * rollouts, sum(hours))]
+    found = [[cell.replace(",", "") for cell in row[3:]] for row in (*rows, total)]
+    assert found == [[str(count), f"{each:.0f}"] for count, each in expected]
+    text = (DOCS / "reproducing.md").read_text("utf-8")
+    assert f"{sum(hours) / 64:.1f} hours on 64 cores" in text
+    assert f"{sum(hours) / 48:.0f} days on two" in text
 
 
 # --- the site
