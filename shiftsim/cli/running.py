@@ -30,7 +30,7 @@ _BEFORE = {
 
 Planners = Annotated[
     list[str] | None,
-    typer.Option("--planner", "-p", help="Name or package.module:Class; repeatable."),
+    typer.Option("--planner", "-p", help="Name or [nuplan:]package.module:Class; repeatable."),
 ]
 PlannerArgs = Annotated[
     list[str] | None,
