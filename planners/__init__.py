@@ -186,7 +186,12 @@ def planner_factory(spec: str) -> Any:
         MissingExtraError: It needs more of nuPlan's devkit than its stand-ins have.
     """
     for prefix, adapter in _ADAPTERS.items():
-        if spec.startswith(prefix) and spec.count(":") > 1:
+        if spec.startswith(prefix):
+            if spec.count(":") != 2:
+                raise ConfigError(
+                    f"planner {spec!r} is not of the form {prefix}package.module:Class",
+                    hint=f"for example {prefix}my_package.my_module:MyPlanner",
+                )
             compat = importlib.import_module(adapter)
             compat.install()
             return compat.factory(planner_factory(spec.removeprefix(prefix)))

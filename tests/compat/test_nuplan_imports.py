@@ -115,6 +115,11 @@ def test_what_cannot_drive_is_refused_before_the_run(name, message):
         load_planner(f"nuplan:nuplan_planners:{name}")
 
 
+def test_a_name_of_another_form_is_explained():
+    with pytest.raises(ConfigError, match=r"not of the form nuplan:package\.module:Class"):
+        load_planner("nuplan:Coast")
+
+
 def test_a_module_that_needs_more_of_the_devkit_says_so(tmp_path, monkeypatch):
     (tmp_path / "needy.py").write_text("from nuplan.planning.script import builders\n")
     monkeypatch.chdir(tmp_path)
