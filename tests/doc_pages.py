@@ -174,7 +174,10 @@ def parse_only(words: list[str]) -> tuple[str, ...]:
     path: tuple[str, ...] = ()
     while len(words) > len(path) and (*path, words[len(path)]) in commands:
         path = (*path, words[len(path)])
-    commands[path].make_context(" ".join(path), words[len(path) :])
+    rest = words[len(path) :]
+    unknown = [word for word in rest[:1] if not word.startswith("-")]
+    assert not (hasattr(commands[path], "commands") and unknown), f"no command {words!r}"
+    commands[path].make_context(" ".join(path), rest)
     return path
 
 
