@@ -4,6 +4,7 @@ Written straight from planner-diffusion.md with torch's own attention: the encod
 all rows, used or not; every call of the sampler computes the whole decoder.
 """
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,14 @@ from torch.nn import functional
 
 from shiftsim.planners.nets import diffusion_encoder as encoder
 from shiftsim.planners.nets.diffusion_sampler import SCHEDULE, sample
+
+
+def plain_network(network: Any) -> Any:
+    """A copy whose weights lie in memory as torch makes them."""
+    made = copy.deepcopy(network)
+    for parameter in made.parameters():
+        parameter.data = parameter.data.contiguous()
+    return made
 
 
 def plain_sample(network: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
@@ -33,7 +42,7 @@ def _decode(
     dit: Any, x: Tensor, time: Tensor, route: Tensor, tokens: Tensor, absent: Tensor
 ) -> Tensor:
     kinds = torch.cat([dit.agent_embedding.weight[:1]] + [dit.agent_embedding.weight[1:]] * 10)
-    x = dit.preproj(x) + kinds
+    x = _mlp(dit.preproj, x) + kinds
     y = _route(dit.route_encoder, route) + dit.t_embedder(time)
     for block in dit.blocks:
         shift1, scale1, gate1, shift2, scale2, gate2 = block.adaLN_modulation(y)[:, None].chunk(
@@ -41,9 +50,9 @@ def _decode(
         )
         z = block.norm1(x) * (1 + scale1) + shift1
         x = x + gate1 * _attend(block.attn, z, z, absent)
-        x = x + gate2 * block.mlp1(block.norm2(x) * (1 + scale2) + shift2)
+        x = x + gate2 * _mlp(block.mlp1, block.norm2(x) * (1 + scale2) + shift2)
         x = _attend(block.cross_attn, block.norm3(x), tokens, None)
-        x = block.mlp2(block.norm4(x))
+        x = _mlp(block.mlp2, block.norm4(x))
     last = dit.final_layer
     shift, scale = last.adaLN_modulation(y)[:, None].chunk(2, dim=-1)
     return last.proj(last.norm_final(x) * (1 + scale) + shift)
@@ -51,8 +60,9 @@ def _decode(
 
 def _route(net: Any, route: Tensor) -> Tensor:
     points = route[..., :4].flatten(1, 2)
-    x = net.token_pre_project(net.channel_pre_project(points).transpose(1, 2)).transpose(1, 2)
-    x = net.emb_project(net.norm(_mix(net.Mixer, x).mean(dim=1)))
+    x = _mlp(net.channel_pre_project, points).transpose(1, 2)
+    x = _mlp(net.token_pre_project, x).transpose(1, 2)
+    x = _mlp(net.emb_project, net.norm(_mix(net.Mixer, x).mean(dim=1)))
     return x * (points != 0).any(-1).any(-1, keepdim=True)
 
 
@@ -96,7 +106,7 @@ def plain_encode(net: Any, scene: Mapping[str, Tensor]) -> Tensor:
     )
     tokens = [
         _agents(net.neighbor_encoder, agents) + net.pos_emb(encoder._positions(agents[:, -1], 0)),
-        net.static_encoder(objects) + net.pos_emb(encoder._positions(objects, 1)),
+        _mlp(net.static_encoder.projection, objects) + net.pos_emb(encoder._positions(objects, 1)),
         _lanes(net.lane_encoder, lanes, limit, known)
         + net.pos_emb(encoder._lane_positions(lanes[:, encoder.MIDDLE])),
     ]
@@ -106,30 +116,34 @@ def plain_encode(net: Any, scene: Mapping[str, Tensor]) -> Tensor:
     valid[:, 0] = True
     for block in net.fusion.blocks:
         x = x + _attend(block.attn, block.norm1(x), x, ~valid)
-        x = x + block.mlp(block.norm2(x))
+        x = x + _mlp(block.mlp, block.norm2(x))
     return net.fusion.norm(x)
 
 
 def _agents(net: Any, agents: Tensor) -> Tensor:
     present = (agents[..., :8] != 0).any(-1, keepdim=True)
     x = _mean(net, torch.cat([agents[..., :8], present], dim=-1))
-    return net.emb_project(net.norm(x + net.type_emb(agents[:, -1, 8:])))
+    return _mlp(net.emb_project, net.norm(x + net.type_emb(agents[:, -1, 8:])))
 
 
 def _lanes(net: Any, lanes: Tensor, limit: Tensor, known: Tensor) -> Tensor:
     speed = torch.where(known, net.speed_limit_emb(limit), net.unknown_speed_emb.weight)
     x = _mean(net, lanes[..., :8]) + speed + net.traffic_emb(lanes[:, 0, 8:])
-    return net.emb_project(net.norm(x))
+    return _mlp(net.emb_project, net.norm(x))
 
 
 def _mean(net: Any, x: Tensor) -> Tensor:
-    x = net.channel_pre_project(x).transpose(1, 2)
-    x = net.token_pre_project(x).transpose(1, 2)
+    x = _mlp(net.channel_pre_project, x).transpose(1, 2)
+    x = _mlp(net.token_pre_project, x).transpose(1, 2)
     for block in net.blocks:
         x = _mix(block, x)
     return x.mean(dim=1)
 
 
 def _mix(block: Any, x: Tensor) -> Tensor:
-    x = x + block.tokens_mlp(block.norm1(x).transpose(1, 2)).transpose(1, 2)
-    return x + block.channels_mlp(block.norm2(x))
+    x = x + _mlp(block.tokens_mlp, block.norm1(x).transpose(1, 2)).transpose(1, 2)
+    return x + _mlp(block.channels_mlp, block.norm2(x))
+
+
+def _mlp(net: Any, x: Tensor) -> Tensor:
+    return net.fc2(functional.gelu(net.fc1(x), approximate=net.approximate))

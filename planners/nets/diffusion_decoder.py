@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.nets.diffusion_parts import EPS, Attention, Mixer, Mlp
+from shiftsim.planners.nets.diffusion_parts import EPS, Attention, Mixer, Mlp, tanh_gelu_
 
 ROUTE_COLUMNS, ROUTE_TOKENS, ROUTE_CHANNELS = 4, 32, 64
 FREQUENCIES, LONGEST = 128, 10000.0  # of the time embedding
@@ -23,15 +23,15 @@ class Prepared(NamedTuple):
     """What all calls of one plan share. S sampler times, D blocks.
 
     Attributes:
-        modulation: D tensors (S, B, 1, 6 * hidden): shift, scale and gate, twice.
-        final: (S, B, 1, 2 * hidden) shift and scale of the last layer.
+        modulation: By block and call: shift, scale and gate, twice, each (B, 1, hidden).
+        final: By call: shift and scale of the last layer, each (B, 1, hidden).
         keys: D tensors (B, heads, N, C) of the scene's tokens.
         values: D tensors of the same shape.
         mask: (B, 1, 1, A) added to the logits of the agents; None where all are present.
     """
 
-    modulation: list[Tensor]
-    final: Tensor
+    modulation: list[list[tuple[Tensor, ...]]]
+    final: list[tuple[Tensor, ...]]
     keys: list[Tensor]
     values: list[Tensor]
     mask: Tensor | None
@@ -92,10 +92,15 @@ class DiTBlock(nn.Module):
         self.mlp2 = Mlp(hidden, 4 * hidden, hidden, approximate="tanh")
 
     def forward(
-        self, x: Tensor, modulation: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None
+        self,
+        x: Tensor,
+        modulation: tuple[Tensor, ...],
+        keys: Tensor,
+        values: Tensor,
+        mask: Tensor | None,
     ) -> Tensor:
         """(B, A, hidden) to the same; the other arguments as in `Prepared`."""
-        shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=-1)
+        shift1, scale1, gate1, shift2, scale2, gate2 = modulation
         y = torch.addcmul(shift1, self.norm1(x), scale1)
         x = torch.addcmul(x, gate1, self.attn(*self.attn.project_all(y), mask))
         y = torch.addcmul(shift2, self.norm2(x), scale2)
@@ -121,10 +126,12 @@ class FinalLayer(nn.Module):
         )
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(hidden, 2 * hidden))
 
-    def forward(self, x: Tensor, modulation: Tensor) -> Tensor:
+    def forward(self, x: Tensor, modulation: tuple[Tensor, ...]) -> Tensor:
         """(B, A, hidden) to (B, A, outputs)."""
-        shift, scale = modulation.chunk(2, dim=-1)
-        out: Tensor = self.proj(torch.addcmul(shift, self.norm_final(x), scale))
+        shift, scale = modulation
+        norm, first, _, last_norm, last = self.proj
+        x = first(norm(torch.addcmul(shift, self.norm_final(x), scale)))
+        out: Tensor = last(last_norm(tanh_gelu_(x)))
         return out
 
 
@@ -170,17 +177,18 @@ class DiT(nn.Module):
             hidden = factors.shape[-1] // 6
             factors[..., hidden : 2 * hidden] += one  # scales are about 1
             factors[..., 4 * hidden : 5 * hidden] += one
-            modulation.append(factors)
+            modulation.append([call.chunk(6, dim=-1) for call in factors])
             key, value = block.cross_attn.keys_values(context)
-            keys.append(key.contiguous())
-            values.append(value.contiguous())
+            keys.append(key)
+            values.append(value)
         final = self.final_layer.adaLN_modulation[1](condition)
         final[..., final.shape[-1] // 2 :] += one
         mask = None
         if bool(absent.any()):
             zeros = torch.zeros(absent.shape, device=context.device)
             mask = zeros.masked_fill(absent, NO_KEY)[:, None, None, :]
-        return Prepared(modulation, final, keys, values, mask)
+        ends = [call.chunk(2, dim=-1) for call in final]
+        return Prepared(modulation, ends, keys, values, mask)
 
     def forward(self, x: Tensor, prepared: Prepared, call: int) -> Tensor:
         """One call of the network.

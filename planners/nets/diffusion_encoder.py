@@ -15,7 +15,7 @@ POSITION = 7  # x, y, cos, sin, and one-hot agent, static object, lane
 TOKENS, CHANNELS = 64, 128  # inside the mixers
 MIDDLE = 10  # point of a lane that stands for its position
 NO_KEY = float("-inf")
-TOGETHER = 16  # rows that pass through the mixers at a time: what they make stays in the cache
+TOGETHER = 36  # rows that pass through the mixers at a time: what they make stays in the cache
 
 
 class MixerEncoder(nn.Module):
@@ -112,7 +112,8 @@ class FusionBlock(nn.Module):
         """(B, N, hidden) to the same; `mask` is added to the logits."""
         keys, values = self.attn.keys_values(x)
         x = x + self.attn(self.attn.query(self.norm1(x)), keys, values, mask)
-        return x + self.mlp(self.norm2(x))
+        self.mlp.add_to(x, self.norm2(x))
+        return x
 
 
 class Fusion(nn.Module):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from shiftsim.errors import CheckpointError
 from shiftsim.planners.nets.diffusion_decoder import DiT, Prepared
 from shiftsim.planners.nets.diffusion_encoder import SceneEncoder
+from shiftsim.planners.nets.diffusion_parts import store_by_columns
 from shiftsim.planners.nets.diffusion_sampler import SCHEDULE, STATE, sample
 
 ROWS = 4  # of agents; a matrix product of 12 rows is faster than one of 11
@@ -112,6 +113,7 @@ class DiffusionNetwork(nn.Module):
             {name: Normaliser(row) for name, row in args["observation_normalizer"].items()}
         )
         self.state_normaliser = Normaliser(args["state_normalizer"])
+        store_by_columns(self)
 
     def normalise(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The inputs as the network reads them; those without a normaliser as they are."""
