@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-kill test-browser lint types docs bench verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-kill test-browser lint types docs bench verify dist clean-cache
 
 install: .venv/installed
 
@@ -15,10 +15,13 @@ demo: install
 	$(BIN)/shiftsim demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not browser"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not browser and not thorough"
 
 test-fast: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser and not thorough"
+
+test-thorough: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough and not browser"
 
 test-kill: install
 	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/run/test_kills.py

@@ -34,7 +34,7 @@ class Choice:
         wanted = [
             task
             for task in sorted(tasks)
-            if (not self.planners or task.planner in self.planners)
+            if (not self.planners or _bare(task.planner) in self.planners)
             and (not self.noises or task.noise in self.noises)
             and (not self.seeds or task.seed in self.seeds or task.noise == "none")
         ]
@@ -42,6 +42,11 @@ class Choice:
             return wanted
         first = {(task.planner, task.noise): task for task in reversed(wanted)}
         return [task for task in wanted if first[task.planner, task.noise] == task]
+
+
+def _bare(planner: str) -> str:
+    """A planner's name without the remark that tells runs apart."""
+    return planner.partition(" (")[0]
 
 
 class Gallery:

@@ -21,7 +21,7 @@ RESULTS = ("scores.parquet", "metrics.parquet")
 NOISY = {"noise": ["none", "ou-high"], "seeds": [0, 1]}
 BAD = "0001cafe"
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 
 def command(*words):

@@ -25,7 +25,7 @@ PATH = [path for path in [os.environ.get("PYTHONPATH")] if path]
 SIGNS = ("manifest.json", JOURNAL, ".tasks.parquet.tmp", "scores.parquet")
 PATIENCE = 60 + 20 * SECONDS
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 
 @pytest.fixture(scope="module")

@@ -69,6 +69,7 @@ def test_results_are_the_same_in_any_order_and_with_used_models(planner, traffic
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="MALLOC_PERTURB_ belongs to glibc")
+@pytest.mark.thorough
 def test_results_do_not_depend_on_what_memory_held_before() -> None:
     # glibc fills what it hands out with this byte, so that reading it before writing shows
     code = DIGEST.format(folder=str(Path(__file__).parent))
