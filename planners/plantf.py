@@ -21,7 +21,7 @@ from shiftsim.planners.features import (
     straight_on,
 )
 from shiftsim.planners.features_map import LightLookup, RoadFeatures, road_features
-from shiftsim.planners.learned import LearnedPlanner
+from shiftsim.planners.learned import LearnedPlanner, infer_alike
 from shiftsim.planners.plan_states import STEP, plan_of_poses
 from shiftsim.planners.route_correction import RouteCorrector
 from shiftsim.state import AX, HEADING, PACIFICA, VX, Trajectory, center_poses
@@ -110,7 +110,12 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         return Features(agents, road, current_state(history), self._route)
 
     def infer(self, features: Sequence[Features]) -> Sequence[Plans]:
-        """Six plans per scene."""
+        """Six plans per scene; on a CPU in groups of scenes of about the same size."""
+        if self._device == "cpu":
+            return infer_alike(self._pass, features, num_tokens)
+        return self._pass(features)
+
+    def _pass(self, features: Sequence[Features]) -> list[Plans]:
         import torch
 
         with torch.inference_mode():
@@ -167,6 +172,11 @@ def current_state(history: History) -> np.ndarray:
         steer = np.clip(np.arctan(turn * PACIFICA.wheel_base / abs(speed)), -MAX_STEER, MAX_STEER)
         yaw_rate = np.clip(turn, -MAX_YAW_RATE, MAX_YAW_RATE)
     return np.array([0.0, 0.0, 0.0, speed, ego[-1, AX], steer, yaw_rate], np.float32)
+
+
+def num_tokens(one: Features) -> int:
+    """Tokens that the network makes of a scene: agents and polygons."""
+    return len(one.agents.valid) + len(one.road.valid)
 
 
 def make_batch(features: Sequence[Features], device: str) -> Any:

@@ -112,6 +112,11 @@ def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> Array:
     return out
 
 
+def num_tokens(scene: SceneInputs) -> int:
+    """Tokens that the network makes of a scene: agents, polygons, static objects."""
+    return len(scene.category) + len(scene.kind) + len(scene.object_category)
+
+
 def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
     """Tensors of a batch; scenes with fewer rows are filled up with zeros, valid nowhere."""
     import torch

@@ -15,6 +15,7 @@ from shiftsim.simulation import Rollout, simulate, simulate_together
 from shiftsim.state import AgentKind, Command, Trajectory
 
 TIMES = np.arange(41) * 0.1
+POISON = -1.0  # a feature at which the "network" fails
 
 
 class Weaver(LearnedPlanner):
@@ -33,10 +34,14 @@ class Weaver(LearnedPlanner):
             raise ZeroDivisionError("no features")
         self.seen.append(observation.iteration)
         near = np.nansum(observation.tracks.poses[..., 0])
-        return np.array([*observation.ego.pose, observation.ego.speed, near, len(self.seen)])
+        poison = observation.iteration == self.fail_at and self.how == "infer"
+        steps = POISON if poison else len(self.seen)
+        return np.array([*observation.ego.pose, observation.ego.speed, near, steps])
 
     def infer(self, features):
         self.batches.append(len(features))
+        if any(row[-1] == POISON for row in features):
+            raise ZeroDivisionError("no output")
         return [5.0 + 3.0 * np.sin(row.sum()) for row in features]
 
     def decode(self, output, observation):
@@ -147,6 +152,25 @@ def test_an_error_in_one_scenario_ends_no_other(how, kind, fail_at):
         assert_same(logs[index], simulate(scenes[index], Weaver()))
     full = fail_at + (how != "features")
     assert planner.batches == [4] * full + [3] * (19 - full)
+
+
+def test_a_scene_at_which_the_network_fails_ends_no_other():
+    planner = Weaver()
+    scenes = [scene(number) for number in range(4)]
+    planners = forks_of(planner, 4)
+    planners[2].trouble = (7, "infer", ())
+    logs = together(scenes, planners)
+    assert isinstance(logs[2], ZeroDivisionError)
+    for index in (0, 1, 3):
+        assert_same(logs[index], simulate(scenes[index], Weaver()))
+    assert planner.batches == [4] * 8 + [1] * 4 + [3] * 11
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_network_that_fails_at_every_scene_ends_all(count):
+    planners = forks_of(Weaver(0, "infer"), count)
+    logs = together([scene(number) for number in range(count)], planners)
+    assert [str(log) for log in logs] == ["no output"] * count
 
 
 def test_a_batch_in_which_all_fail_is_over():
