@@ -41,7 +41,13 @@ Noises = Annotated[
     typer.Option("--noise", "-n", help="none, awgn-low … ou-high, all; repeatable. [none]"),
 ]
 Seeds = Annotated[str | None, typer.Option(help="Noise seeds, such as 0,1,2. [0]")]
-Traffic = Annotated[str | None, typer.Option(help="nonreactive. [nonreactive]")]
+Traffic = Annotated[
+    str | None,
+    typer.Option(
+        help="nonreactive (nr), reactive (r), reactive-fixed, constant-velocity, or "
+        "package.module:Model. [nonreactive]"
+    ),
+]
 Controller = Annotated[
     str | None, typer.Option(help="lqr, perfect or log-playback. [lqr]", show_default=False)
 ]
