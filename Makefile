@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-thorough test-kill test-browser lint types docs bench verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-docs test-kill test-browser lint types docs bench verify dist clean-cache
 
 install: .venv/installed
 
@@ -22,6 +22,9 @@ test-fast: install
 
 test-thorough: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough and not browser"
+
+test-docs: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile tests/docs
 
 test-kill: install
 	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/run/test_kills.py

@@ -9,7 +9,7 @@ from stores import write_toy_store
 
 import shiftsim
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 TINY = ("-p", "constant-velocity", "-s", "toy", "--workers", "1", "--quiet")
 

@@ -15,7 +15,7 @@ from checkpoint_files import LEARNED, Callback, lightning_entries, save, state_o
 
 from shiftsim.planners.checkpoint import load_weights
 
-pytestmark = [pytest.mark.learned, pytest.mark.slow]
+pytestmark = [pytest.mark.learned, pytest.mark.slow, pytest.mark.thorough]
 
 
 def call(folder, *words):

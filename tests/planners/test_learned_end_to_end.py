@@ -24,7 +24,7 @@ from shiftsim.state import AgentKind
 if importlib.util.find_spec("torch") is None:
     pytest.skip("needs torch", allow_module_level=True)
 
-pytestmark = [pytest.mark.learned, pytest.mark.slow]
+pytestmark = [pytest.mark.learned, pytest.mark.slow, pytest.mark.thorough]
 
 LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 STEPS = 13

@@ -71,6 +71,7 @@ def test_where_the_common_pass_fails_the_scenarios_are_done_one_by_one(toy, tmp_
     assert content(result) == content(one_by_one)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_death_in_a_batch_costs_one_scenario(toy, tmp_path, one_by_one):
     result = run(toy, tmp_path / "run", trouble="death", batch_size=5, workers=2)

@@ -191,6 +191,7 @@ def test_what_failed_is_done_again_when_asked_for(toy, tmp_path, monkeypatch):
     assert content(again) == content(clean)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_hung_planner_is_ended_and_named(toy, tmp_path, workers):

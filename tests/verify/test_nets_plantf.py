@@ -85,6 +85,7 @@ def test_a_shortened_loop_is_equal(tmp_path, scenes):
     assert report.not_covered == {}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(short_loop()))
 def test_a_changed_value_of_a_loop_is_noticed(tmp_path, scenes, rng, name):
     arrays = short_loop()
@@ -94,6 +95,7 @@ def test_a_changed_value_of_a_loop_is_noticed(tmp_path, scenes, rng, name):
         assert report.exit_code(require_all=True) != 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(set(arrays_of(FORWARD)) - set(UNUSED)))
 def test_a_changed_value_of_an_input_or_output_is_noticed(tmp_path, scenes, rng, name):
     arrays = arrays_of(FORWARD)
@@ -138,6 +140,7 @@ def test_a_scene_that_is_not_at_hand_is_not_covered(tmp_path):
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "change",
     [

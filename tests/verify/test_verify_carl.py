@@ -90,6 +90,7 @@ def test_without_the_scenes_loops_and_routes_are_not_covered(tmp_path):
     assert f"{ROUTES}: scene s04_left_turn, which is not at hand" in report.not_covered
 
 
+@pytest.mark.thorough
 def test_a_changed_output_of_a_loop_is_a_mismatch(tmp_path, scenes):
     arrays = arrays_of(LOOP)
     wanted = set()
@@ -108,6 +109,7 @@ def test_a_changed_output_of_a_loop_is_a_mismatch(tmp_path, scenes):
     assert {where.split()[-1] for _, where in pictures} == {str(c + 7) for c in range(9)}
 
 
+@pytest.mark.thorough
 def test_a_changed_list_of_what_was_drawn_is_a_mismatch(tmp_path, scenes):
     arrays = arrays_of(LOOP)
     names = [name for name in arrays if name.startswith("it19/cache/")]
@@ -122,6 +124,7 @@ def test_a_changed_list_of_what_was_drawn_is_a_mismatch(tmp_path, scenes):
     assert wanted | {("carl lanes", f"{stem} iteration 0")} == differing(report)
 
 
+@pytest.mark.thorough
 def test_a_changed_input_of_a_loop_is_a_mismatch(tmp_path, scenes):
     arrays = arrays_of(LOOP)
     meta = ("token", "scenario_type", "map_name", "route_roadblock_ids", "state_columns")
@@ -188,6 +191,7 @@ def test_pixels_may_differ_where_a_vertex_lies_on_their_border_and_are_listed(tm
     assert 0 < count == sum(line.endswith("(border)") for line in report.informative)
 
 
+@pytest.mark.thorough
 def test_a_changed_decoding_is_a_mismatch(tmp_path, scenes):
     name = "action_decode.npz"
     arrays = arrays_of(name)
@@ -203,6 +207,7 @@ def test_a_changed_decoding_is_a_mismatch(tmp_path, scenes):
     assert differing(compared(name, arrays, tmp_path, scenes)) == {("carl step [s]", name)}
 
 
+@pytest.mark.thorough
 def test_a_changed_number_of_the_network_is_a_mismatch(tmp_path, scenes):
     name = "forward_dense.npz"
     arrays = arrays_of(name)
@@ -222,6 +227,7 @@ def test_a_changed_number_of_the_network_is_a_mismatch(tmp_path, scenes):
         assert compared(name, {**arrays, key: other}, tmp_path, scenes).mismatches, key
 
 
+@pytest.mark.thorough
 def test_a_changed_manifest_is_a_mismatch(tmp_path, scenes):
     content = json.loads((GOLDEN / "carl" / "state_dict.json").read_text())
     entries = content["entries"]
@@ -242,6 +248,7 @@ def test_a_changed_manifest_is_a_mismatch(tmp_path, scenes):
     assert ("carl selfcheck", "policy_head.0.weight") in found
 
 
+@pytest.mark.thorough
 def test_a_changed_route_is_a_mismatch(tmp_path, scenes):
     content = json.loads((GOLDEN / "route_correction" / ROUTES).read_text())
     content["map"] = "elsewhere"

@@ -97,17 +97,20 @@ def test_everything_agrees_and_nothing_is_left_out(scenes, nuplan_reference, qui
     assert report.num_cases > 500
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", names_of(LOOP))
 def test_a_changed_value_of_a_closed_loop_is_seen(tmp_path, scenes, quick, name):
     report = report_of(folder_with(tmp_path, LOOP, name, -1), scenes)
     assert report.mismatches or report.not_covered
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", names_of(FORWARD))
 def test_a_changed_value_of_a_forward_pass_is_seen(tmp_path, scenes, quick, name):
     assert report_of(folder_with(tmp_path, FORWARD, name, -1), scenes).mismatches
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("file", "name"), [(f, n) for f in (AGENTS, LANES) for n in names_of(f)])
 def test_a_changed_value_of_a_crowded_scene_is_seen(tmp_path, scenes, file, name):
     index = next((i for start, i in PLACES.items() if name.startswith(start)), 0)
@@ -125,6 +128,7 @@ def leaves(value, path=()):
         yield path
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("file", ["args.json", "sampler.json"])
 def test_a_changed_value_of_the_settings_is_seen(tmp_path, scenes, file):
     content = json.loads((GOLDEN / file).read_text())
@@ -141,6 +145,7 @@ def test_a_changed_value_of_the_settings_is_seen(tmp_path, scenes, file):
     assert unseen == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "change",
     [

@@ -102,6 +102,7 @@ def test_everything_agrees_and_nothing_is_left_out(nuplan_reference):
     assert report.num_cases > 1500
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [n for n in names_of(LOOP) if not n.startswith("it01")])
 def test_a_changed_value_of_a_closed_loop_is_seen(tmp_path, scenes, name):
     padded = name.endswith(("reference_line.position", "agent.position"))  # their last row is
@@ -109,17 +110,20 @@ def test_a_changed_value_of_a_closed_loop_is_seen(tmp_path, scenes, name):
     assert report.mismatches or report.not_covered
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", names_of(BRAKES, details=False))
 def test_a_changed_value_of_a_braking_loop_is_seen(tmp_path, scenes, name):
     report = report_of(with_change(tmp_path, BRAKES, name), scenes)
     assert report.mismatches or report.not_covered
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(set(names_of(FORWARD)) - UNREAD))
 def test_a_changed_value_of_a_forward_pass_is_seen(tmp_path, scenes, name):
     assert report_of(with_change(tmp_path, FORWARD, name), scenes).mismatches
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(set(names_of(BRAKE)) - FREE))
 def test_a_changed_value_of_the_brake_is_seen(tmp_path, scenes, name):
     index = 0 if name in ("ego", "states") else -1  # the first case brakes
@@ -166,6 +170,7 @@ def test_another_choice_in_a_near_tie_is_listed(tmp_path, scenes):
     assert not any("best candidate" in line for line in report.mismatches)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "change",
     [
