@@ -27,6 +27,12 @@ class Slow(ConstantVelocity):
     def plan(self, observation):
         time.sleep(0.05)
         return super().plan(observation)
+
+
+class Slower(Slow):
+    def plan(self, observation):
+        time.sleep(0.15)
+        return super().plan(observation)
 """
 
 
@@ -165,7 +171,7 @@ def test_planners_are_checked(place):
 
 @pytest.mark.slow
 def test_an_interrupt_ends_with_130_and_says_what_is_kept(place):
-    command = [sys.executable, "-m", "shiftsim", "run", "-p", "mine:Slow", "-s", "toy"]
+    command = [sys.executable, "-m", "shiftsim", "run", "-p", "mine:Slower", "-s", "toy"]
     process = subprocess.Popen(
         [*command, "--workers", "2", "--out", "runs/stopped"],
         cwd=place,
