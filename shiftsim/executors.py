@@ -228,7 +228,9 @@ class Pool:
         if self.group is not None:
             groups = [self.group(task) for task in islice(waiting, _LOOK_AHEAD)]
             own = None if worker.task is None else self.group(worker.task)
-            others = {self.group(other.task) for other in self._in("busy")}
+            # also of those that have just ended a task and are given their next one after this
+            at = (other.task for other in self.workers if other is not worker)
+            others = {self.group(task) for task in at if task is not None}
             fresh = (i for i, found in enumerate(groups) if found not in others)
             place = groups.index(own) if own in groups else next(fresh, 0)
         task = waiting[place]

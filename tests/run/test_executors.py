@@ -96,7 +96,6 @@ class Named:
         return os.getpid()
 
 
-@pytest.mark.thorough  # a machine with much else to do starts one worker late
 def test_workers_stay_with_a_group_and_leave_those_of_others():
     tasks = [(name, i) for name in "abcdef" for i in range(8)]
     outcomes = list(map_unordered(Named, tasks, workers=2, group=itemgetter(0)))
