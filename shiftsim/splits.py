@@ -2,11 +2,14 @@
 
 import difflib
 import hashlib
-from collections.abc import Iterable
+import json
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
-from shiftsim.config import read_toml
+from shiftsim.config import one_of, read_toml
 from shiftsim.errors import ConfigError
 
 
@@ -83,8 +86,8 @@ def read_split(path: Path) -> Split:
     if not isinstance(listed, list) or not listed or not all(isinstance(t, str) for t in listed):
         raise ConfigError(f"split {str(path)!r} lists no tokens", hint='write tokens = ["…", "…"]')
     split = Split(str(table.get("name", path.stem)), tuple(listed))
-    twice = next((token for token in listed if listed.count(token) > 1), None)
-    if twice is not None:
+    if len(set(listed)) < len(listed):
+        twice = next(token for token in listed if listed.count(token) > 1)
         raise ConfigError(f"split {str(path)!r} lists {twice!r} twice", hint="remove one of them")
     actual = {"count": len(listed), "hash": split.hash}
     for name, value in actual.items():
@@ -93,4 +96,73 @@ def read_split(path: Path) -> Split:
                 f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
                 hint="the file was edited or cut off; fetch or write it again",
             )
+    return split
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted.
+
+    Args:
+        rows: `token`, `type` and `city` of every scenario.
+        usable: Tokens to choose from.
+        wanted: Values by column; none for any.
+        per_type: At most so many of every type, the first ones by token.
+        limit: At most so many in all, the first ones by token.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        lines = [
+            f"name = {json.dumps(split.name)}",
+            f"count = {len(tokens)}",
+            f'hash = "{split.hash}"',
+            "tokens = [",
+            *(f'    "{token}",' for token in tokens),
+            "]",
+        ]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
     return split

@@ -1,4 +1,4 @@
-"""Commands that work on a whole store: filter, stats, export nuplan."""
+"""Commands that work on a whole store: filter, stats, split, export nuplan."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +22,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("filter")(filter_scenarios)
     app.command("stats")(show_stats)
+    app.command("split")(make_split)
     _EXPORT.command("nuplan")(export_to_nuplan)
     app.add_typer(_EXPORT, name="export", no_args_is_help=True)
 
@@ -109,6 +110,44 @@ def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str
     verdicts = read_verdicts(store.path, store.hash)
     usable = store.tokens if verdicts is None else verdicts.accepted
     return store.reviews.usable(store.tokens, usable)
+
+
+def make_split(
+    store: Store,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="File to write: .toml (count and hash too) or .txt.")
+    ],
+    types: Annotated[
+        list[str] | None, typer.Option("--type", help="Scenario type; repeatable. [all]")
+    ] = None,
+    cities: Annotated[list[str] | None, typer.Option("--city", help="Repeatable. [all]")] = None,
+    per_type: Annotated[int | None, typer.Option(min=1, help="At most N of every type.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="At most N in all.")] = None,
+    split: Split = None,
+    all_scenarios: AllScenarios = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Write a list of scenarios that --split takes, the same however often it is written.
+
+    Scenarios are taken in the order of their tokens, which says nothing about their content.
+    """
+    from shiftsim.runner import open_named_store
+    from shiftsim.splits import choose_scenarios, write_split
+
+    opened = open_named_store(store)
+    found = choose_scenarios(
+        opened.summary().select(["token", "type", "city"]).to_pylist(),
+        set(_chosen(opened, split, all_scenarios)),
+        wanted={"type": types or [], "city": cities or []},
+        per_type=per_type,
+        limit=limit,
+    )
+    written = write_split(out, found)
+    if as_json:
+        say_json({"path": str(out), "count": len(found), "hash": written.hash})
+    else:
+        say(f" {plural(len(found), 'scenario')} of {len(opened)}, hash {written.hash} → {out}")
 
 
 def export_to_nuplan(
