@@ -34,17 +34,41 @@ _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
 # states hardly compress and are never searched: what costs time brings nothing
 _WRITE_OPTIONS: dict[str, Any] = {
-    "compression": "zstd",
-    "compression_level": -3,
+    "compression": "snappy",
     "use_dictionary": ["planner", "noise", "token"],
     "write_statistics": False,
 }
-_TRACK_COLUMNS = {
-    "track_valid": pa.bool_(),
-    "track_poses": pa.float64(),
-    "track_velocities": pa.float64(),
-    "track_sizes": pa.float64(),
-}
+_KEY = pa.dictionary(pa.int32(), pa.string())
+
+
+def _list_of(kind: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.field("item", kind))
+
+
+_SCHEMA = pa.schema(
+    {
+        "planner": _KEY,
+        "noise": _KEY,
+        "seed": pa.int64(),
+        "token": _KEY,
+        "iteration": pa.int64(),
+        "time_us": pa.int64(),
+        **dict.fromkeys((*_EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
+        "planning_seconds": pa.float64(),
+        "degraded": pa.bool_(),
+        "plan_poses": _list_of(pa.float64()),
+    }
+)
+_TRACKS_SCHEMA = pa.schema(
+    [
+        *_SCHEMA,
+        pa.field("track_valid", _list_of(pa.bool_())),
+        *(
+            pa.field(name, _list_of(pa.float64()))
+            for name in ("track_poses", "track_velocities", "track_sizes")
+        ),
+    ]
+)
 
 
 class Task(NamedTuple):
@@ -81,35 +105,32 @@ def encode_rollout(task: Task, log: SimulationLog, *, with_tracks: bool) -> byte
 def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Table:
     """One rollout as a table with a row per sample, K rows."""
     count = len(log.time_us)
-    columns: dict[str, Any] = {
-        name: pa.DictionaryArray.from_arrays(pa.array(np.zeros(count, np.int32)), [value])
+    arrays = [*_repeated(task, count), pa.array(np.arange(count)), pa.array(log.time_us)]
+    for values in (log.ego, log.commands, log.noise):
+        arrays += map(pa.array, np.ascontiguousarray(values.T))
+    arrays += [pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
+    if with_tracks:
+        tracks = log.tracks
+        arrays += map(_lists, (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes))
+    return pa.Table.from_arrays(arrays, schema=_TRACKS_SCHEMA if with_tracks else _SCHEMA)
+
+
+def _repeated(task: Task, count: int) -> list[pa.Array]:
+    """The key in every row."""
+    first = pa.array(np.zeros(count, np.int32))
+    return [
+        pa.DictionaryArray.from_arrays(first, pa.array([value]))
         if isinstance(value, str)
         else pa.array(np.full(count, value, np.int64))
-        for name, value in task._asdict().items()
-    }
-    columns["iteration"] = np.arange(count, dtype=np.int64)
-    columns["time_us"] = log.time_us
-    for names, values in (
-        (_EGO_COLUMNS, log.ego),
-        (_COMMAND_COLUMNS, log.commands),
-        (_NOISE_COLUMNS, log.noise),
-    ):
-        columns |= {name: values[:, i].copy() for i, name in enumerate(names)}
-    columns["planning_seconds"] = log.planning_seconds
-    columns["degraded"] = log.degraded
-    columns["plan_poses"] = _lists(log.plans, pa.float64())
-    if with_tracks:
-        arrays = (log.tracks.valid, log.tracks.poses, log.tracks.velocities, log.tracks.sizes)
-        for (name, kind), array in zip(_TRACK_COLUMNS.items(), arrays, strict=True):
-            columns[name] = _lists(array, kind)
-    return pa.table({name: pa.array(column) for name, column in columns.items()})
+        for value in task
+    ]
 
 
-def _lists(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+def _lists(values: np.ndarray) -> pa.Array:
     """(K, …) as K lists of equal length."""
-    flat = values.reshape(len(values), math.prod(values.shape[1:]))
-    offsets = np.arange(len(flat) + 1, dtype=np.int32) * flat.shape[1]
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat.ravel(), type=kind))
+    size = math.prod(values.shape[1:])
+    offsets = pa.array(np.arange(len(values) + 1, dtype=np.int32) * size)
+    return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()))
 
 
 def _from_lists(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:

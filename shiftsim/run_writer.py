@@ -230,8 +230,9 @@ def _whole(path: Path) -> Iterator[Path]:
     try:
         yield partial
         partial.replace(path)
-    finally:
+    except BaseException:
         partial.unlink(missing_ok=True)
+        raise
 
 
 def _link(source: Path, target: Path) -> None:

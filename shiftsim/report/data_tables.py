@@ -1,15 +1,15 @@
 """What the scenarios are like: own data described, and beside the published sets."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
+from shiftsim.bundle import open_run_store
 from shiftsim.data.stats import ALL, StoreStats, store_stats
-from shiftsim.data.store import open_store
 from shiftsim.errors import DataError
 from shiftsim.report.groups import DataSet, Group
 from shiftsim.report.paper import distinct_sets
 from shiftsim.report.published import Published
 from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.results import Run
 
 _COLUMNS = {
     "vehicles_t0": "vehicles t0",
@@ -28,19 +28,14 @@ def own_statistics(groups: Sequence[Group]) -> dict[str, StoreStats | str]:
     """Statistics of every data set by its label, or why there are none."""
     out: dict[str, StoreStats | str] = {}
     for data in distinct_sets(groups):
-        runs = [group.run for group in groups if group.data.key == data.key]
-        store, digest = runs[0].manifest["store"], runs[0].manifest["determining"]["store"]
-        out[data.label] = _statistics(Path(store), digest, data)
+        run = next(group.run for group in groups if group.data.key == data.key)
+        out[data.label] = _statistics(run, data)
     return out
 
 
-def _statistics(path: Path, digest: str, data: DataSet) -> StoreStats | str:
-    if not path.exists():
-        return f"the store is not at {str(path)!r}"
+def _statistics(run: Run, data: DataSet) -> StoreStats | str:
     try:
-        store = open_store(path)
-        if store.hash != digest:
-            return f"store {str(path)!r} has changed since the run"
+        store = open_run_store(run)
         held = set(store.tokens)
         return store_stats(store, [token for token in data.tokens if token in held])
     except DataError as error:
