@@ -9,7 +9,7 @@ install: .venv/installed
 .venv/installed: pyproject.toml constraints.txt Makefile
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[learned,plots]" --group dev && touch $@
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[all]" --group dev && touch $@
 
 demo: install
 	$(BIN)/shiftsim demo

@@ -25,15 +25,46 @@ def test_runs_are_one_dataset(clean_run):
     )
 
 
-def test_pandas_gives_the_same_means(clean_run):
+def pandas_means(path):
     pandas = pytest.importorskip("pandas")
+    means = pandas.read_parquet(path).groupby(["planner", "noise"])["cls"].mean()
+    return dict(means.items())
+
+
+def polars_means(path):
+    polars = pytest.importorskip("polars")
+    table = polars.read_parquet(path).group_by("planner", "noise").agg(polars.mean("cls"))
+    return {row[:2]: row[2] for row in table.iter_rows()}
+
+
+def duckdb_means(path):
+    duckdb = pytest.importorskip("duckdb")
+    query = f"select planner, noise, avg(cls) from '{path}' group by all"
+    return {row[:2]: row[2] for row in duckdb.sql(query).fetchall()}
+
+
+@pytest.mark.parametrize("means_of", [pandas_means, polars_means, duckdb_means])
+def test_other_readers_give_the_same_means(clean_run, means_of):
     from shiftsim.report import score_rows
 
-    frame = pandas.read_parquet(clean_run.path / "scores.parquet")
-    means = frame.groupby(["planner", "noise", "seed"])["cls"].mean()
-    means = means.groupby(["planner", "noise"]).mean()
-    for row in score_rows(clean_run):
+    means = means_of(clean_run.path / "scores.parquet")
+    rows = score_rows(clean_run)
+    assert set(means) == {row.labels for row in rows}
+    for row in rows:
         assert means[row.labels] == pytest.approx(row.means["cls"], abs=1e-12)
+
+
+@pytest.mark.parametrize("reader", ["pandas", "polars", "duckdb"])
+def test_other_readers_open_rollouts(clean_run, reader):
+    module = pytest.importorskip(reader)
+    path = next((clean_run.path / "rollouts").glob("*.parquet"))
+    expected = pq.read_table(path)
+    if reader == "duckdb":
+        table = module.sql(f"select * from '{path}'").to_arrow_table()
+    else:
+        table = module.read_parquet(path)
+    assert [float(x) for x in table["x_m"].to_numpy()] == expected["x_m"].to_pylist()
+    assert len(table["plan_poses"][0]) == len(expected["plan_poses"][0])
 
 
 def test_grouping_with_arrow_gives_the_same_means(clean_run):
