@@ -337,6 +337,8 @@ def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
             f" of {counts['expected']} tasks — shiftsim explain {finished.path} TOKEN"
         )
     say(f" results: {finished.path}")
+    if finished.manifest["config"]["save_rollouts"] == "all":
+        say(f" replay:  shiftsim view {finished.path}")
 
 
 def demo(
@@ -372,7 +374,8 @@ def demo(
         say("next:")
         say(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
         say(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
-        say("  shiftsim report runs/<id>        shiftsim explain runs/<id> TOKEN")
+        say("  shiftsim report runs/<id>        shiftsim view runs/<id>")
+        say("  shiftsim explain runs/<id> TOKEN")
         say("  shiftsim planners list           shiftsim --help")
 
 
