@@ -7,7 +7,7 @@ to one scenario is made in `reset`.
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Generic, Self, TypeVar, cast
 
 from shiftsim.planner import BatchPlanner, Observation, SceneInfo
@@ -15,7 +15,6 @@ from shiftsim.state import Command, Trajectory
 
 Features = TypeVar("Features")
 Output = TypeVar("Output")
-ALIKE = 1.3  # sizes of the scenes that share a pass, the largest over the smallest
 
 
 class LearnedPlanner(ABC, Generic[Features, Output]):
@@ -78,34 +77,6 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
         if len(features) == 1:
             return (outputs,)
         return [_caught(lambda one: self.infer([one])[0], one) for one in features]
-
-
-def infer_alike(
-    infer: Callable[[list[Features]], Sequence[Output]],
-    features: Sequence[Features],
-    size: Callable[[Features], int],
-) -> list[Output]:
-    """Outputs of a batch from one pass for each group of scenes of about the same size.
-
-    A pass fills all of its scenes up to the largest. On a CPU, which is busy with one scene alone,
-    small groups cost less; on a GPU one large pass does.
-
-    Args:
-        infer: One pass.
-        features: Of the scenes.
-        size: How many rows a scene has.
-    """
-    sizes = [size(one) for one in features]
-    groups: list[list[int]] = []
-    for i in sorted(range(len(sizes)), key=sizes.__getitem__):
-        if groups and sizes[i] <= ALIKE * sizes[groups[-1][0]]:
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    outputs: dict[int, Output] = {}
-    for group in groups:
-        outputs.update(zip(group, infer([features[i] for i in group]), strict=True))
-    return [outputs[i] for i in range(len(features))]
 
 
 def _caught(function: Any, *arguments: Any) -> Any:

@@ -21,7 +21,7 @@ from shiftsim.planners.features import (
     straight_on,
 )
 from shiftsim.planners.features_map import LightLookup, RoadFeatures, road_features
-from shiftsim.planners.learned import LearnedPlanner, infer_alike
+from shiftsim.planners.learned import LearnedPlanner
 from shiftsim.planners.plan_states import STEP, plan_of_poses
 from shiftsim.planners.route_correction import RouteCorrector
 from shiftsim.state import AX, HEADING, PACIFICA, VX, Trajectory, center_poses
@@ -110,12 +110,7 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         return Features(agents, road, current_state(history), self._route)
 
     def infer(self, features: Sequence[Features]) -> Sequence[Plans]:
-        """Six plans per scene; on a CPU in groups of scenes of about the same size."""
-        if self._device == "cpu":
-            return infer_alike(self._pass, features, num_tokens)
-        return self._pass(features)
-
-    def _pass(self, features: Sequence[Features]) -> list[Plans]:
+        """Six plans per scene."""
         import torch
 
         with torch.inference_mode():
@@ -174,19 +169,14 @@ def current_state(history: History) -> np.ndarray:
     return np.array([0.0, 0.0, 0.0, speed, ego[-1, AX], steer, yaw_rate], np.float32)
 
 
-def num_tokens(one: Features) -> int:
-    """Tokens that the network makes of a scene: agents and polygons."""
-    return len(one.agents.valid) + len(one.road.valid)
-
-
 def make_batch(features: Sequence[Features], device: str) -> Any:
-    """Inputs of the network; what is padded is not valid."""
+    """Inputs of the network; padding is valid nowhere."""
     from shiftsim.planners.nets.plantf import STATE_CHANNELS, Inputs
 
     agents = [one.agents for one in features]
     roads = [one.road for one in features]
-    rows = max(len(one.valid) for one in agents)
-    objects = max(1, *(len(one.valid) for one in roads))  # a network without any would fail
+    counts = [[len(one.valid) for one in some] for some in (agents, roads)]
+    rows, objects = map(max, counts)
 
     def of_agents(name: str) -> Any:
         return _padded([getattr(one, name) for one in agents], rows, device)
@@ -214,6 +204,7 @@ def make_batch(features: Sequence[Features], device: str) -> Any:
         has_limit=of_road("has_limit"),
         limit=of_road("limit"),
         point_valid=of_road("valid"),
+        counts=counts,
     )
 
 

@@ -19,7 +19,7 @@ from shiftsim.planners.checkpoint import load_weights
 from shiftsim.planners.device import resolve_device
 from shiftsim.planners.features import SAMPLES, AgentFeatures, PerMap, agent_features
 from shiftsim.planners.features_map import LightLookup, RoadFeatures, road_features
-from shiftsim.planners.learned import LearnedPlanner, infer_alike
+from shiftsim.planners.learned import LearnedPlanner
 from shiftsim.planners.pdm_parameters import STEP_US
 from shiftsim.planners.plan_states import plan_of_poses
 from shiftsim.planners.pluto_brake import brake, must_brake
@@ -30,7 +30,7 @@ from shiftsim.planners.pluto_candidates import (
     predicted_agents,
     to_map,
 )
-from shiftsim.planners.pluto_inputs import SceneInputs, num_tokens, scene_inputs, stack
+from shiftsim.planners.pluto_inputs import SceneInputs, scene_inputs, stack
 from shiftsim.planners.pluto_reference import (
     Drivable,
     RouteLanes,
@@ -181,12 +181,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         return ""
 
     def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
-        """One forward pass; on a CPU one for each group of scenes of about the same size."""
-        if self._device == "cpu":
-            return infer_alike(self._pass, features, num_tokens)
-        return self._pass(features)
-
-    def _pass(self, features: Sequence[SceneInputs]) -> list[Output]:
+        """One forward pass."""
         import torch
 
         from shiftsim.planners.nets.pluto import Inputs

@@ -45,11 +45,6 @@ class SceneInputs(NamedTuple):
     line_valid: Array
 
 
-_OF_MAP = SceneInputs._fields[
-    SceneInputs._fields.index("points") : SceneInputs._fields.index("point_valid") + 1
-]
-
-
 def scene_inputs(
     ego: FloatArray,
     agents: AgentFeatures,
@@ -112,22 +107,15 @@ def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> Array:
     return out
 
 
-def num_tokens(scene: SceneInputs) -> int:
-    """Tokens that the network makes of a scene: agents, polygons, static objects."""
-    return len(scene.category) + len(scene.kind) + len(scene.object_category)
-
-
 def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
-    """Tensors of a batch; scenes with fewer rows are filled up with zeros, valid nowhere."""
+    """Values of `nets.pluto.Inputs`; scenes with fewer rows are filled up with zeros."""
     import torch
 
-    out = []
-    for name, *arrays in zip(SceneInputs._fields, *scenes, strict=True):
-        shape = np.max([array.shape for array in arrays], axis=0)
-        if name in _OF_MAP:
-            shape[0] = max(shape[0], 1)  # the network does not work without any
-        batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
+    out: list[Any] = []
+    for _, *arrays in zip(SceneInputs._fields, *scenes, strict=True):
+        batch = np.zeros((len(arrays), *np.max([a.shape for a in arrays], axis=0)), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
         out.append(torch.from_numpy(batch).to(device))
-    return out
+    parts = ("category", "kind", "object_category", "line_valid")
+    return [*out, [[len(getattr(scene, name)) for scene in scenes] for name in parts]]

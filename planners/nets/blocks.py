@@ -1,8 +1,7 @@
 """Blocks that the networks of PlanTF and PLUTO share; names and shapes as in their checkpoints.
 
-Only inference is meant: no dropout, no drop path. A mask `keep` is true for what takes part.
-Attention runs through torch's fused kernel. What the official code computes and then throws away is
-not computed here: the ego's own history, and all but the last step of an agent's.
+Only inference is meant: no dropout, no drop path. What the official code computes and then throws
+away is not computed here: the ego's own history, and all but the last step of an agent's.
 """
 
 from typing import NamedTuple
@@ -10,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from shiftsim.planners.nets.rows import Attention, Linear, Scenes, linear
 
 DIM = 128
 NUM_AGENT_KINDS = 4
@@ -19,48 +20,13 @@ _MLP_RATIO = 3  # of the history encoder
 _LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
 
 
-class Attention(nn.Module):
-    """Multi-head attention with biased projections; tensors of torch's `MultiheadAttention`."""
-
-    def __init__(self, dim: int, num_heads: int) -> None:
-        super().__init__()
-        self.num_heads = num_heads
-        self.in_proj_weight = nn.Parameter(torch.zeros(3 * dim, dim))
-        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
-        self.out_proj = nn.Linear(dim, dim)
-
-    def forward(self, query: Tensor, key: Tensor, value: Tensor, keep: Tensor | None) -> Tensor:
-        """Attend from (B, Q, D) to (B, N, D); `keep` (B, N) may be None."""
-        weights, biases = self.in_proj_weight, self.in_proj_bias
-        if query is key and key is value:
-            q, k, v = functional.linear(query, weights, biases).chunk(3, dim=-1)
-        else:
-            q, k, v = (
-                functional.linear(x, weight, bias)
-                for x, weight, bias in zip(
-                    (query, key, value), weights.chunk(3), biases.chunk(3), strict=True
-                )
-            )
-        mixed = functional.scaled_dot_product_attention(
-            self._heads(q),
-            self._heads(k),
-            self._heads(v),
-            attn_mask=None if keep is None else keep[:, None, None, :],
-        )
-        out: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))
-        return out
-
-    def _heads(self, x: Tensor) -> Tensor:
-        return x.reshape(*x.shape[:2], self.num_heads, -1).transpose(1, 2)
-
-
 class Mlp(nn.Module):
     """Two linear layers with an exact GELU between them."""
 
     def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) to (..., D)."""
@@ -78,13 +44,20 @@ class EncoderBlock(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = Mlp(dim, mlp_ratio * dim)
 
-    def forward(self, x: Tensor, keep: Tensor, num_queries: int | None = None) -> Tensor:
-        """Tokens (B, N, D) after the block; the first `num_queries` of them where that is given."""
+    def forward(self, x: Tensor, scenes: Scenes, asking: Tensor | None = None) -> Tensor:
+        """Tokens (T, D) of scenes after the block, or one for each of them.
+
+        Args:
+            x: The tokens.
+            scenes: How they lie.
+            asking: (B,) the token of each scene that is wanted; None for all.
+        """
         normed = self.norm1(x)
-        if num_queries is None:
-            x = x + self.attn(normed, normed, normed, keep)
+        if asking is None:
+            x = x + self.attn.among(normed, normed, scenes.counts, scenes)
         else:
-            x = x[:, :num_queries] + self.attn(normed[:, :num_queries], normed, normed, keep)
+            ones = [1] * len(asking)
+            x = x[asking] + self.attn.among(normed[asking], normed, ones, scenes)
         out: Tensor = x + self.mlp(self.norm2(x))
         return out
 
@@ -96,8 +69,8 @@ class NeighborhoodAttention(nn.Module):
         super().__init__()
         self.num_heads, self.window = num_heads, window
         self.rpb = nn.Parameter(torch.zeros(num_heads, 2 * window - 1))
-        self.qkv = nn.Linear(dim, 3 * dim)
-        self.proj = nn.Linear(dim, dim)
+        self.qkv = Linear(dim, 3 * dim)
+        self.proj = Linear(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(A, L, D) to (A, L, D)."""
@@ -198,7 +171,7 @@ def _convolved(conv: nn.Module, x: Tensor, stride: int = 1) -> Tensor:
     """Convolution of width 3 without padding, (A, L, C) to (A, L', C'), as one product."""
     assert isinstance(conv, nn.Conv1d)
     windows = x.unfold(1, 3, stride).flatten(2)
-    return functional.linear(windows, conv.weight.flatten(1), conv.bias)
+    return linear(windows, conv.weight.flatten(1), conv.bias)
 
 
 def _end(conv: nn.Module, end: Tensor) -> Tensor:
@@ -217,17 +190,17 @@ class EgoStateEncoder(nn.Module):
 
     def __init__(self, num_scalars: int, dim: int = DIM, num_heads: int = 4) -> None:
         super().__init__()
-        self.linears = nn.ModuleList(nn.Linear(1, dim) for _ in range(num_scalars))
+        self.linears = nn.ModuleList(Linear(1, dim) for _ in range(num_scalars))
         self.attn = Attention(dim, num_heads)
         self.pos_embed = nn.Parameter(torch.zeros(1, num_scalars, dim))
         self.query = nn.Parameter(torch.zeros(1, 1, dim))
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, scalars) to (B, D)."""
-        embedded = [linear(state[:, i, None]) for i, linear in enumerate(self.linears)]
+        embedded = [layer(state[:, i, None]) for i, layer in enumerate(self.linears)]
         tokens = torch.stack(embedded, dim=1) + self.pos_embed
         query = self.query.expand(len(state), -1, -1)
-        out: Tensor = self.attn(query, tokens, tokens, None)[:, 0]
+        out: Tensor = self.attn(query, tokens, tokens)[:, 0]
         return out
 
 
@@ -315,32 +288,32 @@ class _FoldedMlp(NamedTuple):
 
 
 def _folded(mlp: nn.Sequential) -> _FoldedMlp:
-    linear, norm, _, last = mlp
-    assert isinstance(linear, nn.Linear)
+    layer, norm, _, last = mlp
+    assert isinstance(layer, Linear)
     assert isinstance(norm, nn.BatchNorm1d)
     assert norm.running_mean is not None
     assert norm.running_var is not None
     scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    bias = (linear.bias - norm.running_mean) * scale + norm.bias
-    return _FoldedMlp(linear.weight * scale[:, None], bias, last)
+    bias = (layer.bias - norm.running_mean) * scale + norm.bias
+    return _FoldedMlp(layer.weight * scale[:, None], bias, last)
 
 
 def _encode_lines(points: Tensor, keep: Tensor, first: _FoldedMlp, second: _FoldedMlp) -> Tensor:
     """(M, out) from (M, K, channels) with `keep` (M, K)."""
     (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
     rows = points.flatten(0, 1)[row]
-    hidden = first.last(functional.linear(rows, first.weight, first.bias).relu_())
+    hidden = first.last(linear(rows, first.weight, first.bias).relu_())
     pooled = _pooled(hidden, row, keep)
     # Linear([point, pooled]) in two parts: that of the line is the same for all its points
     half = hidden.shape[1]
-    mixed = functional.linear(hidden, second.weight[:, :half])
-    mixed += functional.linear(pooled, second.weight[:, half:], second.bias)[row // keep.shape[1]]
+    mixed = linear(hidden, second.weight[:, :half])
+    mixed += linear(pooled, second.weight[:, half:], second.bias)[row // keep.shape[1]]
     return _pooled(second.last(mixed.relu_()), row, keep)
 
 
 def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(inputs, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, outputs)
+        Linear(inputs, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), Linear(hidden, outputs)
     )
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from shiftsim.planners.deterministic import State
+from shiftsim.planners.nets.rows import Convolution, Linear
 
 PREFIXES = ("",)  # of the names in the published checkpoint
 CHANNELS, SIZE = 9, 256  # of the picture
@@ -18,6 +19,7 @@ CONVOLUTIONS = (  # channels out, kernel, stride
     *((8, 5, 2), (16, 5, 2), (24, 5, 2), (32, 5, 2)),
     *((64, 3, 2), (128, 3, 1), (256, 3, 1)),
 )
+_SMALL = 6  # pixels wide: convolutions that a library does in another way for one picture
 FLAT = 1024  # numbers that the convolutions leave
 RELEASED = {
     "image_encoder": "roach_ln2",
@@ -82,7 +84,8 @@ class FeaturesExtractor(nn.Module):
         channels, size = CHANNELS, SIZE
         for out, kernel, stride in CONVOLUTIONS:
             size = (size - kernel) // stride + 1
-            layers += [nn.Conv2d(channels, out, kernel, stride), nn.LayerNorm((out, size, size))]
+            layer = Convolution if size <= _SMALL else nn.Conv2d
+            layers += [layer(channels, out, kernel, stride), nn.LayerNorm((out, size, size))]
             layers.append(nn.ReLU())
             channels = out
         self.cnn = nn.Sequential(*layers, nn.Flatten())
@@ -131,11 +134,11 @@ class CarlNetwork(nn.Module):
         self.action_dist = _Constants(inner)
         self.features_extractor = FeaturesExtractor()
         self.policy_head = _perceptron(FEATURES, FEATURES, FEATURES)
-        self.dist_mu = nn.Sequential(nn.Linear(FEATURES, ACTIONS))
-        self.dist_sigma = nn.Sequential(nn.Linear(FEATURES, ACTIONS))
+        self.dist_mu = nn.Sequential(Linear(FEATURES, ACTIONS))
+        self.dist_sigma = nn.Sequential(Linear(FEATURES, ACTIONS))
         self.value_head = nn.Sequential(
             *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES),
-            nn.Linear(FEATURES, 1),
+            Linear(FEATURES, 1),
         )
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Policy:
@@ -145,8 +148,9 @@ class CarlNetwork(nn.Module):
     def policy(self, features: Tensor) -> Policy:
         """The policy for (B, 256) features."""
         hidden = self.policy_head(features)
-        alpha = softplus(self.dist_mu(hidden)) + LEAST
-        return Policy(alpha, softplus(self.dist_sigma(hidden)) + LEAST)
+        return Policy(
+            *(_softplus(head(hidden)) + LEAST for head in (self.dist_mu, self.dist_sigma))
+        )
 
     def value(self, features: Tensor, value_measurements: Tensor) -> Tensor:
         """(B, 1) what the critic expects, from (B, 256) features and (B, 4) measurements."""
@@ -154,10 +158,15 @@ class CarlNetwork(nn.Module):
         return value
 
 
+def _softplus(x: Tensor) -> Tensor:
+    """In double precision, in which it does not matter how many numbers there are."""
+    return softplus(x.double()).to(x.dtype)
+
+
 def _perceptron(size: int, hidden: int, out: int) -> nn.Sequential:
     return nn.Sequential(
-        *(nn.Linear(size, hidden), nn.LayerNorm(hidden), nn.ReLU()),
-        *(nn.Linear(hidden, out), nn.LayerNorm(out), nn.ReLU()),
+        *(Linear(size, hidden), nn.LayerNorm(hidden), nn.ReLU()),
+        *(Linear(hidden, out), nn.LayerNorm(out), nn.ReLU()),
     )
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.planners.nets.diffusion_parts import EPS, Attention, Mixer, Mlp, tanh_gelu_
+from shiftsim.planners.nets.rows import Linear
 
 ROUTE_COLUMNS, ROUTE_TOKENS, ROUTE_CHANNELS = 4, 32, 64
 FREQUENCIES, LONGEST = 128, 10000.0  # of the time embedding
@@ -27,14 +28,14 @@ class Prepared(NamedTuple):
         final: By call: shift and scale of the last layer, each (B, 1, hidden).
         keys: D tensors (B, heads, N, C) of the scene's tokens.
         values: D tensors of the same shape.
-        mask: (B, 1, 1, A) added to the logits of the agents; None where all are present.
+        mask: (B, 1, 1, A) added to the logits of the agents.
     """
 
     modulation: list[list[tuple[Tensor, ...]]]
     final: list[tuple[Tensor, ...]]
     keys: list[Tensor]
     values: list[Tensor]
-    mask: Tensor | None
+    mask: Tensor
 
 
 class RouteEncoder(nn.Module):
@@ -63,9 +64,7 @@ class TimeEmbedder(nn.Module):
     def __init__(self, hidden: int) -> None:
         """Make it."""
         super().__init__()
-        self.mlp = nn.Sequential(
-            nn.Linear(2 * FREQUENCIES, hidden), nn.SiLU(), nn.Linear(hidden, hidden)
-        )
+        self.mlp = nn.Sequential(Linear(2 * FREQUENCIES, hidden), nn.SiLU(), Linear(hidden, hidden))
 
     def forward(self, times: Tensor) -> Tensor:
         """(S,) times in [0, 1] to (S, hidden)."""
@@ -85,7 +84,7 @@ class DiTBlock(nn.Module):
         self.attn = Attention(hidden, heads)
         self.norm2 = nn.LayerNorm(hidden, EPS)
         self.mlp1 = Mlp(hidden, 4 * hidden, hidden, approximate="tanh")
-        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(hidden, 6 * hidden))
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), Linear(hidden, 6 * hidden))
         self.norm3 = nn.LayerNorm(hidden, EPS)
         self.cross_attn = Attention(hidden, heads)
         self.norm4 = nn.LayerNorm(hidden, EPS)
@@ -97,7 +96,7 @@ class DiTBlock(nn.Module):
         modulation: tuple[Tensor, ...],
         keys: Tensor,
         values: Tensor,
-        mask: Tensor | None,
+        mask: Tensor,
     ) -> Tensor:
         """(B, A, hidden) to the same; the other arguments as in `Prepared`."""
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation
@@ -119,12 +118,12 @@ class FinalLayer(nn.Module):
         self.norm_final = nn.LayerNorm(hidden, EPS)
         self.proj = nn.Sequential(
             nn.LayerNorm(hidden, EPS),
-            nn.Linear(hidden, 4 * hidden),
+            Linear(hidden, 4 * hidden),
             nn.GELU(approximate="tanh"),
             nn.LayerNorm(4 * hidden, EPS),
-            nn.Linear(4 * hidden, outputs),
+            Linear(4 * hidden, outputs),
         )
-        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(hidden, 2 * hidden))
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), Linear(hidden, 2 * hidden))
 
     def forward(self, x: Tensor, modulation: tuple[Tensor, ...]) -> Tensor:
         """(B, A, hidden) to (B, A, outputs)."""
@@ -183,10 +182,8 @@ class DiT(nn.Module):
             values.append(value)
         final = self.final_layer.adaLN_modulation[1](condition)
         final[..., final.shape[-1] // 2 :] += one
-        mask = None
-        if bool(absent.any()):
-            zeros = torch.zeros(absent.shape, device=context.device)
-            mask = zeros.masked_fill(absent, NO_KEY)[:, None, None, :]
+        zeros = torch.zeros(absent.shape, device=context.device)
+        mask = zeros.masked_fill(absent, NO_KEY)[:, None, None, :]
         ends = [call.chunk(2, dim=-1) for call in final]
         return Prepared(modulation, ends, keys, values, mask)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.nets.diffusion_parts import EPS, Attention, Mixer, Mlp
+from shiftsim.planners.nets.rows import Linear
 
 AGENT_COLUMNS, STATIC_COLUMNS, LANE_COLUMNS, LIGHT_COLUMNS = 8, 10, 8, 4
 AGENT_KINDS = 3
@@ -56,7 +57,7 @@ class AgentEncoder(MixerEncoder):
     def __init__(self, samples: int, hidden: int, depth: int) -> None:
         """Make it for histories of `samples` samples."""
         super().__init__(AGENT_COLUMNS + 1, samples, hidden, depth)
-        self.type_emb = nn.Linear(AGENT_KINDS, CHANNELS)
+        self.type_emb = Linear(AGENT_KINDS, CHANNELS)
 
     def forward(self, agents: Tensor) -> Tensor:
         """(N, samples, 11) of used rows to (N, hidden)."""
@@ -86,9 +87,9 @@ class LaneEncoder(MixerEncoder):
     def __init__(self, points: int, hidden: int, depth: int) -> None:
         """Make it for lanes of `points` points."""
         super().__init__(LANE_COLUMNS, points, hidden, depth)
-        self.speed_limit_emb = nn.Linear(1, CHANNELS)
+        self.speed_limit_emb = Linear(1, CHANNELS)
         self.unknown_speed_emb = nn.Embedding(1, CHANNELS)
-        self.traffic_emb = nn.Linear(LIGHT_COLUMNS, CHANNELS)
+        self.traffic_emb = Linear(LIGHT_COLUMNS, CHANNELS)
 
     def forward(self, lanes: Tensor, limit: Tensor, has_limit: Tensor) -> Tensor:
         """(N, points, 12) of used rows, their limits (N, 1) and whether known, to (N, hidden)."""
@@ -151,7 +152,7 @@ class SceneEncoder(nn.Module):
         self.static_encoder = StaticEncoder(hidden)
         self.lane_encoder = LaneEncoder(points, hidden, depth)
         self.fusion = Fusion(hidden, heads, depth)
-        self.pos_emb = nn.Linear(POSITION, hidden)
+        self.pos_emb = Linear(POSITION, hidden)
 
     def forward(
         self, agents: Tensor, objects: Tensor, lanes: Tensor, limit: Tensor, has_limit: Tensor
@@ -204,6 +205,7 @@ def _positions(rows: Tensor, kind: int) -> Tensor:
 
 def _lane_positions(points: Tensor) -> Tensor:
     """(N, 7) of lanes from one point each: x, y, dx, dy, …."""
-    angle = torch.atan2(points[:, 3], points[:, 2])
-    along = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
+    # in double precision, in which it does not matter how many there are
+    angle = torch.atan2(points[:, 3].double(), points[:, 2].double())
+    along = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1).to(points.dtype)
     return _positions(torch.cat([points[:, :2], along], dim=-1), 2)

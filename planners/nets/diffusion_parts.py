@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from shiftsim.planners.nets.rows import Linear, linear
+
 EPS = 1e-5  # of the layer norms; torch's default, and the official networks keep it
 _CUBIC, _TWICE = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the GELU by tanh
 
@@ -29,8 +31,8 @@ class Mlp(nn.Module):
             approximate: Of the GELU: `none` (error function) or `tanh`.
         """
         super().__init__()
-        self.fc1 = nn.Linear(inputs, hidden)
-        self.fc2 = nn.Linear(hidden, outputs)
+        self.fc1 = Linear(inputs, hidden)
+        self.fc2 = Linear(hidden, outputs)
         self.approximate = approximate
 
     def forward(self, x: Tensor) -> Tensor:
@@ -73,7 +75,7 @@ def _gelu_(x: Tensor) -> Tensor:
     return out
 
 
-def _over_rows(layer: nn.Linear, x: Tensor) -> Tensor:
+def _over_rows(layer: Linear, x: Tensor) -> Tensor:
     """A linear layer over the last but one dimension of (B, inputs, C), without transposing."""
     weight = layer.weight.expand(len(x), -1, -1)
     return torch.baddbmm(layer.bias[:, None], weight, x)
@@ -127,7 +129,7 @@ class Attention(nn.Module):
         super().__init__()
         self.in_proj_weight = nn.Parameter(torch.empty(3 * channels, channels))
         self.in_proj_bias = nn.Parameter(torch.zeros(3 * channels))
-        self.out_proj = nn.Linear(channels, channels)
+        self.out_proj = Linear(channels, channels)
         self.channels, self.heads = channels, heads
         nn.init.xavier_uniform_(self.in_proj_weight)
 
@@ -144,28 +146,24 @@ class Attention(nn.Module):
             (B, Q, H * D).
         """
         mixed = functional.scaled_dot_product_attention(query, keys, values, attn_mask=mask)
-        out = functional.linear(
-            mixed.transpose(1, 2).flatten(2), self.out_proj.weight, self.out_proj.bias
-        )
+        out = linear(mixed.transpose(1, 2).flatten(2), self.out_proj.weight, self.out_proj.bias)
         return out
 
     def query(self, x: Tensor) -> Tensor:
         """(B, H, Q, D) queries of (B, Q, C)."""
         first = self.channels
-        return self._split(
-            functional.linear(x, self.in_proj_weight[:first], self.in_proj_bias[:first])
-        )
+        return self._split(linear(x, self.in_proj_weight[:first], self.in_proj_bias[:first]))
 
     def keys_values(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Keys and values (B, H, K, D) of (B, K, C)."""
         first = self.channels
-        both = functional.linear(x, self.in_proj_weight[first:], self.in_proj_bias[first:])
+        both = linear(x, self.in_proj_weight[first:], self.in_proj_bias[first:])
         keys, values = both.chunk(2, dim=-1)
         return self._split(keys), self._split(values)
 
     def project_all(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (B, H, K, D) of the same (B, K, C)."""
-        packed = functional.linear(x, self.in_proj_weight, self.in_proj_bias)
+        packed = linear(x, self.in_proj_weight, self.in_proj_bias)
         parts = packed.view(*x.shape[:-1], 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         query, keys, values = parts.unbind()
         return query, keys, values

@@ -162,7 +162,7 @@ class DiffusionNetwork(nn.Module):
         """
         scene = self.normalise(inputs)
         current, absent = self.present(scene)
-        if len(noise) == 1:
+        if not noise.is_cuda:
             current, absent, noise = (_padded(part) for part in (current, absent, noise))
         prepared = self.prepare(scene, absent)
         dit = self.dit[0]

@@ -1,6 +1,7 @@
 """The network of PlanTF (planner-plantf.md §3), with the names and shapes of its checkpoint."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from shiftsim.planners.nets.blocks import (
     PointsEncoder,
     history_steps,
 )
+from shiftsim.planners.nets.rows import Linear, make_scenes, present
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 STATE_CHANNELS = POLYGON_CHANNELS = 6
@@ -61,6 +63,8 @@ class Inputs(NamedTuple):
         has_limit: (B, M)
         limit: (B, M) speed limit [m/s].
         point_valid: (B, M, K)
+        counts: How many agents and polygons each scene has, the rest is padding; None where nothing
+            is.
     """
 
     position: Tensor
@@ -80,6 +84,7 @@ class Inputs(NamedTuple):
     has_limit: Tensor
     limit: Tensor
     point_valid: Tensor
+    counts: Sequence[Sequence[int]] | None = None
 
 
 class Outputs(NamedTuple):
@@ -102,7 +107,7 @@ class MapEncoder(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.polygon_encoder = PointsEncoder(channels)
-        self.speed_limit_emb = nn.Sequential(nn.Linear(1, DIM), nn.ReLU(), nn.Linear(DIM, DIM))
+        self.speed_limit_emb = nn.Sequential(Linear(1, DIM), nn.ReLU(), Linear(DIM, DIM))
         self.type_emb = nn.Embedding(3, DIM)
         self.on_route_emb = nn.Embedding(2, DIM)
         self.traffic_light_emb = nn.Embedding(4, DIM)
@@ -135,7 +140,7 @@ class TrajectoryDecoder(nn.Module):
     def __init__(self, num_modes: int, future_steps: int) -> None:
         super().__init__()
         self.num_modes, self.future_steps = num_modes, future_steps
-        self.multimodal_proj = nn.Linear(DIM, num_modes * DIM)
+        self.multimodal_proj = Linear(DIM, num_modes * DIM)
         self.loc = _head(4 * future_steps)
         self.pi = _head(1)
 
@@ -148,10 +153,10 @@ class TrajectoryDecoder(nn.Module):
 
 def _head(outputs: int, *, bias: bool = True) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(DIM, 2 * DIM, bias=bias),
+        Linear(DIM, 2 * DIM, bias=bias),
         nn.LayerNorm(2 * DIM),
         nn.ReLU(),
-        nn.Linear(2 * DIM, outputs),
+        Linear(2 * DIM, outputs),
     )
 
 
@@ -160,7 +165,7 @@ class PlanTfNetwork(nn.Module):
 
     def __init__(self, encoder_depth: int, num_heads: int, num_modes: int, steps: int) -> None:
         super().__init__()
-        self.pos_emb = nn.Sequential(nn.Linear(4, DIM), nn.ReLU(), nn.Linear(DIM, DIM))
+        self.pos_emb = nn.Sequential(Linear(4, DIM), nn.ReLU(), Linear(DIM, DIM))
         self.agent_encoder = AgentEncoder(STATE_CHANNELS)
         self.map_encoder = MapEncoder(POLYGON_CHANNELS)
         self.encoder_blocks = nn.ModuleList(
@@ -177,21 +182,39 @@ class PlanTfNetwork(nn.Module):
         agents = self.agent_encoder(steps, known, seen.category, seen.current_state)
         poses = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
         poses = torch.cat([poses, seen.centers], dim=1)
-        angle = poses[..., 2]
-        where = torch.stack([poses[..., 0], poses[..., 1], angle.cos(), angle.sin()], dim=-1)
-        x = torch.cat([agents, self.map_encoder(seen)], dim=1) + self.pos_emb(where)
-        keep = torch.cat([known, seen.point_valid.any(dim=-1)], dim=1)
-        wanted = known.shape[1] if predict else 1
+        there, counts = _there(seen)
+        x = torch.cat([agents, self.map_encoder(seen)], dim=1)[there] + self._placed(poses[there])
+        keep = torch.cat([known, seen.point_valid.any(dim=-1)], dim=1)[there]
+        scenes = make_scenes(counts, keep)
+        egos = torch.tensor([0, *accumulate(counts[:-1])], device=x.device)
         last = len(self.encoder_blocks) - 1
         for index, block in enumerate(self.encoder_blocks):
-            x = block(x, keep, wanted if index == last else None)
+            x = block(x, scenes, egos if index == last and not predict else None)
         x = self.norm(x)
-        trajectory, probability = self.trajectory_decoder(x[:, 0])
+        trajectory, probability = self.trajectory_decoder(x[egos] if predict else x)
         if not predict:
             return Outputs(trajectory, probability, None)
-        prediction = self.agent_predictor(x[:, 1:])
+        tokens = x.new_zeros(*there.shape, DIM)
+        tokens[there] = x
+        prediction = self.agent_predictor(tokens[:, 1 : known.shape[1]])
         shape = (*prediction.shape[:2], self.trajectory_decoder.future_steps, 2)
         return Outputs(trajectory, probability, prediction.reshape(shape))
+
+    def _placed(self, poses: Tensor) -> Tensor:
+        """(T, 128) of poses (T, 3)."""
+        angle = poses[:, 2]
+        where = torch.stack([poses[:, 0], poses[:, 1], angle.cos(), angle.sin()], dim=-1)
+        out: Tensor = self.pos_emb(where)
+        return out
+
+
+def _there(seen: Inputs) -> tuple[Tensor, list[int]]:
+    """(B, A + M) agents and polygons that are no padding, and how many there are by scene."""
+    batch, num_agents, num_polygons = *seen.category.shape, seen.kind.shape[1]
+    counts = seen.counts or ([num_agents] * batch, [num_polygons] * batch)
+    parts = zip(counts, (num_agents, num_polygons), strict=True)
+    there = torch.cat([present(*part, seen.kind.device) for part in parts], dim=1)
+    return there, list(map(sum, zip(*counts, strict=True)))
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:

@@ -1,6 +1,7 @@
 """The network of PLUTO (planner-pluto.md §3), with the names and shapes of its checkpoint."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from shiftsim.planners.nets.blocks import (
     history_steps,
 )
 from shiftsim.planners.nets.pluto_decoder import FourierEmbedding, MlpLayer, PlanningDecoder
+from shiftsim.planners.nets.rows import Linear, Scenes, make_scenes, present
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 STATE_CHANNELS, POLYGON_CHANNELS = 6, 10
@@ -94,6 +96,8 @@ class Inputs(NamedTuple):
         line_vectors: (B, R, 120, 2) to the next point [m].
         line_orientations: (B, R, 120) [rad].
         line_valid: (B, R, 120)
+        counts: How many agents, polygons, static objects and lines each scene has, the rest is
+            padding; None where nothing is.
     """
 
     position: Tensor
@@ -121,6 +125,7 @@ class Inputs(NamedTuple):
     line_vectors: Tensor
     line_orientations: Tensor
     line_valid: Tensor
+    counts: Sequence[Sequence[int]] | None = None
 
 
 class Outputs(NamedTuple):
@@ -234,43 +239,63 @@ class PlutoNetwork(nn.Module):
             decoder_depth, num_heads, num_modes, steps, misordered_masks=misordered_masks
         )
         # of the training only; the checkpoint holds it
-        self.hidden_proj = nn.Sequential(nn.Linear(DIM, DIM), nn.ReLU(), nn.Linear(DIM, DIM))
+        self.hidden_proj = nn.Sequential(Linear(DIM, DIM), nn.ReLU(), Linear(DIM, DIM))
         self.ref_free_decoder = MlpLayer(DIM, 2 * DIM, 4 * steps)
 
     def forward(self, seen: Inputs) -> Outputs:
         """Plan for a batch."""
-        x, keep = self._encode(seen)
-        ego = x[:, 0]
-        prediction = self.agent_predictor(x[:, 1 : seen.valid.shape[1]])
-        free = self.ref_free_decoder(ego).reshape(len(ego), -1, 4)
+        *counts, num_lines = seen.counts or _all_counts(seen)
+        x, scenes, there = self._encode(seen, counts)
+        egos = x[torch.tensor([0, *accumulate(scenes.counts[:-1])], device=x.device)]
+        tokens = x.new_zeros(*there.shape, DIM)
+        tokens[there] = x
+        prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
+        free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
         trajectory, probability = self.planning_decoder(
             seen.line_points,
             seen.line_vectors,
             seen.line_orientations,
             seen.line_valid,
+            num_lines,
             x,
-            keep,
+            scenes,
+            egos,
         )
-        return Outputs(trajectory, probability, prediction, free, ego)
+        return Outputs(trajectory, probability, prediction, free, egos)
 
-    def _encode(self, seen: Inputs) -> tuple[Tensor, Tensor]:
-        """Tokens (B, N, 128) of ego, agents, polygons and static objects, and which count."""
+    def _encode(
+        self, seen: Inputs, counts: Sequence[Sequence[int]]
+    ) -> tuple[Tensor, Scenes, Tensor]:
+        """Tokens (T, 128) of ego, agents, polygons and static objects, scene by scene.
+
+        Also how they lie, and which of all rows (B, A + M + S) they are: those without padding.
+        """
         known = seen.valid.any(dim=-1)
+        parts = (known, seen.point_valid.any(dim=-1), seen.object_valid)
+        there = torch.cat(
+            [present(n, part.shape[1], part.device) for n, part in zip(counts, parts, strict=True)],
+            dim=1,
+        )
         steps = history_steps(seen.position, seen.heading, seen.velocity, seen.shape, seen.valid)
         tokens = (
             self.agent_encoder(steps, known, seen.category, seen.current_state),
             self.map_encoder(seen),
             self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
         )
-        present = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
-        poses = torch.cat([present, seen.centers, seen.object_pose], dim=1)
-        angle = (poses[..., 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
-        where = self.pos_emb(torch.cat([poses[..., :2], angle], dim=-1))
-        keep = torch.cat([known, seen.point_valid.any(dim=-1), seen.object_valid], dim=1)
-        x = torch.cat(tokens, dim=1) + where
+        now = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
+        poses = torch.cat([now, seen.centers, seen.object_pose], dim=1)[there]
+        angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
+        where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
+        x = torch.cat(tokens, dim=1)[there] + where
+        scenes = make_scenes(list(map(sum, zip(*counts, strict=True))), torch.cat(parts, 1)[there])
         for block in self.encoder_blocks:
-            x = block(x, keep)
-        return self.norm(x), keep
+            x = block(x, scenes)
+        return self.norm(x), scenes, there
+
+
+def _all_counts(seen: Inputs) -> list[list[int]]:
+    parts = (seen.category, seen.kind, seen.object_category, seen.line_valid)
+    return [[part.shape[1]] * len(part) for part in parts]
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:

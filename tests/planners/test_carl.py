@@ -247,7 +247,7 @@ def test_scenes_in_one_batch_are_driven_as_alone(planner, rng):
     alone = [simulate(scene, planner) for scene in scenes]
     together = simulate_together([Rollout(scene, planner.fork()) for scene in scenes])
     for one, other in zip(alone, together, strict=True):
-        np.testing.assert_allclose(other.commands, one.commands, atol=2e-5 * 10)
+        np.testing.assert_allclose(other.commands, one.commands, atol=2e-5)
         np.testing.assert_allclose(other.ego, one.ego, atol=2e-5)
 
 

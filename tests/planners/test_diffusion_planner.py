@@ -78,9 +78,7 @@ def test_a_batch_agrees_with_one_by_one(weights, rng):
     features = [features_of(planner, scene) for scene in scenes]
     alone = np.array([planner.infer([one])[0] for one in features])
     together = np.array(planner.infer(features))
-    # in the network's units, of 20 m
-    scale = np.array([20, 20, 1, 1])
-    np.testing.assert_allclose(together / scale, alone / scale, atol=2e-5)
+    np.testing.assert_allclose(together, alone, rtol=0.0, atol=2e-5)
 
 
 def test_what_is_reused_changes_nothing(planner, rng):

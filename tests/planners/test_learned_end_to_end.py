@@ -28,9 +28,7 @@ pytestmark = [pytest.mark.learned, pytest.mark.slow, pytest.mark.thorough]
 
 LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 STEPS = 13
-OUTPUT = 2e-5  # how much a batch may change what a network says, in its own units
-UNIT = {"diffusion-planner": 20.0}  # m, where outputs come scaled
-DRIVEN = 1e-3  # m, rad, m/s, …: what that may grow to while driving
+BATCH = 2e-5  # how much a batch may change what a network says, and what comes of it
 NOISE = {"noise": "ou-high", "seed": 1}
 
 
@@ -116,19 +114,19 @@ def numbers_of(output):
     }
 
 
+@pytest.mark.parametrize("variant", ["base", "drive"])
 @pytest.mark.parametrize("name", LEARNED)
-def test_a_batch_says_what_each_alone_says(demo, planners, name):
-    forks = [planners(name, "base") for _ in demo]
+def test_a_batch_says_what_each_alone_says(demo, planners, name, variant):
+    forks = [planners(name, variant) for _ in demo]
     seen = [Rollout(scene, fork) for scene, fork in zip(demo, forks, strict=True)]
     features = [r.planner.features(r.observe()) for r in seen]
-    together = planners(name, "base").infer(features)
+    together = planners(name, variant).infer(features)
     for one, output in zip(features, together, strict=True):
-        (alone,) = planners(name, "base").infer([one])
+        (alone,) = planners(name, variant).infer([one])
         expected = numbers_of(alone)
         assert expected
         for place, value in numbers_of(output).items():
-            atol = OUTPUT * UNIT.get(name, 1.0)
-            np.testing.assert_allclose(value, expected[place], rtol=OUTPUT, atol=atol)
+            np.testing.assert_allclose(value, expected[place], rtol=0.0, atol=BATCH)
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -137,9 +135,9 @@ def test_scenarios_in_lock_step_are_driven_as_each_alone(demo, planners, name):
     logs = simulate_together([Rollout(scene, planners(name), **NOISE) for scene in scenes])
     for scene, log in zip(scenes, logs, strict=True):
         alone = simulate(scene, planners(name), **NOISE)
-        np.testing.assert_allclose(log.ego, alone.ego, rtol=0.0, atol=DRIVEN)
+        np.testing.assert_allclose(log.ego, alone.ego, rtol=0.0, atol=BATCH)
         a, b = (compute_metrics(one, scene.map).score for one in (log, alone))
-        assert a == pytest.approx(b, abs=OUTPUT)
+        assert a == pytest.approx(b, abs=BATCH)
 
 
 def test_a_run_with_made_up_weights_says_so_beside_its_scores(tmp_path, monkeypatch):

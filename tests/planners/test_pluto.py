@@ -23,7 +23,7 @@ from shiftsim.planners.pluto_inputs import stack  # noqa: E402  # needs torch
 pytestmark = pytest.mark.learned
 
 NUM_ROWS = 60 + 2 * 10 + 1 + 160
-BATCH_TOLERANCE = 2e-5  # batches are summed in another order
+BATCH_TOLERANCE = 2e-5  # on most machines there is no difference
 MIDDLE = (210.0, 0.3, 0.02)
 
 
@@ -126,7 +126,7 @@ def test_a_batch_agrees_with_one_by_one_whatever_its_sizes(rough):
         (alone,) = rough.infer([one])
         for mine, given_ in zip(alone, other, strict=True):
             assert mine.shape == given_.shape
-            np.testing.assert_allclose(given_, mine, rtol=BATCH_TOLERANCE, atol=BATCH_TOLERANCE)
+            np.testing.assert_allclose(given_, mine, rtol=0.0, atol=BATCH_TOLERANCE)
 
 
 def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rough):
