@@ -12,24 +12,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shiftsim.data.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
 from shiftsim.log import SimulationLog
 from shiftsim.scenario import Scenario
 from shiftsim.state import Tracks
 
-_EGO_COLUMNS = (
-    "x_m",
-    "y_m",
-    "heading_rad",
-    "vx_mps",
-    "vy_mps",
-    "ax_mps2",
-    "ay_mps2",
-    "steering_angle_rad",
-    "steering_rate_radps",
-    "yaw_rate_radps",
-    "yaw_accel_radps2",
-)
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
 # states hardly compress and are never searched: what costs time brings nothing
@@ -53,7 +41,7 @@ _SCHEMA = pa.schema(
         "token": _KEY,
         "iteration": pa.int64(),
         "time_us": pa.int64(),
-        **dict.fromkeys((*_EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
+        **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
         "planning_seconds": pa.float64(),
         "degraded": pa.bool_(),
         "plan_poses": _list_of(pa.float64()),
@@ -157,7 +145,7 @@ def complete_rollout(table: pa.Table, scenario: Scenario) -> SimulationLog:
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
-        ego=_stack(table, _EGO_COLUMNS),
+        ego=_stack(table, EGO_COLUMNS),
         tracks=tracks,
         traffic_lights=scenario.traffic_lights.rows(samples),
         expert_time_us=scenario.iteration_times,

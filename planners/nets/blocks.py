@@ -4,7 +4,7 @@ Only inference is meant: no dropout, no drop path. What the official code comput
 away is not computed here: the ego's own history, and all but the last step of an agent's.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -322,3 +322,42 @@ def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
     dense = values.new_zeros(keep.numel(), values.shape[1])
     dense.index_copy_(0, row, values)
     return dense.reshape(*keep.shape, values.shape[1]).amax(dim=1)
+
+
+class MapEncoder(nn.Module):
+    """Tokens of the polygons, without their poses."""
+
+    def __init__(self, channels: int, speed_limit_emb: nn.Module) -> None:
+        super().__init__()
+        self.polygon_encoder = PointsEncoder(channels)
+        self.speed_limit_emb = speed_limit_emb
+        self.type_emb = nn.Embedding(3, DIM)
+        self.on_route_emb = nn.Embedding(2, DIM)
+        self.traffic_light_emb = nn.Embedding(4, DIM)
+        self.unknown_speed_emb = nn.Embedding(1, DIM)
+
+    def forward(self, points: Tensor, seen: Any) -> Tensor:
+        """(B, M, 128).
+
+        Args:
+            points: (B, M, K, channels) what is known of each point.
+            seen: Inputs of the network.
+        """
+        tokens = self.polygon_encoder(points, seen.point_valid)
+        known = self.speed_limit_emb(seen.limit[..., None])
+        speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
+        out: Tensor = (
+            tokens
+            + self.type_emb(seen.kind)
+            + self.on_route_emb(seen.on_route)
+            + self.traffic_light_emb(seen.light)
+            + speed
+        )
+        return out
+
+
+def along_line(middle: Tensor, seen: Any) -> list[Tensor]:
+    """Of each point of the centre lines (B, M, K, 2): place, vector and direction, each (…, 2)."""
+    angle = seen.orientations
+    directions = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    return [middle - seen.centers[:, :, None, :2], seen.vectors, directions]

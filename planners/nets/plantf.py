@@ -12,7 +12,8 @@ from shiftsim.planners.nets.blocks import (
     DIM,
     AgentEncoder,
     EncoderBlock,
-    PointsEncoder,
+    MapEncoder,
+    along_line,
     history_steps,
 )
 from shiftsim.planners.nets.rows import Linear, make_scenes, present
@@ -101,39 +102,6 @@ class Outputs(NamedTuple):
     prediction: Tensor | None
 
 
-class MapEncoder(nn.Module):
-    """Tokens of the polygons, without their poses."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.polygon_encoder = PointsEncoder(channels)
-        self.speed_limit_emb = nn.Sequential(Linear(1, DIM), nn.ReLU(), Linear(DIM, DIM))
-        self.type_emb = nn.Embedding(3, DIM)
-        self.on_route_emb = nn.Embedding(2, DIM)
-        self.traffic_light_emb = nn.Embedding(4, DIM)
-        self.unknown_speed_emb = nn.Embedding(1, DIM)
-
-    def forward(self, seen: Inputs) -> Tensor:
-        """(B, M, 128)."""
-        angle = seen.orientations
-        parts = (
-            seen.points - seen.centers[:, :, None, :2],
-            seen.vectors,
-            torch.stack([angle.cos(), angle.sin()], dim=-1),
-        )
-        tokens = self.polygon_encoder(torch.cat(parts, dim=-1), seen.point_valid)
-        known = self.speed_limit_emb(seen.limit[..., None])
-        speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
-        out: Tensor = (
-            tokens
-            + self.type_emb(seen.kind)
-            + self.on_route_emb(seen.on_route)
-            + self.traffic_light_emb(seen.light)
-            + speed
-        )
-        return out
-
-
 class TrajectoryDecoder(nn.Module):
     """Several trajectories and their logits from the ego token."""
 
@@ -167,7 +135,8 @@ class PlanTfNetwork(nn.Module):
         super().__init__()
         self.pos_emb = nn.Sequential(Linear(4, DIM), nn.ReLU(), Linear(DIM, DIM))
         self.agent_encoder = AgentEncoder(STATE_CHANNELS)
-        self.map_encoder = MapEncoder(POLYGON_CHANNELS)
+        limits = nn.Sequential(Linear(1, DIM), nn.ReLU(), Linear(DIM, DIM))
+        self.map_encoder = MapEncoder(POLYGON_CHANNELS, limits)
         self.encoder_blocks = nn.ModuleList(
             EncoderBlock(DIM, num_heads) for _ in range(encoder_depth)
         )
@@ -182,8 +151,11 @@ class PlanTfNetwork(nn.Module):
         agents = self.agent_encoder(steps, known, seen.category, seen.current_state)
         poses = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
         poses = torch.cat([poses, seen.centers], dim=1)
+        points = torch.cat(along_line(seen.points, seen), dim=-1)
         there, counts = _there(seen)
-        x = torch.cat([agents, self.map_encoder(seen)], dim=1)[there] + self._placed(poses[there])
+        x = torch.cat([agents, self.map_encoder(points, seen)], dim=1)[there] + self._placed(
+            poses[there]
+        )
         keep = torch.cat([known, seen.point_valid.any(dim=-1)], dim=1)[there]
         scenes = make_scenes(counts, keep)
         egos = torch.tensor([0, *accumulate(counts[:-1])], device=x.device)

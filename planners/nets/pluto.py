@@ -12,7 +12,8 @@ from shiftsim.planners.nets.blocks import (
     DIM,
     AgentEncoder,
     EncoderBlock,
-    PointsEncoder,
+    MapEncoder,
+    along_line,
     history_steps,
 )
 from shiftsim.planners.nets.pluto_decoder import FourierEmbedding, MlpLayer, PlanningDecoder
@@ -146,41 +147,6 @@ class Outputs(NamedTuple):
     ego: Tensor
 
 
-class MapEncoder(nn.Module):
-    """Tokens of the polygons, without their poses."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.polygon_encoder = PointsEncoder(POLYGON_CHANNELS)
-        self.speed_limit_emb = FourierEmbedding(1)
-        self.type_emb = nn.Embedding(3, DIM)
-        self.on_route_emb = nn.Embedding(2, DIM)
-        self.traffic_light_emb = nn.Embedding(4, DIM)
-        self.unknown_speed_emb = nn.Embedding(1, DIM)
-
-    def forward(self, seen: Inputs) -> Tensor:
-        """(B, M, 128)."""
-        angle, middle = seen.orientations, seen.points[:, :, 0]
-        parts = (
-            middle - seen.centers[:, :, None, :2],
-            seen.vectors,
-            torch.stack([angle.cos(), angle.sin()], dim=-1),
-            seen.points[:, :, 1] - middle,
-            seen.points[:, :, 2] - middle,
-        )
-        tokens = self.polygon_encoder(torch.cat(parts, dim=-1), seen.point_valid)
-        known = self.speed_limit_emb(seen.limit[..., None])
-        speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
-        out: Tensor = (
-            tokens
-            + self.type_emb(seen.kind)
-            + self.on_route_emb(seen.on_route)
-            + self.traffic_light_emb(seen.light)
-            + speed
-        )
-        return out
-
-
 class StaticObjectsEncoder(nn.Module):
     """Tokens of the static objects, without their poses."""
 
@@ -228,7 +194,7 @@ class PlutoNetwork(nn.Module):
         super().__init__()
         self.pos_emb = FourierEmbedding(3)
         self.agent_encoder = AgentEncoder(STATE_CHANNELS)
-        self.map_encoder = MapEncoder()
+        self.map_encoder = MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
         self.static_objects_encoder = StaticObjectsEncoder()
         self.encoder_blocks = nn.ModuleList(
             EncoderBlock(DIM, num_heads) for _ in range(encoder_depth)
@@ -277,9 +243,12 @@ class PlutoNetwork(nn.Module):
             dim=1,
         )
         steps = history_steps(seen.position, seen.heading, seen.velocity, seen.shape, seen.valid)
+        middle = seen.points[:, :, 0]
+        sides = [seen.points[:, :, side] - middle for side in (1, 2)]
+        points = torch.cat([*along_line(middle, seen), *sides], dim=-1)
         tokens = (
             self.agent_encoder(steps, known, seen.category, seen.current_state),
-            self.map_encoder(seen),
+            self.map_encoder(points, seen),
             self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
         )
         now = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
