@@ -104,6 +104,7 @@ def test_a_second_conversion_keeps_what_is_there(place, capsys):
     assert content(place / "shiftsim-data/whole") == before
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_killed_conversion_goes_on_and_ends_with_the_same_bytes(place, capsys):
     store = place / "shiftsim-data/killed"

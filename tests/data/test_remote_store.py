@@ -50,7 +50,7 @@ def test_a_file_that_was_damaged_on_the_way_is_refused(remote):
         open_store(url).read(TOKEN)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_a_run_on_a_url_gives_the_bytes_of_one_on_the_folder(remote, tmp_path, workers):
     folder, url = remote
     runs = [

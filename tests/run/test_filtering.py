@@ -184,6 +184,7 @@ def test_a_filter_that_drops_everything_stops_a_run(store):
         shiftsim.run("log-future", store=str(store), workers=1)
 
 
+@pytest.mark.thorough
 def test_a_killed_command_goes_on_with_other_workers_to_the_same_bytes(tmp_path):
     store = write_toy_store(tmp_path / "toy", count=40)
     command = [sys.executable, "-m", "shiftsim", "filter", str(store), "--json", "--workers"]

@@ -103,6 +103,7 @@ def test_only_failed_rollouts_are_kept_where_asked_for(call, tmp_path):
     assert len(list((run.path / "rollouts").iterdir())) == len(kept)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_request_to_end_keeps_what_is_finished_and_says_how_to_go_on(toy, tmp_path):
     words = ["run", "-p", "drivers:Slow", "--noise", "ou-high", "--seeds", "0,1,2,3,4,5,6,7"]

@@ -103,6 +103,7 @@ def test_the_whole_reference_is_equal(nuplan_reference: Path) -> None:
     assert report.num_cases > 4000
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_every_changed_cell_is_noticed(folder: Path) -> None:
     maps = load_maps(folder)
@@ -135,6 +136,7 @@ def edit_json(path: Path, change: Callable[[Any], None]) -> None:
     path.write_text(json.dumps(content))
 
 
+@pytest.mark.thorough
 def test_every_changed_scene_fact_is_noticed(folder: Path) -> None:
     path = folder / "expected" / "scenario_meta.json"
     for field in json.loads(path.read_text())["s06_right_turn_ped"]:
@@ -149,6 +151,7 @@ def test_every_changed_scene_fact_is_noticed(folder: Path) -> None:
         path.write_bytes(original)
 
 
+@pytest.mark.thorough
 def test_every_changed_manifest_entry_is_noticed(folder: Path) -> None:
     path = folder / "scenes.json"
     fields = set(json.loads(path.read_text())[0]) - {"scene", "db", "map", "token"}
@@ -197,6 +200,7 @@ def test_the_tiny_world_is_equal_in_all_fields() -> None:
     assert report.num_cases >= 18
 
 
+@pytest.mark.thorough
 def test_every_changed_field_of_the_tiny_world_is_noticed(tmp_path: Path) -> None:
     copy = tmp_path / "format"
     shutil.copytree(GOLDEN, copy)
