@@ -155,6 +155,7 @@ def test_reading_commands_speak_json(place):
     assert {"idm", "log-future", "constant-velocity"} <= set(names)
 
 
+@pytest.mark.thorough
 def test_stored_rollouts_are_scored_again(place):
     done = call(place, "score", "runs/good", "--thresholds", "deepplan", "--out", "runs/relaxed")
     assert done.returncode == 0
@@ -162,6 +163,7 @@ def test_stored_rollouts_are_scored_again(place):
     assert shiftsim.open_run(place / "runs" / "relaxed").is_complete
 
 
+@pytest.mark.thorough
 def test_planners_are_checked(place):
     assert call(place, "planners", "check", "mine:Slow", "--store", "toy").returncode == 0
     done = call(place, "planners", "check", "mine:Failing", "--store", "toy", "--token", "0001cafe")
@@ -169,6 +171,7 @@ def test_planners_are_checked(place):
     assert "lost the way" in done.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_an_interrupt_ends_with_130_and_says_what_is_kept(place):
     command = [sys.executable, "-m", "shiftsim", "run", "-p", "mine:Slower", "-s", "toy"]

@@ -90,6 +90,7 @@ def test_a_broken_recording_is_skipped_with_its_reason_and_the_others_finish(pla
     assert check_store(place / "shiftsim-data/again") == []
 
 
+@pytest.mark.thorough
 def test_the_bytes_do_not_depend_on_the_number_of_workers(place, capsys):
     code, _, err = convert(place, capsys, "town", "--store", "two", "--workers", "2")
     assert code == 3, err

@@ -39,12 +39,14 @@ def test_the_command_line_drives_a_planner_of_the_present_folder(toy, tmp_path):
     assert theirs == pytest.approx(_scores(tmp_path / "out", "constant-velocity"), abs=1e-9)
 
 
+@pytest.mark.thorough
 def test_the_command_line_checks_the_contract(toy, tmp_path):
     shutil.copy(PAGE, tmp_path / "mine.py")
     done = call(tmp_path, "planners", "check", "nuplan:mine:FollowRoute", "--store", str(toy))
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.thorough
 def test_an_instance_travels_to_workers(toy, tmp_path):
     run = shiftsim.run(
         [nuplan.wrap(planners.Coast(horizon=8.0)), "constant-velocity"],

@@ -143,6 +143,7 @@ def test_an_existing_demo_store_is_kept(store):
     assert (store.path / "store.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_benchmark_city_is_large_and_its_agents_are_near():
     scene = bench_scene(40, 0)

@@ -481,6 +481,7 @@ def test_iterations_that_no_mapping_gives_are_refused(trip):
         cut_of(odd)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_scenarios_made_from_drone_recordings_come_back(tmp_path):
     from shiftsim.data.synthetic import demo_store
