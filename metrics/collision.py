@@ -5,10 +5,18 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.geometry import boxes_to_corners
 from shiftsim.metrics import kernels_collision
 from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Statistic, Violation
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.state import LAST_AGENT_KIND, AgentKind, Tracks
+from shiftsim.state import (
+    LAST_AGENT_KIND,
+    AgentKind,
+    Tracks,
+    VehicleParameters,
+    center_poses,
+    speeds,
+)
 
 NAME = "no_ego_at_fault_collisions"
 COLLISION_TYPES = ("stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral")
@@ -56,6 +64,14 @@ class Contacts(NamedTuple):
     first: IntArray
     types: IntArray
     delta_v: FloatArray
+
+
+def flat_ego(states: FloatArray, vehicle: VehicleParameters) -> Ego:
+    """The ego of a rollout: (K, 11) states of its rear axle."""
+    centers = center_poses(states[:, :3], vehicle)
+    size = np.array([vehicle.length, vehicle.width])
+    corners = boxes_to_corners(centers, np.broadcast_to(size, (len(centers), 2)))
+    return Ego(np.ascontiguousarray(states), speeds(states), centers, corners, size)
 
 
 def flat_tracks(tracks: Tracks) -> FlatTracks:

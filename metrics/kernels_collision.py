@@ -6,7 +6,7 @@ diagonal). Most pairs are decided by distances with a margin; the rest exactly, 
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import EXTERIOR, convex_intersect, locate_in_ring, segments_intersect
 from shiftsim.layers import Polygons, in_any
 
@@ -21,7 +21,7 @@ _MARGIN = 1e-6  # m, far above rounding: gaps beyond it need no exact test
 _BOX = 9
 
 
-@kernel
+@lean_kernel
 def _set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> None:
     box[0], box[1] = pose[0], pose[1]
     box[2], box[3] = np.cos(pose[2]), np.sin(pose[2])
@@ -29,13 +29,13 @@ def _set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> 
     _set_size(box, length, width)
 
 
-@kernel
+@lean_kernel
 def _set_size(box: FloatArray, length: float, width: float) -> None:
     box[6], box[7] = 0.5 * length, 0.5 * width
     box[8] = 0.5 * np.sqrt(length * length + width * width)
 
 
-@kernel
+@lean_kernel
 def _set_corners(box: FloatArray, out: FloatArray) -> None:
     for index in range(4):
         lon = box[6] if index == 0 or index == 3 else -box[6]
@@ -45,7 +45,7 @@ def _set_corners(box: FloatArray, out: FloatArray) -> None:
         out[index, 1] = box[1] + (lat * box[5] + lon * box[3])
 
 
-@kernel
+@lean_kernel
 def _gap(a: FloatArray, b: FloatArray) -> float:
     """Largest gap between two boxes along the axes of `a`; negative where they overlap [m]."""
     dx, dy = b[0] - a[0], b[1] - a[1]
@@ -55,7 +55,7 @@ def _gap(a: FloatArray, b: FloatArray) -> float:
     return max(lon, lat)
 
 
-@kernel
+@lean_kernel
 def _collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
     dx, dy = b[0] - a[0], b[1] - a[1]
     reach = a[8] + b[8]
@@ -69,7 +69,7 @@ def _collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
     return convex_intersect(corners[0], corners[1])
 
 
-@kernel
+@lean_kernel
 def _bearing(ego: FloatArray, x: float, y: float) -> float:
     """Angle between the ego heading and the vector from the rear axle to a point [rad].
 
@@ -242,14 +242,14 @@ def time_to_collision(
             ttc[i], partners[i] = TTC_STEP * hit[0], kept[hit[1]]
 
 
-@kernel
+@lean_kernel
 def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
     # nuPlan: along the heading, whatever the direction of the velocity (nuplan-metrics.md §13 Q9)
     step[0] = box[2] * speed * TTC_STEP
     step[1] = box[3] * speed * TTC_STEP
 
 
-@kernel
+@lean_kernel
 def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
     distance = speed * TTC_HORIZON
     for index in range(_BOX):  # a slice assignment takes numba seconds to compile
@@ -269,7 +269,7 @@ def _swept_collide(
     return _collide(swept[0], swept[1], scratch)
 
 
-@kernel
+@lean_kernel
 def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tuple[int, int]:
     """First step at which box 0 meets another, and which; 0 when none does. Moves the boxes."""
     if len(boxes) < 2:

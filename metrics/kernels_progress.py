@@ -2,23 +2,23 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry import project_on_polyline
 from shiftsim.layers import Lists, Polygons, Polylines, contains
 
 
-@kernel
+@lean_kernel
 def _project(lines: Polylines, line: int, x: float, y: float) -> float:
     return project_on_polyline(lines.xy, lines.arc, lines.ptr[line], lines.ptr[line + 1], x, y)
 
 
-@kernel
+@lean_kernel
 def _project_end(lines: Polylines, line: int, other: int) -> float:
     last = lines.ptr[other + 1] - 1
     return _project(lines, line, lines.xy[last, 0], lines.xy[last, 1])
 
 
-@kernel
+@lean_kernel
 def progress_along(
     blocks: Polygons,
     lines: Polylines,
@@ -69,7 +69,7 @@ def progress_along(
             ahead += 1
 
 
-@kernel
+@lean_kernel
 def progress_in_lane(
     lines: Polylines, lists: IntArray, counts: IntArray, poses: FloatArray, out: FloatArray
 ) -> None:
@@ -97,7 +97,7 @@ def progress_in_lane(
         previous, known = along, True
 
 
-@kernel
+@lean_kernel
 def speed_limits_along(
     num_lanes: int,
     incoming: Lists,

@@ -2,11 +2,13 @@
 
 Every sample has a short list of edges, stored as a row of a (…, C) index array with its length; C
 is the largest number of edges that can hold one point. Lanes come before connectors.
+
+A length handed on starts as np.int64(0): for a literal the callee would be compiled once more.
 """
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry import boundary_distance_below
 from shiftsim.layers import Lists, Polygons, containing, contains, distance_to, in_any
 
@@ -14,7 +16,7 @@ _KEEP_DISTANCE = 5.0  # m, how far a connector is kept for inside an intersectio
 _OVERLAP = -1  # several lanes hold the point
 
 
-@kernel
+@lean_kernel
 def has(items: IntArray, count: int, value: int) -> bool:
     """Whether `value` is among the first `count` items."""
     for index in range(count):
@@ -23,7 +25,7 @@ def has(items: IntArray, count: int, value: int) -> bool:
     return False
 
 
-@kernel
+@lean_kernel
 def _search(polygons: Polygons, num_lanes: int, x: float, y: float, out: IntArray) -> int:
     found = containing(polygons, x, y, out)
     if found > 1 and out[1] < num_lanes:
@@ -33,7 +35,7 @@ def _search(polygons: Polygons, num_lanes: int, x: float, y: float, out: IntArra
     return found
 
 
-@kernel
+@lean_kernel
 def _narrow(
     polygons: Polygons,
     outgoing: Lists,
@@ -58,7 +60,7 @@ def _narrow(
     return found
 
 
-@kernel
+@lean_kernel
 def driven_route(
     polygons: Polygons,
     num_lanes: int,
@@ -161,7 +163,7 @@ def corner_routes(
     """
     candidates = np.empty(8 * lists.shape[2], np.int64)
     for i in range(len(corners)):
-        size = 0
+        size = np.int64(0)
         if i > 0:
             for corner in range(4):
                 size = _add(candidates, size, lists[i - 1, corner], counts[i - 1, corner])
@@ -179,7 +181,7 @@ def corner_routes(
     return -1
 
 
-@kernel
+@lean_kernel
 def _add(items: IntArray, size: int, more: IntArray, count: int) -> int:
     for index in range(count):
         if not has(items, size, more[index]):
@@ -188,7 +190,7 @@ def _add(items: IntArray, size: int, more: IntArray, count: int) -> int:
     return size
 
 
-@kernel
+@lean_kernel
 def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> bool:
     if has(items, count, value):
         return True
@@ -200,7 +202,7 @@ def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> 
     return False
 
 
-@kernel
+@lean_kernel
 def _linked(
     fl: IntArray,
     rl: IntArray,
@@ -234,7 +236,7 @@ def _linked(
     return found if found > 0 else -1
 
 
-@kernel
+@lean_kernel
 def _common(
     lists: IntArray, size: IntArray, incoming: Lists, outgoing: Lists, out: IntArray
 ) -> int:
@@ -283,7 +285,7 @@ def lane_states(
         np.empty(room, np.int64),
         np.empty(room, np.int64),
     )
-    is_open, num, initial_size = False, 0, 0
+    is_open, num, initial_size = False, 0, np.int64(0)
     for i in range(len(counts)):
         state = _common(lists[i], counts[i], incoming, outgoing, current)
         states[i] = state
@@ -347,7 +349,7 @@ def corner_violations(
                     distances[i, corner] = _scan_near(drivable, x, y, best, found, corner)
 
 
-@kernel
+@lean_kernel
 def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) -> float:
     """Distance of a point from the nearest polygon, whose index goes to `found[corner]` [m]."""
     best = np.inf
@@ -358,7 +360,7 @@ def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) 
     return best
 
 
-@kernel
+@lean_kernel
 def _scan_near(
     polygons: Polygons, x: float, y: float, limit: float, found: IntArray, corner: int
 ) -> float:
@@ -380,7 +382,7 @@ def _scan_near(
     return best
 
 
-@kernel
+@lean_kernel
 def _distance_below(polygons: Polygons, poly: int, x: float, y: float, limit: float) -> float:
     """Distance of a point outside polygon `poly` from it, or `limit` where it is not below [m]."""
     dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])

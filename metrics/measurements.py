@@ -6,7 +6,6 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import DataError
-from shiftsim.geometry import boxes_to_corners
 from shiftsim.log import SimulationLog
 from shiftsim.map import VectorMap
 from shiftsim.metrics import collision, drivable_area, driving_direction, progress, speed_limit
@@ -14,7 +13,7 @@ from shiftsim.metrics.comfort import MIN_SAMPLES, ComfortSignals, comfort_signal
 from shiftsim.metrics.result import Collision
 from shiftsim.metrics.route import EdgeLists, LaneChanges, corner_routes, driven_route, lane_changes
 from shiftsim.metrics.time_to_collision import TimeToCollision, time_to_collision
-from shiftsim.state import STATE_COLUMNS, VehicleParameters, center_poses, speeds
+from shiftsim.state import STATE_COLUMNS, VehicleParameters, center_poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +70,14 @@ def measure(log: SimulationLog, road: VectorMap) -> Measurements:
     """
     _check(log)
     vehicle = VehicleParameters()
-    centers = center_poses(log.ego[:, :3], vehicle)
-    size = np.array([vehicle.length, vehicle.width])
-    footprints = boxes_to_corners(centers, np.broadcast_to(size, (len(centers), 2)))
-    speed = speeds(log.ego)
+    ego, tracks = collision.flat_ego(log.ego, vehicle), collision.flat_tracks(log.tracks)
     # nuPlan's order of evaluation, which decides what is reported when several things are wrong
-    route = driven_route(road, centers)
-    corners = corner_routes(road, footprints)
+    route = driven_route(road, ego.centers)
+    corners = corner_routes(road, ego.corners)
     lanes = lane_changes(road, corners)
     comfort = comfort_signals(log.time_us, log.ego)
-    along = progress.measure(road, centers, center_poses(log.expert_ego[:, :3], vehicle))
-    drivable = drivable_area.measure(road, footprints, route, corners)
-    ego = collision.Ego(np.ascontiguousarray(log.ego), speed, centers, footprints, size)
-    tracks = collision.flat_tracks(log.tracks)
+    along = progress.measure(road, ego.centers, center_poses(log.expert_ego[:, :3], vehicle))
+    drivable = drivable_area.measure(road, ego.corners, route, corners)
     contacts = collision.first_contacts(ego, tracks)
     collisions = collision.classify(contacts, log.time_us, log.tracks, lanes.is_common)
     ttc = time_to_collision(ego, tracks, contacts, collisions, lanes.is_common, road, log.tracks)
@@ -97,8 +91,8 @@ def measure(log: SimulationLog, road: VectorMap) -> Measurements:
         drivable=drivable,
         collisions=collisions,
         ttc=ttc,
-        overspeed=speed_limit.overspeed(road, route, speed),
-        lane_progress=driving_direction.lane_progress(road, route, centers),
+        overspeed=speed_limit.overspeed(road, route, ego.speeds),
+        lane_progress=driving_direction.lane_progress(road, route, ego.centers),
     )
 
 

@@ -58,7 +58,7 @@ def kernel(function: Any) -> Any:
 
 
 def lean_kernel(function: Any) -> Any:
-    """As `kernel`, for functions that make, receive and return no arrays; they count no references.
+    """As `kernel`, for functions that make and return no arrays; they count no references.
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """

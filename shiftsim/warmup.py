@@ -18,20 +18,22 @@ import numpy as np
 from shiftsim.log import SimulationLog
 from shiftsim.map import VectorMap
 from shiftsim.scenario import Scenario
-from shiftsim.state import AgentKind, Tracks, TrafficLights
+from shiftsim.state import AgentKind, Tracks, TrafficLights, VehicleParameters
 
 WORLD = Path(__file__).parent / "reference" / "metric_worlds" / "metric_world_21.json"
-SHARES = ("metrics", "planners")
 _ROUTE = ("R1", "RC1", "R2")
 
 
 @contextmanager
-def warm_up() -> Iterator[None]:
+def warm_up(*shares: str) -> Iterator[None]:
     """Compile in the background for as long as the block lasts, and wait for the rest after it.
 
     A share that fails is left to whoever runs into its cause.
+
+    Args:
+        shares: Names out of `SHARES`; all of them when none is named.
     """
-    command = "import sys; from shiftsim.warmup import compile_share; compile_share(sys.argv[1])"
+    command = "import sys; from shiftsim.warmup import SHARES; SHARES[sys.argv[1]]()"
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", command, share],
@@ -39,7 +41,7 @@ def warm_up() -> Iterator[None]:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        for share in SHARES
+        for share in shares or SHARES
     ]
     try:
         yield
@@ -51,19 +53,49 @@ def warm_up() -> Iterator[None]:
             process.wait()
 
 
-def compile_share(share: str) -> None:
-    """Compile one of `SHARES` by using its kernels once."""
-    log, road = _scene()
-    if share == "metrics":
-        from shiftsim.metrics import compute_metrics
+def _routes() -> None:
+    """Metrics that find the ego on the map."""
+    from shiftsim.metrics import collision, drivable_area
+    from shiftsim.metrics.route import corner_routes, driven_route, lane_changes
 
-        compute_metrics(log, road)
-        return
+    log, road = _scene()
+    ego = collision.flat_ego(log.ego, VehicleParameters())
+    route, corners = driven_route(road, ego.centers), corner_routes(road, ego.corners)
+    lane_changes(road, corners)
+    drivable_area.measure(road, ego.corners, route, corners)
+
+
+def _contacts() -> None:
+    """The other metrics."""
+    from shiftsim.metrics import collision, driving_direction, progress, speed_limit
+    from shiftsim.metrics.comfort import comfort_signals
+    from shiftsim.metrics.route import EdgeLists, list_room
+    from shiftsim.metrics.time_to_collision import time_to_collision
+
+    log, road = _scene()
+    ego = collision.flat_ego(log.ego, VehicleParameters())
+    tracks, is_common = collision.flat_tracks(log.tracks), np.ones(len(log.ego), np.bool_)
+    contacts = collision.first_contacts(ego, tracks)
+    time_to_collision(ego, tracks, contacts, (), is_common, road, log.tracks)
+    comfort_signals(log.time_us, log.ego)
+    progress.measure(road, ego.centers, ego.centers)
+    off_road = EdgeLists(
+        np.zeros((len(log.ego), list_room(road)), np.int64), np.zeros(len(log.ego), np.int64)
+    )
+    speed_limit.overspeed(road, off_road, ego.speeds)
+    driving_direction.lane_progress(road, off_road, ego.centers)
+
+
+def _planners() -> None:
+    """Dynamics, and a planner that follows the route."""
     from shiftsim.planners import load_planner
     from shiftsim.simulation import simulate
 
     for planner in ("constant-velocity", "idm"):
-        simulate(_scenario(log, road), load_planner(planner, {}))
+        simulate(_scenario(*_scene()), load_planner(planner, {}))
+
+
+SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
 
 
 def _scene() -> tuple[SimulationLog, VectorMap]:

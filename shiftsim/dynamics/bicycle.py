@@ -7,7 +7,7 @@ angle is limited.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry import wrap_angle
 from shiftsim.state import (
     AX,
@@ -30,7 +30,7 @@ STEERING_TIME_CONSTANT = 0.05  # s, nuPlan kinematic bicycle
 WHEEL_BASE = PACIFICA.wheel_base  # m
 
 
-@kernel
+@lean_kernel
 def step_seconds(now_us: int, next_us: int) -> float:
     """Seconds from one time stamp to another, for the motion model.
 
@@ -40,7 +40,7 @@ def step_seconds(now_us: int, next_us: int) -> float:
     return (next_us - now_us) * 1e-6
 
 
-@kernel
+@lean_kernel
 def step_bicycle(
     state: FloatArray,
     accel: float,
@@ -85,7 +85,7 @@ def step_bicycle(
     out[YAW_ACCEL] = (yaw_rate - old_yaw_rate) / dt
 
 
-@kernel
+@lean_kernel
 def step_bicycles(
     states: FloatArray,
     commands: FloatArray,
@@ -106,7 +106,7 @@ def step_bicycles(
         step_bicycle(states[row], commands[row, 0], commands[row, 1], wheel_base, dt, out[row])
 
 
-@kernel
+@lean_kernel
 def command_and_step(
     now_us: int,
     next_us: int,

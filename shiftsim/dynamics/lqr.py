@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.dynamics.perfect import interpolate, unwrap_correction
 from shiftsim.errors import InvalidTrajectoryError
@@ -72,13 +72,13 @@ class Reference(NamedTuple):
     curvature: FloatArray
 
 
-@kernel
+@lean_kernel
 def num_resampled(traj_time_us: IntArray, step_us: int) -> int:
     """Number of poses of a trajectory at whole steps from its start."""
     return (traj_time_us[-1] - traj_time_us[0]) // step_us + 1
 
 
-@kernel
+@lean_kernel
 def resample_poses(
     traj_time_us: IntArray, traj_states: FloatArray, step_us: int, out: FloatArray
 ) -> None:
@@ -180,7 +180,7 @@ def fit_curvature(
         out[row] = (out[row] + out[row - 1]) / (1.0 + gains[row])
 
 
-@kernel
+@lean_kernel
 def profile_at(profile: FloatArray, start_us: int, step_us: int, seconds: float) -> float:
     """Value of a profile sampled at whole steps, at a time [s]; clamped at both ends.
 
@@ -251,13 +251,13 @@ def reference(
     return Reference(TRACKED, lateral, wrap_angle(state[HEADING] - heading), speed, curvature)
 
 
-@kernel
+@lean_kernel
 def is_stopping(speed: float, reference_speed: float, params: LqrParameters) -> bool:
     """Whether the stop controller acts; signed speeds, so also when reversing (§12 Q9)."""
     return reference_speed <= params.stopping_speed and speed <= params.stopping_speed
 
 
-@kernel
+@lean_kernel
 def steering_rate(
     ref: Reference, speed: float, steering: float, accel: float, params: LqrParameters
 ) -> float:
@@ -288,7 +288,7 @@ def steering_rate(
     return -top / bottom
 
 
-@kernel
+@lean_kernel
 def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[float, float]:
     """Acceleration [m/s^2] and steering rate [rad/s] that follow the reference; no limits."""
     speed = state[VX]
@@ -300,7 +300,7 @@ def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[f
     return accel, steering_rate(ref, speed, state[STEERING], accel, params)
 
 
-@kernel
+@lean_kernel
 def track(
     now_us: int,
     state: FloatArray,
@@ -319,7 +319,7 @@ def track(
     return TRACKED, accel, rate
 
 
-@kernel
+@lean_kernel
 def track_and_step(
     now_us: int,
     next_us: int,

@@ -7,7 +7,7 @@ out as 0; nothing is extrapolated (nuplan-simulation.md §4).
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
 from shiftsim.geometry import wrap_angle
 from shiftsim.state import (
@@ -26,7 +26,7 @@ MAX_SPEED = 50.0  # m/s, nuPlan perfect tracking controller
 SAMPLE_US = 100_000  # us, spacing of the poses of a plan that a rollout keeps
 
 
-@kernel
+@lean_kernel
 def unwrap_correction(before: float, after: float) -> float:
     """What to add to a heading (and all later ones) to make the step from the one before small.
 
@@ -41,7 +41,7 @@ def unwrap_correction(before: float, after: float) -> float:
     return wrapped - step
 
 
-@kernel
+@lean_kernel
 def segment_end(traj_time_us: IntArray, query_us: int) -> int:
     """Index of the first knot at or after the query, at least 1, at most the last knot."""
     low, high = 1, len(traj_time_us) - 1
@@ -54,7 +54,7 @@ def segment_end(traj_time_us: IntArray, query_us: int) -> int:
     return low
 
 
-@kernel
+@lean_kernel
 def interpolate(
     traj_time_us: IntArray, traj_states: FloatArray, query_us: int, out: FloatArray
 ) -> bool:
