@@ -6,6 +6,7 @@ lights, route and expert come back from the store when a rollout is read.
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,33 +31,30 @@ _KEY = pa.dictionary(pa.int32(), pa.string())
 
 
 def _list_of(kind: pa.DataType) -> pa.DataType:
-    return pa.list_(pa.field("item", kind))
+    return pa.list_(pa.field("item", kind, nullable=False))
 
 
-_SCHEMA = pa.schema(
-    {
-        "planner": _KEY,
-        "noise": _KEY,
-        "seed": pa.int64(),
-        "token": _KEY,
-        "iteration": pa.int64(),
-        "time_us": pa.int64(),
-        **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
-        "planning_seconds": pa.float64(),
-        "degraded": pa.bool_(),
-        "plan_poses": _list_of(pa.float64()),
-    }
-)
-_TRACKS_SCHEMA = pa.schema(
-    [
-        *_SCHEMA,
-        pa.field("track_valid", _list_of(pa.bool_())),
-        *(
-            pa.field(name, _list_of(pa.float64()))
-            for name in ("track_poses", "track_velocities", "track_sizes")
-        ),
-    ]
-)
+def _without_nulls(columns: dict[str, pa.DataType]) -> pa.Schema:
+    return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
+
+
+_COLUMNS = {
+    "planner": _KEY,
+    "noise": _KEY,
+    "seed": pa.int64(),
+    "token": _KEY,
+    "iteration": pa.int64(),
+    "time_us": pa.int64(),
+    **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
+    "planning_seconds": pa.float64(),
+    "degraded": pa.bool_(),
+    "plan_poses": _list_of(pa.float64()),
+}
+_TRACK_COLUMNS = {
+    "track_valid": _list_of(pa.bool_()),
+    **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
+}
+_SCHEMA, _TRACKS_SCHEMA = _without_nulls(_COLUMNS), _without_nulls(_COLUMNS | _TRACK_COLUMNS)
 
 
 class Task(NamedTuple):
@@ -93,7 +91,7 @@ def encode_rollout(task: Task, log: SimulationLog, *, with_tracks: bool) -> byte
 def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Table:
     """One rollout as a table with a row per sample, K rows."""
     count = len(log.time_us)
-    arrays = [*_repeated(task, count), pa.array(np.arange(count)), pa.array(log.time_us)]
+    arrays = [*_repeated(task, count), _numbers(count), pa.array(log.time_us)]
     for values in (log.ego, log.commands, log.noise):
         arrays += map(pa.array, np.ascontiguousarray(values.T))
     arrays += [pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
@@ -105,9 +103,8 @@ def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Ta
 
 def _repeated(task: Task, count: int) -> list[pa.Array]:
     """The key in every row."""
-    first = pa.array(np.zeros(count, np.int32))
     return [
-        pa.DictionaryArray.from_arrays(first, pa.array([value]))
+        pa.DictionaryArray.from_arrays(_zeros(count), pa.array([value]))
         if isinstance(value, str)
         else pa.array(np.full(count, value, np.int64))
         for value in task
@@ -116,9 +113,27 @@ def _repeated(task: Task, count: int) -> list[pa.Array]:
 
 def _lists(values: np.ndarray) -> pa.Array:
     """(K, …) as K lists of equal length."""
-    size = math.prod(values.shape[1:])
-    offsets = pa.array(np.arange(len(values) + 1, dtype=np.int32) * size)
-    return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()))
+    kind = _TRACK_COLUMNS["track_valid" if values.dtype == np.bool_ else "track_poses"]
+    offsets = _offsets(len(values), math.prod(values.shape[1:]))
+    return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()), type=kind)
+
+
+# rollouts have the same length again and again
+
+
+@lru_cache(16)
+def _numbers(count: int) -> pa.Array:
+    return pa.array(np.arange(count, dtype=np.int64))
+
+
+@lru_cache(16)
+def _zeros(count: int) -> pa.Array:
+    return pa.array(np.zeros(count, np.int32))
+
+
+@lru_cache(16)
+def _offsets(count: int, size: int) -> pa.Array:
+    return pa.array(np.arange(count + 1, dtype=np.int32) * size)
 
 
 def _from_lists(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
