@@ -1,18 +1,29 @@
 """Decoder of the Diffusion Planner: a diffusion transformer over the ego and its neighbours.
 
-What does not depend on the noisy trajectories is computed once per plan (`prepare`): the route
+What does not depend on the noisy trajectories is computed once per plan (`DiT.prepare`): the route
 encoding, the modulation at every time of the sampler, the keys and values of the scene's tokens.
-`forward` is one call of the network (planner-diffusion.md §3.2).
+`Prepared` is called for every step of the sampler (planner-diffusion.md §3.2).
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.nets.diffusion_parts import EPS, Attention, Mixer, Mlp, tanh_gelu_
+from shiftsim.planners.nets.diffusion_parts import (
+    EPS,
+    Attention,
+    Mixer,
+    Mlp,
+    Norm,
+    Product,
+    gelu_,
+    norm,
+    product,
+    tanh_gelu_,
+)
 from shiftsim.planners.nets.rows import Linear
 
 ROUTE_COLUMNS, ROUTE_TOKENS, ROUTE_CHANNELS = 4, 32, 64
@@ -20,22 +31,115 @@ FREQUENCIES, LONGEST = 128, 10000.0  # of the time embedding
 NO_KEY = float("-inf")
 
 
-class Prepared(NamedTuple):
-    """What all calls of one plan share. S sampler times, D blocks.
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A `DiTBlock` at hand for one plan. S sampler times.
 
     Attributes:
-        modulation: By block and call: shift, scale and gate, twice, each (B, 1, hidden).
-        final: By call: shift and scale of the last layer, each (B, 1, hidden).
-        keys: D tensors (B, heads, N, C) of the scene's tokens.
-        values: D tensors of the same shape.
-        mask: (B, 1, 1, A) added to the logits of the agents.
+        norms: The four of the block.
+        packed: Queries, keys and values of the agents.
+        joined: Out of the attention between agents.
+        mlp1: First and second layer.
+        query: Into the attention to the scene.
+        looked: Out of it.
+        mlp2: First and second layer.
+        modulation: By call: shift, scale and gate, twice, each (B, 1, hidden).
+        keys: (B * heads, C, N) of the scene's tokens, scaled.
+        values: (B * heads, N, C) of the same.
+        mask: (B * heads, 1, A) added to the logits of the agents.
     """
 
-    modulation: list[list[tuple[Tensor, ...]]]
-    final: list[tuple[Tensor, ...]]
-    keys: list[Tensor]
-    values: list[Tensor]
+    norms: tuple[Norm, ...]
+    packed: Product
+    joined: Product
+    mlp1: tuple[Product, Product]
+    query: Product
+    looked: Product
+    mlp2: tuple[Product, Product]
+    modulation: list[tuple[Tensor, ...]]
+    keys: Tensor
+    values: Tensor
     mask: Tensor
+
+    def __call__(self, x: Tensor, call: int) -> Tensor:
+        """(B, A, hidden) to the same."""
+        shift1, scale1, gate1, shift2, scale2, gate2 = self.modulation[call]
+        norm1, norm2, norm3, norm4 = self.norms
+        y = torch.addcmul(shift1, norm1(x), scale1).flatten(0, 1)
+        x = torch.addcmul(x, gate1, self._among(y, len(x)).view_as(x))
+        y = torch.addcmul(shift2, norm2(x), scale2).flatten(0, 1)
+        x = torch.addcmul(x, gate2, _mlp(self.mlp1, y).view_as(x))
+        # the second half has no residual
+        return _mlp(self.mlp2, norm4(self._at_scene(norm3(x)))).view_as(x)
+
+    def _among(self, x: Tensor, scenes: int) -> Tensor:
+        """Agents (B * A, hidden) attend to those of their scene."""
+        channels = self.keys.shape[1]
+        parts = self.packed(x).view(scenes, -1, 3, len(self.keys) // scenes, channels)
+        query, keys, values = parts.permute(2, 0, 3, 1, 4).flatten(1, 2)
+        logits = torch.baddbmm(self.mask, query, keys.mT, alpha=channels**-0.5)
+        return self.joined(_mixed(logits, values, scenes))
+
+    def _at_scene(self, x: Tensor) -> Tensor:
+        """Agents (B, A, hidden) attend to the tokens of their scene; (B * A, hidden)."""
+        heads, channels = len(self.keys) // len(x), self.keys.shape[1]
+        query = self.query(x.flatten(0, 1)).view(*x.shape[:2], heads, channels)
+        logits = torch.bmm(query.transpose(1, 2).flatten(0, 1), self.keys)
+        return self.looked(_mixed(logits, self.values, len(x)))
+
+
+def _mixed(logits: Tensor, values: Tensor, scenes: int) -> Tensor:
+    """(B * A, heads * C) of logits (B * heads, A, N) and values (B * heads, N, C)."""
+    mixed = torch.bmm(logits.softmax(dim=-1), values)
+    by_agent = mixed.view(scenes, -1, *mixed.shape[1:]).transpose(1, 2)
+    return by_agent.reshape(-1, by_agent.shape[2] * by_agent.shape[3])
+
+
+def _mlp(layers: tuple[Product, Product], x: Tensor) -> Tensor:
+    first, second = layers
+    return second(tanh_gelu_(first(x)))
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """The network at hand for one plan.
+
+    Attributes:
+        entry: First and second layer into the blocks.
+        kinds: (A, hidden) embedding of an agent's kind, ego or neighbour.
+        blocks: The blocks.
+        norms: The three of the last layer.
+        exit: First and second layer out of the blocks.
+        modulation: By call: shift and scale of the last layer, each (B, 1, hidden).
+    """
+
+    entry: tuple[Product, Product]
+    kinds: Tensor
+    blocks: list[Block]
+    norms: tuple[Norm, ...]
+    exit: tuple[Product, Product]
+    modulation: list[tuple[Tensor, ...]]
+
+    def __call__(self, x: Tensor, call: int) -> Tensor:
+        """One call of the network.
+
+        Args:
+            x: (B, A, 4 * steps) noisy trajectories, ego first; on a CPU at least `rows.ROWS`.
+            call: Which of the prepared times.
+
+        Returns:
+            (B, A, 4 * steps) clean ones.
+        """
+        shape = x.shape
+        first, second = self.entry
+        x = second(gelu_(first(x.flatten(0, 1)))).view(*shape[:2], -1) + self.kinds
+        for block in self.blocks:
+            x = block(x, call)
+        shift, scale = self.modulation[call]
+        norm1, norm2, norm3 = self.norms
+        first, second = self.exit
+        x = norm2(torch.addcmul(shift, norm1(x), scale)).flatten(0, 1)
+        return second(norm3(tanh_gelu_(first(x)))).view(shape)
 
 
 class RouteEncoder(nn.Module):
@@ -90,23 +194,24 @@ class DiTBlock(nn.Module):
         self.norm4 = nn.LayerNorm(hidden, EPS)
         self.mlp2 = Mlp(hidden, 4 * hidden, hidden, approximate="tanh")
 
-    def forward(
-        self,
-        x: Tensor,
-        modulation: tuple[Tensor, ...],
-        keys: Tensor,
-        values: Tensor,
-        mask: Tensor,
-    ) -> Tensor:
-        """(B, A, hidden) to the same; the other arguments as in `Prepared`."""
-        shift1, scale1, gate1, shift2, scale2, gate2 = modulation
-        y = torch.addcmul(shift1, self.norm1(x), scale1)
-        x = torch.addcmul(x, gate1, self.attn(*self.attn.project_all(y), mask))
-        y = torch.addcmul(shift2, self.norm2(x), scale2)
-        x = torch.addcmul(x, gate2, self.mlp1(y))
-        x = self.cross_attn(self.cross_attn.query(self.norm3(x)), keys, values, None)
-        out: Tensor = self.mlp2(self.norm4(x))
-        return out
+    def at_hand(self, context: Tensor, modulation: list[tuple[Tensor, ...]], mask: Tensor) -> Block:
+        """The block for one plan: tokens of the scene (B, N, hidden), the rest as in `Block`."""
+        first = self.cross_attn.channels
+        weight, bias = self.cross_attn.in_proj_weight, self.cross_attn.in_proj_bias
+        keys, values = self.cross_attn.keys_values(context)
+        return Block(
+            norms=tuple(norm(getattr(self, f"norm{number}")) for number in (1, 2, 3, 4)),
+            packed=Product(self.attn.in_proj_weight.t(), self.attn.in_proj_bias),
+            joined=product(self.attn.out_proj),
+            mlp1=(product(self.mlp1.fc1), product(self.mlp1.fc2)),
+            query=Product(weight[:first].t(), bias[:first]),
+            looked=product(self.cross_attn.out_proj),
+            mlp2=(product(self.mlp2.fc1), product(self.mlp2.fc2)),
+            modulation=modulation,
+            keys=(keys * keys.shape[-1] ** -0.5).mT.flatten(0, 1).contiguous(),
+            values=values.flatten(0, 1).contiguous(),
+            mask=mask,
+        )
 
 
 class FinalLayer(nn.Module):
@@ -124,14 +229,6 @@ class FinalLayer(nn.Module):
             Linear(4 * hidden, outputs),
         )
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), Linear(hidden, 2 * hidden))
-
-    def forward(self, x: Tensor, modulation: tuple[Tensor, ...]) -> Tensor:
-        """(B, A, hidden) to (B, A, outputs)."""
-        shift, scale = modulation
-        norm, first, _, last_norm, last = self.proj
-        x = first(norm(torch.addcmul(shift, self.norm_final(x), scale)))
-        out: Tensor = last(last_norm(tanh_gelu_(x)))
-        return out
 
 
 class DiT(nn.Module):
@@ -151,6 +248,7 @@ class DiT(nn.Module):
             points: Of a lane.
         """
         super().__init__()
+        self.heads = heads
         self.route_encoder = RouteEncoder(lanes, points, hidden)
         self.agent_embedding = nn.Embedding(2, hidden)
         self.preproj = Mlp(4 * steps, 512, hidden)
@@ -169,45 +267,26 @@ class DiT(nn.Module):
         """
         condition = functional.silu(route + self.t_embedder(times)[:, None])[:, :, None]
         one = torch.ones((), device=context.device)
-        modulation, keys, values = [], [], []
+        zeros = torch.zeros(absent.shape, device=context.device).masked_fill(absent, NO_KEY)
+        mask = zeros.repeat_interleave(self.heads, dim=0)[:, None]
+        blocks = []
         for block in self.blocks:
             assert isinstance(block, DiTBlock)
             factors = block.adaLN_modulation[1](condition)
             hidden = factors.shape[-1] // 6
             factors[..., hidden : 2 * hidden] += one  # scales are about 1
             factors[..., 4 * hidden : 5 * hidden] += one
-            modulation.append([call.chunk(6, dim=-1) for call in factors])
-            key, value = block.cross_attn.keys_values(context)
-            keys.append(key)
-            values.append(value)
-        final = self.final_layer.adaLN_modulation[1](condition)
+            calls = [call.chunk(6, dim=-1) for call in factors]
+            blocks.append(block.at_hand(context, calls, mask))
+        last = self.final_layer
+        final = last.adaLN_modulation[1](condition)
         final[..., final.shape[-1] // 2 :] += one
-        zeros = torch.zeros(absent.shape, device=context.device)
-        mask = zeros.masked_fill(absent, NO_KEY)[:, None, None, :]
-        ends = [call.chunk(2, dim=-1) for call in final]
-        return Prepared(modulation, ends, keys, values, mask)
-
-    def forward(self, x: Tensor, prepared: Prepared, call: int) -> Tensor:
-        """One call of the network.
-
-        Args:
-            x: (B, A, 4 * steps) noisy trajectories, ego first.
-            prepared: Of the plan.
-            call: Which of the prepared times.
-
-        Returns:
-            (B, A, 4 * steps) clean ones.
-        """
-        x = self.preproj(x)
-        x[:, :1] += self.agent_embedding.weight[0]
-        x[:, 1:] += self.agent_embedding.weight[1]
-        for index, block in enumerate(self.blocks):
-            x = block(
-                x,
-                prepared.modulation[index][call],
-                prepared.keys[index],
-                prepared.values[index],
-                prepared.mask,
-            )
-        out: Tensor = self.final_layer(x, prepared.final[call])
-        return out
+        is_neighbour = torch.arange(absent.shape[1], device=context.device).clamp(max=1)
+        return Prepared(
+            entry=(product(self.preproj.fc1), product(self.preproj.fc2)),
+            kinds=self.agent_embedding(is_neighbour),
+            blocks=blocks,
+            norms=(norm(last.norm_final), norm(last.proj[0]), norm(last.proj[3])),
+            exit=(product(last.proj[1]), product(last.proj[4])),
+            modulation=[call.chunk(2, dim=-1) for call in final],
+        )

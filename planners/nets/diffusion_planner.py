@@ -165,8 +165,7 @@ class DiffusionNetwork(nn.Module):
         if not noise.is_cuda:
             current, absent, noise = (_padded(part) for part in (current, absent, noise))
         prepared = self.prepare(scene, absent)
-        dit = self.dit[0]
-        states = sample(lambda x, call: dit(x, prepared, call), current, noise)
+        states = sample(prepared, current, noise)
         return self.denormalise(states[:, : self.num_agents, 1:])
 
     def denormalise(self, states: Tensor) -> Tensor:

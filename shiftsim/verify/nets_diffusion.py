@@ -237,13 +237,13 @@ def _verify_sampling(
     from shiftsim.planners.nets.diffusion_sampler import sample
 
     current, absent = network.present(scene)
-    prepared, dit = network.prepare(scene, absent), network.dit[0]
+    prepared = network.prepare(scene, absent)
     noise = torch.from_numpy(file["in.noise"])
     seen, made = [], []
 
     def call(x: Any, number: int) -> Any:
         seen.append(x[0, 0].clone())
-        made.append(dit(x, prepared, number))
+        made.append(prepared(x, number))
         return made[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:
