@@ -58,7 +58,7 @@ def _routes() -> None:
     from shiftsim.metrics import collision, drivable_area
     from shiftsim.metrics.route import corner_routes, driven_route, lane_changes
 
-    log, road = _scene()
+    log, road = _rollout()
     ego = collision.flat_ego(log.ego, VehicleParameters())
     route, corners = driven_route(road, ego.centers), corner_routes(road, ego.corners)
     lane_changes(road, corners)
@@ -72,7 +72,7 @@ def _contacts() -> None:
     from shiftsim.metrics.route import EdgeLists, list_room
     from shiftsim.metrics.time_to_collision import time_to_collision
 
-    log, road = _scene()
+    log, road = _rollout()
     ego = collision.flat_ego(log.ego, VehicleParameters())
     tracks, is_common = collision.flat_tracks(log.tracks), np.ones(len(log.ego), np.bool_)
     contacts = collision.first_contacts(ego, tracks)
@@ -92,13 +92,14 @@ def _planners() -> None:
     from shiftsim.simulation import simulate
 
     for planner in ("constant-velocity", "idm"):
-        simulate(_scenario(*_scene()), load_planner(planner, {}))
+        simulate(scene(), load_planner(planner))
 
 
 SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
 
 
-def _scene() -> tuple[SimulationLog, VectorMap]:
+def _rollout() -> tuple[SimulationLog, VectorMap]:
+    """A drive past a car and a pedestrian, and its map."""
     from shiftsim.verify.metric_worlds import read_world
 
     log, road = read_world(json.loads(WORLD.read_text("utf-8")))
@@ -116,7 +117,9 @@ def _scene() -> tuple[SimulationLog, VectorMap]:
     return replace(log, tracks=tracks), road
 
 
-def _scenario(log: SimulationLog, road: VectorMap) -> Scenario:
+def scene() -> Scenario:
+    """A scenario of a dozen iterations: a small map with a route, a car, a pedestrian."""
+    log, road = _rollout()
     return Scenario(
         token=log.token,
         scenario_type="unknown",

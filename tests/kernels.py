@@ -1,0 +1,46 @@
+"""Compile the kernels that many tests need, once, before two workers would both compile them."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+
+from shiftsim.planners import load_planner
+from shiftsim.simulation import simulate
+from shiftsim.warmup import SHARES, scene
+
+MARKER = "compiled-for-tests"
+GROUPS = (
+    ("routes", "contacts", "pdm-closed", "plantf", "pluto"),
+    ("planners", "reactive", "diffusion-planner", "carl"),
+)
+LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
+
+
+def compile_all() -> None:
+    """Do nothing where it has been done; a process for each of `GROUPS` otherwise."""
+    marker = Path(vars(numba.config)["CACHE_DIR"]) / MARKER
+    if marker.exists():
+        return
+    processes = [subprocess.Popen([sys.executable, __file__, *group]) for group in GROUPS]
+    if not any([process.wait() for process in processes]):
+        marker.touch()
+
+
+def compile_share(name: str) -> None:
+    """Compile one of `SHARES`, or what a planner or reactive traffic needs."""
+    if name in SHARES:
+        SHARES[name]()
+    elif name == "reactive":
+        simulate(scene(), load_planner("constant-velocity"), traffic=name)
+    elif name not in LEARNED:
+        simulate(scene(), load_planner(name))
+    elif importlib.util.find_spec("torch"):
+        simulate(scene(), load_planner(name, {"checkpoint": "deterministic:drive"}))
+
+
+if __name__ == "__main__":
+    for share in sys.argv[1:]:
+        compile_share(share)
