@@ -1,7 +1,6 @@
 """The network of PlanTF (planner-plantf.md §3), with the names and shapes of its checkpoint."""
 
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from shiftsim.planners.nets.blocks import (
     along_line,
     history_steps,
 )
-from shiftsim.planners.nets.rows import Linear, make_scenes, present
+from shiftsim.planners.nets.rows import Linear, without_padding
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 STATE_CHANNELS = POLYGON_CHANNELS = 6
@@ -152,13 +151,11 @@ class PlanTfNetwork(nn.Module):
         poses = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
         poses = torch.cat([poses, seen.centers], dim=1)
         points = torch.cat(along_line(seen.points, seen), dim=-1)
-        there, counts = _there(seen)
+        there, scenes = without_padding((known, seen.point_valid.any(dim=-1)), seen.counts)
         x = torch.cat([agents, self.map_encoder(points, seen)], dim=1)[there] + self._placed(
             poses[there]
         )
-        keep = torch.cat([known, seen.point_valid.any(dim=-1)], dim=1)[there]
-        scenes = make_scenes(counts, keep)
-        egos = torch.tensor([0, *accumulate(counts[:-1])], device=x.device)
+        egos = scenes.firsts(x.device)
         last = len(self.encoder_blocks) - 1
         for index, block in enumerate(self.encoder_blocks):
             x = block(x, scenes, egos if index == last and not predict else None)
@@ -178,15 +175,6 @@ class PlanTfNetwork(nn.Module):
         where = torch.stack([poses[:, 0], poses[:, 1], angle.cos(), angle.sin()], dim=-1)
         out: Tensor = self.pos_emb(where)
         return out
-
-
-def _there(seen: Inputs) -> tuple[Tensor, list[int]]:
-    """(B, A + M) agents and polygons that are no padding, and how many there are by scene."""
-    batch, num_agents, num_polygons = *seen.category.shape, seen.kind.shape[1]
-    counts = seen.counts or ([num_agents] * batch, [num_polygons] * batch)
-    parts = zip(counts, (num_agents, num_polygons), strict=True)
-    there = torch.cat([present(*part, seen.kind.device) for part in parts], dim=1)
-    return there, list(map(sum, zip(*counts, strict=True)))
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:

@@ -1,7 +1,6 @@
 """The network of PLUTO (planner-pluto.md §3), with the names and shapes of its checkpoint."""
 
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +16,7 @@ from shiftsim.planners.nets.blocks import (
     history_steps,
 )
 from shiftsim.planners.nets.pluto_decoder import FourierEmbedding, MlpLayer, PlanningDecoder
-from shiftsim.planners.nets.rows import Linear, Scenes, make_scenes, present
+from shiftsim.planners.nets.rows import Linear, Scenes, without_padding
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 STATE_CHANNELS, POLYGON_CHANNELS = 6, 10
@@ -212,7 +211,7 @@ class PlutoNetwork(nn.Module):
         """Plan for a batch."""
         *counts, num_lines = seen.counts or _all_counts(seen)
         x, scenes, there = self._encode(seen, counts)
-        egos = x[torch.tensor([0, *accumulate(scenes.counts[:-1])], device=x.device)]
+        egos = x[scenes.firsts(x.device)]
         tokens = x.new_zeros(*there.shape, DIM)
         tokens[there] = x
         prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
@@ -238,10 +237,7 @@ class PlutoNetwork(nn.Module):
         """
         known = seen.valid.any(dim=-1)
         parts = (known, seen.point_valid.any(dim=-1), seen.object_valid)
-        there = torch.cat(
-            [present(n, part.shape[1], part.device) for n, part in zip(counts, parts, strict=True)],
-            dim=1,
-        )
+        there, scenes = without_padding(parts, counts)
         steps = history_steps(seen.position, seen.heading, seen.velocity, seen.shape, seen.valid)
         middle = seen.points[:, :, 0]
         sides = [seen.points[:, :, side] - middle for side in (1, 2)]
@@ -256,7 +252,6 @@ class PlutoNetwork(nn.Module):
         angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
         where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
         x = torch.cat(tokens, dim=1)[there] + where
-        scenes = make_scenes(list(map(sum, zip(*counts, strict=True))), torch.cat(parts, 1)[there])
         for block in self.encoder_blocks:
             x = block(x, scenes)
         return self.norm(x), scenes, there

@@ -6,6 +6,7 @@ Scenes of different sizes lie one after another, without any padding between the
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -61,6 +62,10 @@ class Scenes(NamedTuple):
     counts: list[int]
     masks: list[Tensor | None]
 
+    def firsts(self, device: torch.device) -> Tensor:
+        """(B,) the first row of each scene."""
+        return torch.tensor([0, *accumulate(self.counts[:-1])], device=device)
+
 
 def make_scenes(counts: Sequence[int], keep: Tensor) -> Scenes:
     """Scenes of `counts` rows, of which those take part for which `keep` (T,) is true."""
@@ -77,6 +82,27 @@ def make_scenes(counts: Sequence[int], keep: Tensor) -> Scenes:
 def present(counts: Sequence[int], length: int, device: torch.device) -> Tensor:
     """(B, length) true in the first rows of every scene, as many as it has."""
     return torch.arange(length, device=device) < torch.tensor(counts, device=device)[:, None]
+
+
+def without_padding(
+    parts: Sequence[Tensor], counts: Sequence[Sequence[int]] | None
+) -> tuple[Tensor, Scenes]:
+    """Which rows of several parts side by side are there, and how they lie.
+
+    Args:
+        parts: Each (B, N), true for rows that take part.
+        counts: By part how many rows each scene has, the rest is padding; None for all.
+
+    Returns:
+        (B, N of all parts) rows that are no padding, and the scenes they make.
+    """
+    counts = counts or [[part.shape[1]] * len(part) for part in parts]
+    there = torch.cat(
+        [present(n, part.shape[1], part.device) for n, part in zip(counts, parts, strict=True)],
+        dim=1,
+    )
+    totals = list(map(sum, zip(*counts, strict=True)))
+    return there, make_scenes(totals, torch.cat(list(parts), dim=1)[there])
 
 
 class Attention(nn.Module):

@@ -206,7 +206,7 @@ def test_the_demo_runs_from_recordings_to_the_table(tmp_path):
     assert (tmp_path / "shiftsim-data" / "demo" / "store.json").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_doctor_finds_this_installation_well(tmp_path):
     done = call(tmp_path, "doctor", "--json")
     assert done.returncode == 0, done.stdout

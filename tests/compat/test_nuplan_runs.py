@@ -26,6 +26,7 @@ def _scores(folder, planner):
     return {row["token"]: row["cls"] for row in rows if row["planner"] == planner}
 
 
+@pytest.mark.thorough
 def test_the_command_line_drives_a_planner_of_the_present_folder(toy, tmp_path):
     shutil.copy(PAGE, tmp_path / "mine.py")
     name = "nuplan:mine:Coast"

@@ -53,6 +53,7 @@ def _digest(folder):
     return digest.hexdigest()
 
 
+@pytest.mark.thorough
 def test_the_demo_is_the_same_bytes_every_time(recordings, tmp_path):
     write_demo(tmp_path)
     assert _digest(tmp_path) == _digest(recordings)

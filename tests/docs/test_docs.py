@@ -308,7 +308,7 @@ def test_columns_of_a_map_are_those_of_the_file() -> None:
     assert sorted(found) == sorted(expected)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_columns_of_a_rollout_are_those_of_the_file(desk: Path) -> None:
     import shiftsim
 

@@ -71,7 +71,7 @@ def test_every_iteration_has_its_own_noise(planner):
     assert not np.array_equal(noises[0], noises[1])
 
 
-@pytest.mark.parametrize("weights", ["base", "drive"])
+@pytest.mark.parametrize("weights", [pytest.param("base", marks=pytest.mark.thorough), "drive"])
 def test_a_batch_agrees_with_one_by_one(weights, rng):
     planner = DiffusionPlanner(f"deterministic:{weights}")
     scenes = [cruise_scenario(start=START), traffic(rng, 3), traffic(rng, 80), bench_scene(40, 1)]

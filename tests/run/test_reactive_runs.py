@@ -6,7 +6,9 @@ import shiftsim
 from shiftsim.rescore import rescore
 
 
-@pytest.mark.parametrize("traffic", ["reactive", "reactive-fixed"])
+@pytest.mark.parametrize(
+    "traffic", ["reactive", pytest.param("reactive-fixed", marks=pytest.mark.thorough)]
+)
 def test_workers_do_not_change_reactive_results(traffic, toy, tmp_path):
     runs = [
         shiftsim.run(
