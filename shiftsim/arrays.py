@@ -58,7 +58,9 @@ def kernel(function: Any) -> Any:
 
 
 def lean_kernel(function: Any) -> Any:
-    """As `kernel`, for functions that make and return no arrays; they count no references.
+    """As `kernel`, for functions that make no arrays and count no references.
+
+    Neither may they return one, nor call a kernel that does: it would never be given back.
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """

@@ -33,7 +33,7 @@ NO_KEY = float("-inf")
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A `DiTBlock` at hand for one plan. S sampler times.
+    """A `DiTBlock` at hand for one plan: its tensors are looked up once, not in every call.
 
     Attributes:
         norms: The four of the block.
