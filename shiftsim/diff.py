@@ -6,14 +6,12 @@ and effect: the world as the planner saw it, its plan, the command, the noise.
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.results import Run
 from shiftsim.rollouts import Task
@@ -230,28 +228,20 @@ def _change(
         if name != "score" and rows[0][name] != rows[1][name]
     }
     departure, note = None, ""
-    files = first.rollout_files.get(task), second.rollout_files.get(task._replace(planner=planner))
-    if files[0] is None or files[1] is None:
+    theirs_of = task._replace(planner=planner)
+    if first.rollout_places.get(task) is None or second.rollout_places.get(theirs_of) is None:
         note = "rollouts are not stored"
     else:
-        departure = find_departure(*map(_read, files))
+        departure = find_departure(first.rollout_rows(task), second.rollout_rows(theirs_of))
         note = "" if departure else "the rollouts are the same: they were judged differently"
     return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
 
 
-def _read(path: Path | None) -> pa.Table:
-    assert path is not None
-    try:
-        return pq.ParquetFile(path).read()
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{str(path)!r} cannot be read: {error}", hint="run it again") from error
-
-
-def find_departure(first: pa.Table, second: pa.Table) -> Departure | None:
+def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
     """The first step at which two stored rollouts differ; None where they never do."""
     rows = min(len(first), len(second))
     best: tuple[int, str] | None = None
-    for name in _ordered(set(first.column_names) & set(second.column_names)):
+    for name in _ordered(set(first.schema.names) & set(second.schema.names)):
         row = _first_difference(_values(first[name], rows), _values(second[name], rows))
         if row is not None and (best is None or row < best[0]):
             best = (row, name)
@@ -275,9 +265,9 @@ def _ordered(names: Iterable[str]) -> list[str]:
     return sorted((name for name in names if name not in _KEYS), key=rank)
 
 
-def _values(column: pa.ChunkedArray, rows: int) -> np.ndarray:
+def _values(column: pa.Array, rows: int) -> np.ndarray:
     """(rows, …) numbers of a column of numbers, or of lists of numbers."""
-    array = column.slice(0, rows).combine_chunks()
+    array = column.slice(0, rows)
     if pa.types.is_list(array.type):
         flat = array.flatten().to_numpy(zero_copy_only=False).astype(np.float64)
         return flat.reshape(rows, -1) if rows else flat
@@ -293,7 +283,7 @@ def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
     return int(np.argmax(differ.reshape(len(differ), -1).any(axis=1)))
 
 
-def _since_start(table: pa.Table, row: int) -> float:
+def _since_start(table: pa.RecordBatch, row: int) -> float:
     times = table["time_us"]
     return (times[row].as_py() - times[0].as_py()) * 1e-6
 

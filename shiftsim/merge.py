@@ -7,10 +7,10 @@ from typing import Any
 from shiftsim.config import parse_shard
 from shiftsim.errors import ConfigError
 from shiftsim.manifest import now
-from shiftsim.results import MISSING, Run
+from shiftsim.results import MISSING, Run, stored_results
 from shiftsim.resume import check_target, difference
 from shiftsim.rollouts import Task
-from shiftsim.run_writer import RunWriter, stored_results
+from shiftsim.run_writer import RunWriter
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
@@ -44,13 +44,13 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
     writer = RunWriter(target, manifest)
     try:
         for run in runs:
-            for result, rollout in stored_results(run.path):
+            for result, place in stored_results(run.path):
                 if result.task in writer.ended:
                     raise ConfigError(
                         f"task {tuple(result.task)!r} of {str(run.path)!r} is in another shard too",
                         hint="name every shard once",
                     )
-                writer.add(result, rollout=rollout)
+                writer.add(result, stored=place)
         errors = _errors(runs)
         return writer.finish(
             manifest | {"state": "finished"},

@@ -103,7 +103,7 @@ def rescore(
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
     check_target(target, determining)
     tasks = [Task(*(row[n] for n in Task._fields)) for row in _finished(run)]
-    lacking = [task for task in tasks if run.rollout_files[task] is None]
+    lacking = [task for task in tasks if run.rollout_places[task] is None]
     if lacking:
         raise DataError(
             f"run {run.path.name!r} holds no rollouts for {len(lacking)} of {len(tasks)} tasks",
@@ -129,12 +129,12 @@ def rescore(
         with closing(outcomes):
             for outcome in outcomes:
                 result = outcome.result or _lost(outcome)
-                writer.add(result, rollout=run.rollout_files[result.task])
+                writer.add(result, stored=run.rollout_places[result.task])
                 progress = advanced(progress, result)
                 on_progress(progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
-        errors = dict(zip(run.rollout_files, run.tasks["error"].to_pylist(), strict=True))
-        return writer.finish(manifest, run.rollout_files, errors.__getitem__)
+        errors = dict(zip(run.rollout_places, run.tasks["error"].to_pylist(), strict=True))
+        return writer.finish(manifest, run.rollout_places, errors.__getitem__)
     finally:
         writer.close()
 

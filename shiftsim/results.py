@@ -6,8 +6,11 @@ Timings are in `tasks.parquet`.
 """
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +20,11 @@ import pyarrow.parquet as pq
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.log import SimulationLog
 from shiftsim.metrics import SHORT_NAMES
+from shiftsim.rollout_files import FOLDER, Place, RolloutReader
 from shiftsim.rollouts import Task, complete_rollout, describe
 from shiftsim.scenario import Scenario
 
-FORMAT_VERSION = 3
-JOURNAL = "unfinished.jsonl"  # results of a run under way; gone when the tables are written
+FORMAT_VERSION = 4
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
 
 _KEY = [
@@ -46,8 +49,13 @@ TASKS_SCHEMA = pa.schema(
         ("planning_ms_p95", pa.float64()),
         ("metrics_seconds", pa.float64()),
         ("rollout", pa.string()),  # file below rollouts/
+        ("rollout_row", pa.int64()),
+        ("rollout_rows", pa.int64()),
     ]
 )
+PLACE = ("rollout", "rollout_row", "rollout_rows")
+TEXTS = ("status", "scenario_type", "error", "hint", "traceback")
+_DURATIONS = [n for n in TASKS_SCHEMA.names if n.endswith("_seconds") or "_ms_" in n]
 SCORES_SCHEMA = pa.schema(
     [
         *_KEY,
@@ -94,7 +102,7 @@ class TaskResult:
         seconds: Durations by column name of `tasks.parquet` [s], or [ms] where the name says so.
         scores: The row of `scores.parquet` beyond the key; empty unless `ok`.
         metrics: The rows of `metrics.parquet` beyond the key.
-        rollout: The rollout as a Parquet file; empty when it is not to be stored.
+        rollout: The rollout, encoded; empty when it is not to be stored.
     """
 
     task: Task
@@ -137,12 +145,16 @@ class Run:
         return _read(self.path / "tasks.parquet")
 
     @cached_property
-    def rollout_files(self) -> dict[Task, Path | None]:
-        """File of every stored rollout; None where there is none."""
-        names = [*Task._fields, "rollout"]
-        rows = zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
-        folder = self.path / "rollouts"
-        return {Task(*row[:4]): folder / row[4] if row[4] else None for row in rows}
+    def rollout_places(self) -> dict[Task, Place | None]:
+        """Where every rollout is stored; None where there is none."""
+        keys, places = (
+            zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
+            for names in (Task._fields, PLACE)
+        )
+        return {
+            Task(*key): stored_place(self.path, *place)
+            for key, place in zip(keys, places, strict=True)
+        }
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
         """One stored rollout.
@@ -154,13 +166,25 @@ class Run:
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.
         """
-        path = self.rollout_files.get(task)
-        if path is None:
+        return complete_rollout(self.rollout_rows(task), scenario)
+
+    def rollout_rows(self, task: Task) -> pa.RecordBatch:
+        """One stored rollout as it lies on disk, a row per sample.
+
+        Raises:
+            DataError: It was not stored, or cannot be read.
+        """
+        place = self.rollout_places.get(task)
+        if place is None:
             raise DataError(
                 f"run {self.path.name!r} holds no rollout of {describe(task)}",
                 hint="run again with --save-rollouts all",
             )
-        return complete_rollout(_read(path), scenario)
+        return self._reader.read(place)
+
+    @cached_property
+    def _reader(self) -> RolloutReader:
+        return RolloutReader()
 
     @property
     def is_complete(self) -> bool:
@@ -199,6 +223,41 @@ class Run:
         import html
 
         return f"<pre>{html.escape(self.table())}</pre>"
+
+
+def stored_place(
+    run: Path, rollout: str | None, rollout_row: int, rollout_rows: int
+) -> Place | None:
+    """Where a rollout is, by the columns of `tasks.parquet`."""
+    return Place(run / FOLDER / rollout, rollout_row, rollout_rows) if rollout else None
+
+
+def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
+    """What made the tables of a run, task by task, and where the rollout is.
+
+    A task without a result has none.
+    """
+    scores, metrics = (_by_task(path / f"{name}.parquet") for name in ("scores", "metrics"))
+    for key, (row,) in _by_task(path / "tasks.parquet"):
+        if row["status"] == MISSING:
+            continue
+        done = row["status"] == OK
+        result = TaskResult(
+            Task(*key),
+            **{name: row[name] for name in TEXTS},
+            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
+            scores=next(scores)[1][0] if done else {},
+            metrics=next(metrics)[1] if done else [],
+        )
+        yield result, stored_place(path, *(row[name] for name in PLACE))
+
+
+def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
+    key = itemgetter(*Task._fields)
+    batches = pq.ParquetFile(path).iter_batches(batch_size=4096)
+    rows = (row for batch in batches for row in batch.to_pylist())
+    for found, group in groupby(rows, key):
+        yield found, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]
 
 
 def _read(path: Path) -> pa.Table:

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.results import JOURNAL, read_manifest
+from shiftsim.journal import JOURNAL
+from shiftsim.results import read_manifest
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
 _MAX_MESSAGE = 600  # characters

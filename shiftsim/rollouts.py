@@ -1,17 +1,17 @@
-"""Rollouts on disk: a Parquet file each, with a row per sample.
+"""Rollouts as columns with a row per sample, and as the bytes that a worker hands over.
 
-What the scenario holds already is not stored again: recorded tracks (unless the traffic reacts),
-lights, route and expert come back from the store when a rollout is read.
+What the scenario holds already is not kept again: recorded tracks (unless the traffic reacts),
+lights, route and expert come back from the store when a rollout is read. The files they end in are
+those of `rollout_files`.
 """
 
 import math
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from shiftsim.data.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
@@ -21,13 +21,6 @@ from shiftsim.state import Tracks
 
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
-# states hardly compress and are never searched: what costs time brings nothing
-_WRITE_OPTIONS: dict[str, Any] = {
-    "compression": "snappy",
-    "use_dictionary": ["planner", "noise", "token"],
-    "write_statistics": False,
-}
-_KEY = pa.dictionary(pa.int32(), pa.string())
 
 
 def _list_of(kind: pa.DataType) -> pa.DataType:
@@ -38,23 +31,22 @@ def _without_nulls(columns: dict[str, pa.DataType]) -> pa.Schema:
     return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
 
 
-_COLUMNS = {
-    "planner": _KEY,
-    "noise": _KEY,
-    "seed": pa.int64(),
-    "token": _KEY,
-    "iteration": pa.int64(),
-    "time_us": pa.int64(),
-    **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
-    "planning_seconds": pa.float64(),
-    "degraded": pa.bool_(),
-    "plan_poses": _list_of(pa.float64()),
-}
-_TRACK_COLUMNS = {
-    "track_valid": _list_of(pa.bool_()),
-    **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
-}
-_SCHEMA, _TRACKS_SCHEMA = _without_nulls(_COLUMNS), _without_nulls(_COLUMNS | _TRACK_COLUMNS)
+STATES = _without_nulls(
+    {
+        "time_us": pa.int64(),
+        **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
+        "planning_seconds": pa.float64(),
+        "degraded": pa.bool_(),
+        "plan_poses": _list_of(pa.float64()),
+    }
+)
+TRACKS = _without_nulls(
+    {
+        "track_valid": _list_of(pa.bool_()),
+        **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
+    }
+)
+_BOTH = pa.schema([*STATES, *TRACKS])
 
 
 class Task(NamedTuple):
@@ -79,112 +71,105 @@ def describe(task: Task) -> str:
     return f"{task.planner} {task.noise}{seed} {task.token}"
 
 
-def encode_rollout(task: Task, log: SimulationLog, *, with_tracks: bool) -> bytes:
-    """One rollout as the bytes of its file."""
-    sink = pa.BufferOutputStream()
-    table = rollout_table(task, log, with_tracks=with_tracks)
-    pq.write_table(table, sink, **_WRITE_OPTIONS)
-    data: bytes = sink.getvalue().to_pybytes()
-    return data
+def encode_rollout(log: SimulationLog, *, with_tracks: bool) -> bytes:
+    """One rollout as the bytes that its columns have in memory: a message of Arrow IPC.
+
+    The states of tracks are a second message, so that the bytes say by themselves what they hold.
+    """
+    batches = [pa.RecordBatch.from_arrays(_states(log), schema=STATES)]
+    if with_tracks:
+        batches.append(pa.RecordBatch.from_arrays(_tracks(log.tracks), schema=TRACKS))
+    return b"".join(batch.serialize() for batch in batches)
 
 
-def rollout_table(task: Task, log: SimulationLog, *, with_tracks: bool) -> pa.Table:
-    """One rollout as a table with a row per sample, K rows."""
-    count = len(log.time_us)
-    arrays = [*_repeated(task, count), _numbers(count), pa.array(log.time_us)]
+def decode_rollout(data: bytes) -> pa.RecordBatch:
+    """What `encode_rollout` was given, a row per sample: columns of `STATES`, then of `TRACKS`."""
+    source = pa.BufferReader(data)
+    states = pa.ipc.read_record_batch(pa.ipc.read_message(source), STATES)
+    if source.tell() == len(data):
+        return states
+    tracks = pa.ipc.read_record_batch(pa.ipc.read_message(source), TRACKS)
+    return pa.RecordBatch.from_arrays([*states.columns, *tracks.columns], schema=_BOTH)
+
+
+def _states(log: SimulationLog) -> list[pa.Array]:
+    arrays = [pa.array(log.time_us)]
     for values in (log.ego, log.commands, log.noise):
         arrays += map(pa.array, np.ascontiguousarray(values.T))
-    arrays += [pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
-    if with_tracks:
-        tracks = log.tracks
-        arrays += map(_lists, (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes))
-    return pa.Table.from_arrays(arrays, schema=_TRACKS_SCHEMA if with_tracks else _SCHEMA)
+    return [*arrays, pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
 
 
-def _repeated(task: Task, count: int) -> list[pa.Array]:
-    """The key in every row."""
-    return [
-        pa.DictionaryArray.from_arrays(_zeros(count), pa.array([value]))
-        if isinstance(value, str)
-        else pa.array(np.full(count, value, np.int64))
-        for value in task
-    ]
+def _tracks(tracks: Tracks) -> list[pa.Array]:
+    return [_lists(x) for x in (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)]
 
 
 def _lists(values: np.ndarray) -> pa.Array:
     """(K, …) as K lists of equal length."""
-    kind = _TRACK_COLUMNS["track_valid" if values.dtype == np.bool_ else "track_poses"]
+    kind = TRACKS.field("track_valid" if values.dtype == np.bool_ else "track_poses").type
     offsets = _offsets(len(values), math.prod(values.shape[1:]))
     return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()), type=kind)
 
 
-# rollouts have the same length again and again
-
-
-@lru_cache(16)
-def _numbers(count: int) -> pa.Array:
-    return pa.array(np.arange(count, dtype=np.int64))
-
-
-@lru_cache(16)
-def _zeros(count: int) -> pa.Array:
-    return pa.array(np.zeros(count, np.int32))
-
-
 @lru_cache(16)
 def _offsets(count: int, size: int) -> pa.Array:
+    # rollouts have the same length again and again
     return pa.array(np.arange(count + 1, dtype=np.int32) * size)
 
 
-def _from_lists(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
-    flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
+    flat = column.flatten().to_numpy(zero_copy_only=False)
     return np.array(flat.reshape(len(column), *shape))
 
 
-def complete_rollout(table: pa.Table, scenario: Scenario) -> SimulationLog:
+def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
     """A stored rollout, completed by what its scenario holds already.
+
+    Args:
+        rows: Columns of `STATES`, and of `TRACKS` where they are not those of the log; others do
+            not matter.
+        scenario: The scenario that was driven.
 
     Raises:
         DataError: The scenario is not the one that was driven.
     """
     samples = scenario.iteration_rows[:-1]
-    time_us = table["time_us"].to_numpy()
+    time_us = rows["time_us"].to_numpy()
     if not np.array_equal(time_us, scenario.time_us[samples]):
         raise DataError(
             f"scenario {scenario.token!r} in the store is not the one that was driven",
             hint="use the store that the manifest names",
         )
     tracks = scenario.tracks.rows(samples)
-    if "track_valid" in table.column_names:
-        tracks = _stored_tracks(table, tracks)
+    if "track_valid" in rows.schema.names:
+        tracks = _stored_tracks(rows, tracks)
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
-        ego=_stack(table, EGO_COLUMNS),
+        ego=_stack(rows, EGO_COLUMNS),
         tracks=tracks,
         traffic_lights=scenario.traffic_lights.rows(samples),
         expert_time_us=scenario.iteration_times,
         expert_ego=scenario.expert,
         route=scenario.route,
-        commands=_stack(table, _COMMAND_COLUMNS),
-        noise=_stack(table, _NOISE_COLUMNS),
-        plans=_from_lists(table["plan_poses"], (-1, 3)),
-        planning_seconds=np.array(table["planning_seconds"].to_numpy()),
-        degraded=np.array(table["degraded"].to_numpy()),
+        commands=_stack(rows, _COMMAND_COLUMNS),
+        noise=_stack(rows, _NOISE_COLUMNS),
+        plans=_from_lists(rows["plan_poses"], (-1, 3)),
+        planning_seconds=np.array(rows["planning_seconds"].to_numpy()),
+        degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
     )
 
 
-def _stack(table: pa.Table, names: Iterable[str]) -> np.ndarray:
-    return np.stack([table[name].to_numpy() for name in names], axis=1)
+def _stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
+    return np.stack([rows[name].to_numpy() for name in names], axis=1)
 
 
-def _stored_tracks(table: pa.Table, recorded: Tracks) -> Tracks:
+def _stored_tracks(rows: pa.RecordBatch, recorded: Tracks) -> Tracks:
     count = recorded.num_tracks
     return Tracks(
-        _from_lists(table["track_valid"], (count,)),
-        _from_lists(table["track_poses"], (count, 3)),
-        _from_lists(table["track_velocities"], (count, 2)),
-        _from_lists(table["track_sizes"], (count, 2)),
+        _from_lists(rows["track_valid"], (count,)),
+        _from_lists(rows["track_poses"], (count, 3)),
+        _from_lists(rows["track_velocities"], (count, 2)),
+        _from_lists(rows["track_sizes"], (count, 2)),
         recorded.kinds,
         recorded.tokens,
     )

@@ -1,29 +1,45 @@
-"""Writing a run folder: every result is on disk when it ends, the tables are made at the end.
+"""Writing a run folder: results go to a journal one by one, the tables are made at the end.
 
-A result is one line of a journal, written at once; its rollout is a file of its own, in place
-before that line. So a run can be killed at any moment: the journal, without a last line that was
-cut off, is what is finished. `finish` reads it task by task in the order of the tables, so that
-memory does not grow with the run; then the journal is removed.
+`finish` reads the journal task by task in the order of the tables, so that memory does not grow
+with the run, and writes its rollouts into Parquet files.
 """
 
-import hashlib
 import json
 import os
-import re
 import shutil
-import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from itertools import groupby, islice
-from operator import itemgetter
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.results import JOURNAL, MISSING, OK, STATUSES, TABLES, Run, TaskResult, open_run
+from shiftsim.journal import Journal, Line, whole_file
+from shiftsim.results import (
+    MISSING,
+    OK,
+    PLACE,
+    STATUSES,
+    TABLES,
+    TEXTS,
+    Run,
+    TaskResult,
+    open_run,
+)
+from shiftsim.rollout_files import (
+    FOLDER,
+    PartWriter,
+    Place,
+    RolloutReader,
+    next_number,
+    num_rows,
+    part_name,
+    without_key,
+)
 from shiftsim.rollouts import Task
 
 WRITE_OPTIONS: dict[str, Any] = {
@@ -36,24 +52,6 @@ WRITE_OPTIONS: dict[str, Any] = {
 }
 ROW_GROUP = 1 << 16  # rows
 _CHUNK = 256  # results turned into tables at once
-_MAX_TOKEN = 60  # characters of a token in a file name
-_TEXTS = ("status", "scenario_type", "error", "hint", "traceback")
-_FIELDS = (*_TEXTS, "seconds", "scores", "metrics")
-_DURATIONS = [n for n in TABLES["tasks"].names if n.endswith("_seconds") or "_ms_" in n]
-
-
-class _Place(NamedTuple):
-    """Where the line of a task is in the journal."""
-
-    offset: int
-    length: int
-    status: str
-
-
-def rollout_name(task: Task) -> str:
-    """File name of a rollout: the beginning of its token, and a digest of the task."""
-    digest = hashlib.blake2b(repr(tuple(task)).encode(), digest_size=8).hexdigest()
-    return f"{re.sub(r'[^A-Za-z0-9_-]', '-', task.token)[:_MAX_TOKEN]}-{digest}.parquet"
 
 
 class RunWriter:
@@ -61,7 +59,7 @@ class RunWriter:
 
     Attributes:
         path: The folder.
-        ended: Status of every task that has ended, those of an earlier attempt included.
+        rollouts: The folder of its rollouts.
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
@@ -77,42 +75,37 @@ class RunWriter:
             ConfigError: Another process works on this folder.
         """
         self.path = path
-        self.rollouts = path / "rollouts"
+        self.rollouts = path / FOLDER
         path.mkdir(parents=True, exist_ok=True)
-        if resume:
-            _restore_journal(path)
-        self._file = _locked(path / JOURNAL)
-        if not resume:
-            self._file.truncate(0)
-        places, self._end = _scan(self._file)
-        self._file.truncate(self._end)
-        self.ended = {task: place.status for task, place in places.items()}
+        self._journal = Journal(path, resume=resume)
         if not _is_complete(path):
             self._write_manifest(manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
+        self._number = next_number(self.rollouts)  # of the next file that is linked to
+        self._linked: dict[Path, str] = {}
 
-    def add(self, result: TaskResult, *, rollout: Path | None = None) -> None:
+    @property
+    def ended(self) -> Mapping[Task, Line]:
+        """What has ended so far, in an earlier attempt included."""
+        return self._journal.lines
+
+    def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
         """Put one result on disk.
 
         Args:
             result: The result.
-            rollout: File of its rollout, where it is stored already in another run.
+            stored: Where its rollout is, if another run has it already.
         """
-        name = rollout_name(result.task) if result.rollout or rollout else None
-        if result.rollout and name:
-            with _whole(self.rollouts / name) as partial:
-                partial.write_bytes(result.rollout)
-        elif rollout and name:
-            _link(rollout, self.rollouts / name)
-        data = _line(result, name).encode()
-        try:
-            self._file.write(data)
-        except OSError:  # the disk is full: without half a line, the next attempt can go on
-            with suppress(OSError):
-                self._file.truncate(self._end)
-            raise
-        self._end += len(data)
-        self.ended[result.task] = result.status
+        place = (self._link(stored.file), stored.row, stored.rows) if stored else ()
+        self._journal.add(result, place)
+
+    def _link(self, file: Path) -> str:
+        """Have a file of another run in this one, too; returns its name here."""
+        if file not in self._linked:
+            name = part_name(self._number)
+            _link(file, self.rollouts / name)
+            self._linked[file], self._number = name, self._number + 1
+        return self._linked[file]
 
     def finish(
         self,
@@ -127,62 +120,101 @@ class RunWriter:
             expected: All tasks of a complete run.
             absent: Why a task has no result.
         """
-        places, _ = _scan(self._file)
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
-        kept: set[str] = set()
+        parts = _Parts(self.rollouts, self._journal)
         try:
-            lines = self._lines(sorted(expected), places, absent)
-            while chunk := list(islice(lines, _CHUNK)):
-                for line in chunk:
+            tasks = iter(sorted(expected))
+            while chunk := list(islice(tasks, _CHUNK)):
+                rows = [self._values(task, parts, absent) for task in chunk]
+                for values in rows:
                     counts["expected"] += 1
-                    counts[line["status"]] += 1
-                    kept.add(line["rollout"])
-                for table, rows in zip(tables, _rows(chunk), strict=True):
-                    table.add(rows)
+                    counts[values["status"]] += 1
+                for table, content in zip(tables, _contents(chunk, rows), strict=True):
+                    table.add(content)
+            parts.close()
             for table in tables:
                 table.close()
         finally:
+            parts.discard()
             for table in tables:
                 table.discard()
         self._write_manifest({**manifest, "counts": counts})
+        self._journal.remove()  # what it points to is needed until then
         for path in self.rollouts.iterdir():
-            if path.name not in kept:
+            if path.name not in parts.names:
                 path.unlink()
-        (self.path / JOURNAL).unlink()
-        self.close()
         return open_run(self.path)
 
     def close(self) -> None:
         """Let another process work on the folder."""
-        self._file.close()
+        self._journal.close()
 
-    def _lines(
-        self, tasks: Iterable[Task], places: dict[Task, _Place], absent: Callable[[Task], str]
-    ) -> Iterator[dict[str, Any]]:
-        for task in tasks:
-            place = places.get(task)
-            if place is None:
-                values = TaskResult(task, MISSING, error=absent(task))
-                line = {field: getattr(values, field) for field in _FIELDS} | {"rollout": None}
-            else:
-                self._file.seek(place.offset)
-                line = json.loads(self._file.read(place.length))
-            yield {**line, "key": task._asdict()}
+    def _values(self, task: Task, parts: "_Parts", absent: Callable[[Task], str]) -> dict[str, Any]:
+        """What the tables say of a task beyond its key."""
+        line = self.ended.get(task)
+        if line is None:
+            values = {name: "" for name in TEXTS} | {"status": MISSING, "error": absent(task)}
+            return {**values, **dict.fromkeys(PLACE), "seconds": {}}
+        return {**self._journal.read(line), **parts.keep(task, line)}
 
     def _write_manifest(self, manifest: dict[str, Any]) -> None:
-        with _whole(self.path / "manifest.json") as partial:
+        with whole_file(self.path / "manifest.json") as partial:
             partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
 
 
-def _rows(lines: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
+class _Parts:
+    """The files of rollouts of a run that ends: what is in the journal is written into new ones.
+
+    A file from an earlier attempt stays as it is, unless some of its rollouts have been made again:
+    then the others move.
+
+    Attributes:
+        names: The files that hold rollouts of this run.
+    """
+
+    def __init__(self, folder: Path, journal: Journal) -> None:
+        self.names: set[str] = set()
+        self._folder, self._journal = folder, journal
+        self._writer, self._reader = PartWriter(folder), RolloutReader()
+        kept: Counter[str] = Counter()
+        for line in journal.lines.values():
+            if line.has_place:
+                name, _, rows = line.rollout
+                kept[name] += rows
+        self._whole = {name for name, rows in kept.items() if rows == num_rows(folder / name)}
+
+    def keep(self, task: Task, line: Line) -> dict[str, Any]:
+        """Have a rollout in one of the files; returns the columns that say where."""
+        if not line.rollout:
+            return dict.fromkeys(PLACE)
+        if line.has_place:
+            name, row, rows = line.rollout
+            place = Place(self._folder / name, row, rows)
+            if name not in self._whole:
+                place = self._writer.add(task, without_key(self._reader.read(place)))
+        else:
+            place = self._writer.add(task, self._journal.rollout(line))
+        self.names.add(place.file.name)
+        return dict(zip(PLACE, (place.file.name, place.row, place.rows), strict=True))
+
+    def close(self) -> None:
+        self._writer.close()
+
+    def discard(self) -> None:
+        """Remove what is not finished."""
+        self._writer.discard()
+
+
+def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
     """Rows of the tables, in the order of `TABLES`."""
-    names = (*_TEXTS, "rollout")
-    done = [line for line in lines if line["status"] == OK]
+    names = (*TEXTS, *PLACE)
+    keyed = [(task._asdict(), row) for task, row in zip(tasks, values, strict=True)]
+    done = [(key, row) for key, row in keyed if row["status"] == OK]
     return (
-        [{**x["key"], **{name: x[name] for name in names}, **x["seconds"]} for x in lines],
-        [{**x["key"], **x["scores"]} for x in done],
-        [{**x["key"], **row} for x in done for row in x["metrics"]],
+        [{**key, **{name: row[name] for name in names}, **row["seconds"]} for key, row in keyed],
+        [{**key, **row["scores"]} for key, row in done],
+        [{**key, **metric} for key, row in done for metric in row["metrics"]],
     )
 
 
@@ -223,18 +255,6 @@ class _SortedTable:
         self._partial.unlink(missing_ok=True)
 
 
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A file to be written, which then takes its place: whole or not at all."""
-    partial = path.with_name(f".{path.name}.tmp")
-    try:
-        yield partial
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-
-
 def _link(source: Path, target: Path) -> None:
     """The same file once more, without its bytes where the disk can do that."""
     if target.exists() and target.samefile(source):
@@ -243,58 +263,8 @@ def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        with _whole(target) as partial:
+        with whole_file(target) as partial:
             shutil.copyfile(source, partial)
-
-
-def _line(result: TaskResult, rollout: str | None) -> str:
-    """A line of the journal."""
-    values = {field: getattr(result, field) for field in _FIELDS}
-    line = {"task": result.task, "rollout": rollout, **values}
-    return json.dumps(line, default=_plain) + "\n"
-
-
-def _plain(value: Any) -> Any:
-    """NumPy scalars as Python's."""
-    return value.item()
-
-
-def _locked(path: Path) -> BinaryIO:
-    file = path.open("a+b", buffering=0)
-    if sys.platform == "win32":
-        return file
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise ConfigError(
-            f"another process is working on {str(path.parent)!r}",
-            hint="wait for it, or choose another --out",
-        ) from error
-    except OSError:
-        pass  # a file system without locks
-    return file
-
-
-def _scan(file: BinaryIO) -> tuple[dict[Task, _Place], int]:
-    """Where the last line of every task is, and where the last whole line ends."""
-    places: dict[Task, _Place] = {}
-    end = 0
-    file.seek(0)
-    with open(file.fileno(), "rb", closefd=False) as reader:
-        for line in reader:
-            try:
-                values = json.loads(line)
-                task, status = Task(*values["task"]), values["status"]
-            except (ValueError, KeyError, TypeError):
-                break
-            if not line.endswith(b"\n"):
-                break
-            places[task] = _Place(end, len(line), status)
-            end += len(line)
-    return places, end
 
 
 def _is_complete(path: Path) -> bool:
@@ -302,45 +272,3 @@ def _is_complete(path: Path) -> bool:
         return open_run(path).is_complete
     except (ConfigError, DataError):
         return False
-
-
-def _restore_journal(path: Path) -> None:
-    """Turn the tables of a finished or interrupted run into a journal again."""
-    journal = path / JOURNAL
-    if journal.is_file() and journal.stat().st_size:
-        return
-    try:
-        open_run(path)
-    except (ConfigError, DataError):
-        return
-    with _whole(journal) as partial, partial.open("w", encoding="utf-8") as file:
-        for result, rollout in stored_results(path):
-            file.write(_line(result, rollout.name if rollout else None))
-
-
-def stored_results(path: Path) -> Iterator[tuple[TaskResult, Path | None]]:
-    """What made the tables of a run, task by task, and the file of the rollout.
-
-    A task without a result has none.
-    """
-    scores, metrics = (_by_task(path / f"{name}.parquet") for name in ("scores", "metrics"))
-    for key, (row,) in _by_task(path / "tasks.parquet"):
-        if row["status"] == MISSING:
-            continue
-        done = row["status"] == OK
-        result = TaskResult(
-            Task(*key),
-            **{name: row[name] for name in _TEXTS},
-            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
-            scores=next(scores)[1][0] if done else {},
-            metrics=next(metrics)[1] if done else [],
-        )
-        yield result, path / "rollouts" / row["rollout"] if row["rollout"] else None
-
-
-def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
-    key = itemgetter(*Task._fields)
-    batches = pq.ParquetFile(path).iter_batches(batch_size=4096)
-    rows = (row for batch in batches for row in batch.to_pylist())
-    for found, group in groupby(rows, key):
-        yield found, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]

@@ -121,7 +121,8 @@ def _do_units(
     prepared: Prepared, writer: RunWriter, on_progress: Callable[[Progress], None]
 ) -> bool:
     """Do what is not finished; returns whether the user interrupted."""
-    todo = remaining(prepared.units, writer.ended, retry=prepared.config.retry_failed)
+    statuses = {task: line.status for task, line in writer.ended.items()}
+    todo = remaining(prepared.units, statuses, retry=prepared.config.retry_failed)
     total = len(prepared.tasks)
     progress = Progress(total - sum(map(len, todo)), total, 0)
     try:

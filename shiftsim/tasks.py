@@ -133,7 +133,7 @@ class TaskRunner:
             scenario_type=scenario.scenario_type,
             scores=scores,
             metrics=metrics,
-            rollout=encode_rollout(result.task, log, with_tracks=reactive) if keep else b"",
+            rollout=encode_rollout(log, with_tracks=reactive) if keep else b"",
         )
 
     def _setting(self, task: Task) -> dict[str, Any]:

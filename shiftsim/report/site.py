@@ -43,7 +43,7 @@ def write_report_site(
         picture = figure.save(folder)
         name, title = html.escape(picture.name), html.escape(figure.title)
         parts.append(f'<figure><img src="{name}" alt="{title}"></figure>')
-    stored = [run for run in runs if any(file is not None for file in run.rollout_files.values())]
+    stored = [run for run in runs if any(run.rollout_places.values())]
     stores = [open_run_store(run) for run in stored]
     write_site(
         folder,

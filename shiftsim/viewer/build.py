@@ -72,8 +72,8 @@ class Gallery:
                     f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
                     hint="name the store that its manifest.json names",
                 )
-            for task, file in run.rollout_files.items():
-                if file is not None:
+            for task, place in run.rollout_places.items():
+                if place is not None:
                     planner = f"{task.planner} ({name})" if name else task.planner
                     self._runs[task._replace(planner=planner)] = (run, task)
         self._scores = {run.path: _by_task(run.scores.to_pylist()) for run in runs}

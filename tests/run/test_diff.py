@@ -3,14 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from made_runs import write_run
 
 import shiftsim
 from shiftsim.diff import diff_lines, diff_runs, find_departure
 from shiftsim.errors import ConfigError
-from shiftsim.rollouts import Task, rollout_table
+from shiftsim.rollouts import Task, decode_rollout, encode_rollout
 
 
 class Coast:
@@ -95,11 +94,6 @@ def test_runs_of_other_things_are_refused(tmp_path):
         diff_runs(first, second)
 
 
-def _rollout(run):
-    (path,) = [path for task, path in run.rollout_files.items() if task.token == "0000cafe"]
-    return pq.ParquetFile(path).read()
-
-
 @pytest.mark.parametrize(
     ("field", "row", "quantity"),
     [
@@ -117,7 +111,8 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
     values = np.array(getattr(log, field))
     values[row].reshape(-1)[1] += 1e-9
     tables = [
-        rollout_table(task, one, with_tracks=True) for one in (log, replace(log, **{field: values}))
+        decode_rollout(encode_rollout(one, with_tracks=True))
+        for one in (log, replace(log, **{field: values}))
     ]
     found = find_departure(*tables)
     assert (found.iteration, found.quantity) == (row, quantity)
@@ -125,12 +120,12 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
 
 
 def test_a_shorter_rollout_differs_in_length(runs):
-    table = _rollout(runs[0])
+    table = runs[0].rollout_rows(Task("coast", "none", 0, "0000cafe"))
     found = find_departure(table, table.slice(0, 9))
     assert (found.iteration, found.quantity) == (9, "length of the rollout")
     assert (found.first, found.second) == (24.0, 9.0)
 
 
 def test_the_same_rollout_never_parts(runs):
-    table = _rollout(runs[0])
+    table = runs[0].rollout_rows(Task("coast", "none", 0, "0000cafe"))
     assert find_departure(table, table) is None

@@ -13,7 +13,8 @@ import shiftsim
 from shiftsim.config import make_config
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.executors import Outcome
-from shiftsim.results import JOURNAL, TaskResult
+from shiftsim.journal import JOURNAL, ROLLOUTS
+from shiftsim.results import TaskResult
 from shiftsim.rollouts import Task
 from shiftsim.run_writer import RunWriter
 from shiftsim.runner import execute, prepare
@@ -78,7 +79,7 @@ def test_resuming_does_only_what_is_left_and_gives_the_same_bytes(stopped, toy, 
     assert sorted(path.name for path in stopped.iterdir()) == sorted(
         ["manifest.json", "rollouts", "tasks.parquet", *RESULTS]
     )
-    assert len(list((stopped / "rollouts").iterdir())) == 12
+    assert [path.name for path in (stopped / "rollouts").iterdir()] == ["part-00000.parquet"]
 
 
 @pytest.mark.parametrize("cut", [1, 40, 5000])
@@ -90,7 +91,7 @@ def test_a_line_that_was_cut_off_is_done_again(stopped, toy, undisturbed, cut):
 
 
 def test_halves_of_files_that_a_killed_process_leaves_do_no_harm(stopped, toy, undisturbed):
-    for name in (".scores.parquet.tmp", ".manifest.json.tmp", "rollouts/.x.parquet.tmp"):
+    for name in (".scores.parquet.tmp", ".manifest.json.tmp", "rollouts/.part-00000.parquet.tmp"):
         (stopped / name).write_bytes(b"half")
     run = execute(prepare(settings(toy, stopped, resume=True, **NOISY)))
     assert content(run) == content(undisturbed)
@@ -236,10 +237,12 @@ def test_a_full_disk_keeps_what_is_finished(toy, tmp_path, undisturbed, monkeypa
     assert content(run) == content(undisturbed)
 
 
-def test_half_a_line_on_a_full_disk_is_taken_back(tmp_path):
+@pytest.mark.parametrize("name", [JOURNAL, ROLLOUTS])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), None])
+def test_half_a_result_on_a_full_disk_is_taken_back(tmp_path, name, error):
     writer = RunWriter(tmp_path / "run", {"format": 3})
-    writer.add(TaskResult(Task("p", "none", 0, "a"), "failed"))
-    whole = (tmp_path / "run" / JOURNAL).read_bytes()
+    writer.add(TaskResult(Task("p", "none", 0, "a"), "ok", rollout=b"some bytes of a rollout"))
+    before = (tmp_path / "run" / name).read_bytes()
 
     class Full:
         def __init__(self, file):
@@ -247,15 +250,20 @@ def test_half_a_line_on_a_full_disk_is_taken_back(tmp_path):
 
         def write(self, data):
             self.file.write(data[:10])
-            raise OSError(28, "No space left on device")
+            if error:
+                raise error
+            return 10
 
         def truncate(self, size):
             return self.file.truncate(size)
 
-    writer._file = Full(writer._file)
+    journal = writer._journal
+    appended = journal._text if name == JOURNAL else journal._rollouts
+    appended.file = Full(appended.file)
     with pytest.raises(OSError, match="No space left"):
-        writer.add(TaskResult(Task("p", "none", 0, "b"), "failed"))
-    assert (tmp_path / "run" / JOURNAL).read_bytes() == whole
+        writer.add(TaskResult(Task("p", "none", 0, "b"), "ok", rollout=b"some bytes of another"))
+    assert (tmp_path / "run" / name).read_bytes() == before
+    assert list(writer.ended) == [Task("p", "none", 0, "a")]
 
 
 def test_an_output_that_cannot_be_written_is_one_error(toy, tmp_path):

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from pyarrow import parquet
 
 import shiftsim
 from shiftsim.cli import main
@@ -97,10 +98,12 @@ def test_only_failed_rollouts_are_kept_where_asked_for(call, tmp_path):
     call("run", *words, "--save-rollouts", "failed", "--out", tmp_path / "run")
     run = shiftsim.open_run(tmp_path / "run")
     scores = {(row["seed"], row["token"]): row["cls"] for row in run.scores.to_pylist()}
-    kept = {(t.seed, t.token) for t, file in run.rollout_files.items() if file is not None}
+    kept = {(t.seed, t.token) for t, place in run.rollout_places.items() if place}
     assert kept == {key for key, score in scores.items() if score == 0.0}
     assert 0 < len(kept) < len(scores)
-    assert len(list((run.path / "rollouts").iterdir())) == len(kept)
+    (path,) = (run.path / "rollouts").iterdir()
+    stored = parquet.read_table(path, columns=["seed", "token"]).to_pylist()
+    assert {(row["seed"], row["token"]) for row in stored} == kept
 
 
 @pytest.mark.thorough
