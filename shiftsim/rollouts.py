@@ -6,6 +6,7 @@ those of `rollout_files`.
 """
 
 import math
+import struct
 from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
@@ -47,6 +48,8 @@ TRACKS = _without_nulls(
     }
 )
 _BOTH = pa.schema([*STATES, *TRACKS])
+_CODEC = pa.Codec("lz4_raw")
+_LENGTH = struct.Struct("<q")
 
 
 class Task(NamedTuple):
@@ -72,21 +75,30 @@ def describe(task: Task) -> str:
 
 
 def encode_rollout(log: SimulationLog, *, with_tracks: bool) -> bytes:
-    """One rollout as the bytes that its columns have in memory: a message of Arrow IPC.
-
-    The states of tracks are a second message, so that the bytes say by themselves what they hold.
-    """
+    """One rollout as bytes; with the states of tracks where those are not the recorded ones."""
     batches = [pa.RecordBatch.from_arrays(_states(log), schema=STATES)]
     if with_tracks:
         batches.append(pa.RecordBatch.from_arrays(_tracks(log.tracks), schema=TRACKS))
-    return b"".join(batch.serialize() for batch in batches)
+    return encode_batches(batches)
+
+
+def encode_batches(batches: Iterable[pa.RecordBatch]) -> bytes:
+    """The columns of a rollout as they are in memory, compressed.
+
+    Columns of `STATES` are one message of Arrow IPC, those of `TRACKS`, if there are any, another
+    one: so the bytes say by themselves what they hold. In front is the length of the messages.
+    """
+    messages = b"".join(batch.serialize() for batch in batches)
+    compressed: bytes = _CODEC.compress(messages, asbytes=True)
+    return _LENGTH.pack(len(messages)) + compressed
 
 
 def decode_rollout(data: bytes) -> pa.RecordBatch:
     """What `encode_rollout` was given, a row per sample: columns of `STATES`, then of `TRACKS`."""
-    source = pa.BufferReader(data)
+    (length,) = _LENGTH.unpack_from(data)
+    source = pa.BufferReader(_CODEC.decompress(memoryview(data)[_LENGTH.size :], length))
     states = pa.ipc.read_record_batch(pa.ipc.read_message(source), STATES)
-    if source.tell() == len(data):
+    if source.tell() == length:
         return states
     tracks = pa.ipc.read_record_batch(pa.ipc.read_message(source), TRACKS)
     return pa.RecordBatch.from_arrays([*states.columns, *tracks.columns], schema=_BOTH)

@@ -15,7 +15,7 @@ from shiftsim import rollout_files
 from shiftsim.errors import DataError
 from shiftsim.results import TaskResult
 from shiftsim.rollout_files import PartWriter, Place, RolloutReader, without_key
-from shiftsim.rollouts import STATES, TRACKS, Task
+from shiftsim.rollouts import STATES, TRACKS, Task, encode_batches
 from shiftsim.run_writer import RunWriter
 
 MANIFEST = {"format": 4, "state": "finished"}
@@ -34,10 +34,6 @@ def made_up(length, *, value=0.0, tracks=None):
             columns.append(pa.array([value] * length).cast(field.type))
     schema = STATES if tracks is None else pa.schema([*STATES, *TRACKS])
     return pa.RecordBatch.from_arrays(columns, schema=schema)
-
-
-def encoded(rows):
-    return rows.serialize().to_pybytes()
 
 
 def key(number):
@@ -109,7 +105,9 @@ def under_way(folder, results, *, resume):
     for task, rows in results.items():
         scores = {"cls": 1.0, "thresholds": "nuplan", "metric_version": "1"}
         metrics = [{"metric": "m", "thresholds": "nuplan", "metric_version": "1"}]
-        writer.add(TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encoded(rows)))
+        writer.add(
+            TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode_batches([rows]))
+        )
     return writer
 
 
