@@ -310,13 +310,14 @@ def _tasks(
 def _units(entries: Iterable[PlannerEntry], tasks: list[Task], size: int) -> list[Unit]:
     """The tasks, those of a planner that answers in batches grouped.
 
-    The groups depend on the whole run only, not on workers, shards or what is finished already.
+    The groups depend on the whole run only, not on workers, shards or what is finished already. The
+    first is a single task: other workers wait until it has compiled the planner's kernels.
     """
     batched = {entry.name for entry in entries if entry.in_batches}
     units: list[Unit] = [(task,) for task in tasks if task.planner not in batched]
     for name in sorted(batched):
         own = [task for task in tasks if task.planner == name]
-        units += [tuple(own[i : i + size]) for i in range(0, len(own), size)]
+        units += [tuple(own[:1]), *(tuple(own[i : i + size]) for i in range(1, len(own), size))]
     return units
 
 

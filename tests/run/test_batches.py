@@ -48,7 +48,7 @@ def test_batches_give_the_rows_of_single_scenarios(toy, tmp_path, one_by_one, si
 def test_the_scenarios_of_a_batch_share_their_passes(toy, tmp_path):
     run(toy, tmp_path / "run", batch_size=5, notes=tmp_path / "notes")
     sizes = [int(line) for line in (tmp_path / "notes").read_text().split()]
-    assert sizes == [5] * 24 + [5] * 24 + [2] * 24
+    assert sizes == [1] * 24 + [5] * 24 + [5] * 24 + [1] * 24
 
 
 def test_the_batch_size_does_not_matter_to_planners_that_know_no_batches(toy, tmp_path):
