@@ -18,6 +18,7 @@ from shiftsim.resume import check_target
 from shiftsim.rollouts import Task
 from shiftsim.run_writer import RunWriter
 from shiftsim.runner import RUNS, Progress, advanced, ended, run_name
+from shiftsim.scenario import Scenario
 from shiftsim.tasks import attempt, score_rollout
 
 
@@ -39,6 +40,7 @@ class Rescorer:
     metrics: tuple[str, ...]
     traffic: str
     _open: Any = field(default=None, init=False)
+    _last: Scenario | None = field(default=None, init=False)
 
     def __call__(self, task: Task) -> TaskResult:
         """The result of one task."""
@@ -50,7 +52,9 @@ class Rescorer:
 
             self._open = open_run(self.run), open_store(self.store)
         run, store = self._open
-        scenario = store.read(task.token)
+        if self._last is None or self._last.token != task.token:
+            self._last = store.read(task.token)
+        scenario = self._last
         log = run.rollout(task, scenario)
         scores, metrics = score_rollout(
             scenario,
@@ -103,6 +107,7 @@ def rescore(
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
     check_target(target, determining)
     tasks = [Task(*(row[n] for n in Task._fields)) for row in _finished(run)]
+    tasks.sort(key=lambda task: task.token)  # as rollouts lie in their files
     lacking = [task for task in tasks if run.rollout_places[task] is None]
     if lacking:
         raise DataError(
@@ -125,7 +130,9 @@ def rescore(
         _keep_unfinished(run, writer)
         progress = Progress(0, len(tasks), 0)
         count = min(workers or default_workers(), len(tasks))
-        outcomes = map_unordered(partial(_same, rescorer), tasks, workers=count, alone=1)
+        outcomes = map_unordered(
+            partial(_same, rescorer), tasks, workers=count, alone=1, group=_token
+        )
         with closing(outcomes):
             for outcome in outcomes:
                 result = outcome.result or _lost(outcome)
@@ -147,6 +154,10 @@ def _code(simulated: str) -> str:
 
 def _same(rescorer: Rescorer) -> Rescorer:
     return rescorer
+
+
+def _token(task: Task) -> str:
+    return task.token
 
 
 def _lost(outcome: Outcome[Task, TaskResult]) -> TaskResult:

@@ -1,7 +1,7 @@
 """Writing a run folder: results go to a journal one by one, the tables are made at the end.
 
-`finish` reads the journal task by task in the order of the tables, so that memory does not grow
-with the run, and writes its rollouts into Parquet files.
+`finish` writes the rollouts of the journal into Parquet files, and reads its lines in the order of
+the tables, both one by one, so that memory does not grow with the run.
 """
 
 import json
@@ -122,27 +122,26 @@ class RunWriter:
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
-        parts = _Parts(self.rollouts, self._journal)
         try:
+            places = _write_rollouts(self.rollouts, self._journal)
             tasks = iter(sorted(expected))
             while chunk := list(islice(tasks, _CHUNK)):
-                rows = [self._values(task, parts, absent) for task in chunk]
+                rows = [self._values(task, places.get(task), absent) for task in chunk]
                 for values in rows:
                     counts["expected"] += 1
                     counts[values["status"]] += 1
                 for table, content in zip(tables, _contents(chunk, rows), strict=True):
                     table.add(content)
-            parts.close()
             for table in tables:
                 table.close()
         finally:
-            parts.discard()
             for table in tables:
                 table.discard()
         self._write_manifest({**manifest, "counts": counts})
         self._journal.remove()  # what it points to is needed until then
+        used = {place.file for place in places.values()}
         for path in self.rollouts.iterdir():
-            if path.name not in parts.names:
+            if path not in used:
                 path.unlink()
         return open_run(self.path)
 
@@ -150,60 +149,55 @@ class RunWriter:
         """Let another process work on the folder."""
         self._journal.close()
 
-    def _values(self, task: Task, parts: "_Parts", absent: Callable[[Task], str]) -> dict[str, Any]:
+    def _values(
+        self, task: Task, place: Place | None, absent: Callable[[Task], str]
+    ) -> dict[str, Any]:
         """What the tables say of a task beyond its key."""
         line = self.ended.get(task)
         if line is None:
-            values = {name: "" for name in TEXTS} | {"status": MISSING, "error": absent(task)}
-            return {**values, **dict.fromkeys(PLACE), "seconds": {}}
-        return {**self._journal.read(line), **parts.keep(task, line)}
+            texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
+            return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
+        columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
+        return {**self._journal.read(line), **dict(zip(PLACE, columns, strict=True))}
 
     def _write_manifest(self, manifest: dict[str, Any]) -> None:
         with whole_file(self.path / "manifest.json") as partial:
             partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
 
 
-class _Parts:
-    """The files of rollouts of a run that ends: what is in the journal is written into new ones.
+def _write_rollouts(folder: Path, journal: Journal) -> dict[Task, Place]:
+    """Put the rollouts of a run that ends into files, those of a scenario together.
 
     A file from an earlier attempt stays as it is, unless some of its rollouts have been made again:
     then the others move.
 
-    Attributes:
-        names: The files that hold rollouts of this run.
+    Returns:
+        Where they are.
     """
-
-    def __init__(self, folder: Path, journal: Journal) -> None:
-        self.names: set[str] = set()
-        self._folder, self._journal = folder, journal
-        self._writer, self._reader = PartWriter(folder), RolloutReader()
-        kept: Counter[str] = Counter()
-        for line in journal.lines.values():
-            if line.has_place:
-                name, _, rows = line.rollout
-                kept[name] += rows
-        self._whole = {name for name, rows in kept.items() if rows == num_rows(folder / name)}
-
-    def keep(self, task: Task, line: Line) -> dict[str, Any]:
-        """Have a rollout in one of the files; returns the columns that say where."""
-        if not line.rollout:
-            return dict.fromkeys(PLACE)
+    lines = {task: line for task, line in journal.lines.items() if line.rollout}
+    kept: Counter[str] = Counter()
+    for line in lines.values():
         if line.has_place:
-            name, row, rows = line.rollout
-            place = Place(self._folder / name, row, rows)
-            if name not in self._whole:
-                place = self._writer.add(task, without_key(self._reader.read(place)))
-        else:
-            place = self._writer.add(task, self._journal.rollout(line))
-        self.names.add(place.file.name)
-        return dict(zip(PLACE, (place.file.name, place.row, place.rows), strict=True))
-
-    def close(self) -> None:
-        self._writer.close()
-
-    def discard(self) -> None:
-        """Remove what is not finished."""
-        self._writer.discard()
+            name, _, rows = line.rollout
+            kept[name] += rows
+    whole = {name for name, rows in kept.items() if rows == num_rows(folder / name)}
+    places: dict[Task, Place] = {}
+    writer, reader = PartWriter(folder), RolloutReader()
+    try:
+        for task in sorted(lines, key=lambda task: (task.token, task)):
+            line = lines[task]
+            if line.has_place:
+                name, row, rows = line.rollout
+                place = Place(folder / name, row, rows)
+                if name not in whole:
+                    place = writer.add(task, without_key(reader.read(place)))
+            else:
+                place = writer.add(task, journal.rollout(line))
+            places[task] = place
+        writer.close()
+    finally:
+        writer.discard()
+    return places
 
 
 def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:

@@ -174,3 +174,16 @@ def test_ending_is_begun_anew_after_a_kill_at_any_step(tmp_path, monkeypatch, mo
         names = {path.name for path in (run.path / "rollouts").iterdir()}
         assert names == set(run.tasks["rollout"].to_pylist())
     assert step > 3
+
+
+def test_the_rollouts_of_a_scenario_lie_together(tmp_path):
+    tasks = [Task(planner, "none", 0, token) for planner in "ba" for token in ("y", "x")]
+    writer = under_way(tmp_path / "run", dict.fromkeys(tasks, made_up(3)), resume=False)
+    run = writer.finish(MANIFEST, tasks)
+    ordered = sorted(tasks, key=lambda task: run.rollout_places[task])
+    assert [(task.token, task.planner) for task in ordered] == [
+        ("x", "a"),
+        ("x", "b"),
+        ("y", "a"),
+        ("y", "b"),
+    ]
