@@ -212,7 +212,7 @@ class Pool:
             if done < alone:
                 ready = [] if self._in("busy") else ready[:1]
             for worker in ready[: len(waiting)]:
-                task = self._taken(waiting, worker)
+                task = waiting.popleft() if done < alone else self._taken(waiting, worker)
                 worker.give(task, self._seconds(task) + _TIME_TO_COMPILE * (done < alone))
             for outcome in self._heard():
                 done += 1

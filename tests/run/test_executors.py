@@ -72,6 +72,14 @@ def test_leading_tasks_are_done_one_at_a_time():
     assert all(before[1] <= after[0] for before, after in pairwise(spans[:4]))
 
 
+def test_leading_tasks_come_first_whatever_their_groups():
+    groups = [0, 0, 0, 1, 2, 1]
+    for _ in range(3):
+        outcomes = map_unordered(Timed, range(6), workers=2, alone=3, group=groups.__getitem__)
+        began = {o.task: o.result[0] for o in outcomes}
+        assert sorted(began, key=began.__getitem__)[:3] == [0, 1, 2]
+
+
 class Closing:
     def __init__(self, path):
         self.path = path
