@@ -9,6 +9,7 @@ from made_runs import write_run
 import shiftsim
 from shiftsim.diff import diff_lines, diff_runs, find_departure
 from shiftsim.errors import ConfigError
+from shiftsim.results import Run
 from shiftsim.rollouts import Task, decode_rollout, encode_rollout
 
 
@@ -45,6 +46,23 @@ def test_rollouts_part_at_the_step_where_the_planner_acts_differently(runs):
         assert change.departure.quantity == "command accel [m/s²]"
         assert (change.departure.first, change.departure.second) == (0.0, -3.0)
         assert change.departure.seconds == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("traffic", "note"),
+    [
+        ("nonreactive", "the rollouts are the same: they were judged differently"),
+        ("reactive", "the ego drove the same, but in other traffic (nonreactive, reactive)"),
+    ],
+)
+def test_scores_that_differ_without_another_step_are_explained(runs, traffic, note):
+    determining = runs[0].manifest["determining"] | {"traffic": traffic}
+    other = Run(runs[0].path, runs[0].manifest | {"determining": determining})
+    column = other.scores.column_names.index("cls")
+    worse = other.scores.set_column(column, "cls", [[0.0] * len(other.scores)])
+    other.__dict__["scores"] = worse
+    changes = diff_runs(runs[0], other).changes
+    assert {(change.departure, change.note) for change in changes} == {(None, note)}
 
 
 def test_changes_are_ranked_and_counted(runs):
