@@ -28,7 +28,7 @@ from shiftsim.manifest import code_digest
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.planner_entry import PlannerEntry, can_travel, planner_entry, takes_argument
-from shiftsim.resume import State, check_resumable, check_target
+from shiftsim.resume import State, check_resumable, check_room, check_target
 from shiftsim.rollouts import Task
 from shiftsim.splits import find_split, token_hash
 from shiftsim.tasks import TaskRunner, Unit
@@ -150,6 +150,9 @@ def prepare(
     )
     tasks = list(_tasks(entries, models, config.seeds, present))
     units = _of_shard(config.shard, _units(entries, tasks, config.batch_size))
+    if before == "new":
+        count = sum(map(len, units))
+        check_room(folder, count, with_rollouts=config.save_rollouts == "all")
     missing: list[Unit] = [(task,) for task in _tasks(entries, models, config.seeds, lacking)]
     return Prepared(
         config,

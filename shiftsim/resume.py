@@ -1,5 +1,6 @@
-"""What a run folder holds before a run begins: nothing, the same run in some state, or another."""
+"""What is where a run is to be: nothing, the same run in some state, or another; and the room."""
 
+import shutil
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -9,6 +10,9 @@ from shiftsim.results import read_manifest
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
 _MAX_MESSAGE = 600  # characters
+# on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
+_BYTES_PER_TASK = 6e3
+_BYTES_PER_ROLLOUT = 70e3
 
 
 def state_of(folder: Path) -> State:
@@ -109,4 +113,28 @@ def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "
                 :_MAX_MESSAGE
             ],
             hint="give its settings, or leave out --resume to begin anew",
+        )
+
+
+def check_room(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
+    """Refuse a run that cannot end where it is to be.
+
+    Args:
+        folder: The folder of the run, which need not exist.
+        num_tasks: Its tasks.
+        with_rollouts: Whether all rollouts are kept.
+
+    Raises:
+        ConfigError: The disk has too little room.
+    """
+    place = folder.absolute()
+    while not place.exists():
+        place = place.parent
+    needed = num_tasks * (_BYTES_PER_TASK + _BYTES_PER_ROLLOUT * with_rollouts)
+    free = shutil.disk_usage(place).free
+    if needed > free:
+        raise ConfigError(
+            f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, "
+            f"{str(place)!r} has {free / 1e9:.1f} GB free",
+            hint="choose another --out" + ", or --save-rollouts failed" * with_rollouts,
         )
