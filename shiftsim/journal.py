@@ -77,7 +77,8 @@ class Journal:
         self._rollouts.cut(max(map(sum, spooled), default=0))
 
     def _scan(self) -> None:
-        end = 0
+        """Read the lines up to one that was cut off, or whose rollout a power failure took."""
+        end, stored = 0, os.fstat(self._rollouts.file.fileno()).st_size
         self._text.file.seek(0)
         with open(self._text.file.fileno(), "rb", closefd=False) as reader:
             for text in reader:
@@ -87,7 +88,8 @@ class Journal:
                     task = Task(*values["task"])
                 except (ValueError, KeyError, TypeError):
                     break
-                if not text.endswith(b"\n"):
+                lost = not line.has_place and sum(line.rollout) > stored
+                if lost or not text.endswith(b"\n"):
                     break
                 self.lines[task] = line
                 end += len(text)

@@ -90,6 +90,16 @@ def test_a_line_that_was_cut_off_is_done_again(stopped, toy, undisturbed, cut):
     assert content(run) == content(undisturbed)
 
 
+@pytest.mark.parametrize("left", [0.0, 0.5, 0.99])
+def test_a_rollout_that_was_lost_is_made_again(stopped, toy, undisturbed, left):
+    rollouts = stopped / ROLLOUTS
+    os.truncate(rollouts, int(left * rollouts.stat().st_size))
+    run = execute(prepare(settings(toy, stopped, resume=True, **NOISY)))
+    assert content(run) == content(undisturbed)
+    for task in undisturbed.rollout_places:
+        assert run.rollout_rows(task)["x_m"] == undisturbed.rollout_rows(task)["x_m"]
+
+
 def test_halves_of_files_that_a_killed_process_leaves_do_no_harm(stopped, toy, undisturbed):
     for name in (".scores.parquet.tmp", ".manifest.json.tmp", "rollouts/.part-00000.parquet.tmp"):
         (stopped / name).write_bytes(b"half")
