@@ -1,10 +1,11 @@
 """Rollouts on disk: Parquet files `part-*.parquet` with many of them, a row per sample.
 
-A small Parquet file costs as much as simulating a scenario, as every column has headers of its own,
-and clusters dislike many small files. So rollouts share row groups, and a `Place` says which rows
-are whose. The first columns name the task, for readers that know nothing of places.
+Most of the time of writing a small Parquet file goes into headers, some for every column, and
+clusters dislike many small files. So rollouts share row groups, and a `Place` says which rows are
+whose. The first columns name the task, for readers that know nothing of places.
 """
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -172,11 +173,9 @@ class PartWriter:
         """Remove what is not finished."""
         self._pending.clear()
         if self._writer is not None:
-            writer, self._writer = self._writer, None
-            try:
-                writer.close()
-            except OSError:
-                pass
+            with suppress(OSError):
+                self._writer.close()
+            self._writer = None
             self._partial.unlink(missing_ok=True)
 
 

@@ -38,16 +38,7 @@ from shiftsim.planners.checkpoint_convert import convert_checkpoint, inspect_che
 from shiftsim.planners.checkpoint_match import empty_state
 from shiftsim.planners.checkpoint_reader import read_contents
 
-pytestmark = pytest.mark.learned
-
-
-@pytest.fixture(autouse=True)
-def checkpoints(tmp_path, monkeypatch):
-    """The folder of checkpoints, at first empty."""
-    folder = tmp_path / "checkpoints"
-    folder.mkdir()
-    monkeypatch.setenv("SHIFTSIM_CHECKPOINTS", str(folder))
-    return folder
+pytestmark = [pytest.mark.learned, pytest.mark.usefixtures("checkpoints")]
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,7 @@ from shiftsim.planners.checkpoint import (
 )
 from shiftsim.planners.device import resolve_device
 
-pytestmark = pytest.mark.learned
-
-
-@pytest.fixture(autouse=True)
-def checkpoints(tmp_path, monkeypatch):
-    """The folder of checkpoints, at first empty."""
-    folder = tmp_path / "checkpoints"
-    folder.mkdir()
-    monkeypatch.setenv("SHIFTSIM_CHECKPOINTS", str(folder))
-    return folder
+pytestmark = [pytest.mark.learned, pytest.mark.usefixtures("checkpoints")]
 
 
 # --- found by path and by name
