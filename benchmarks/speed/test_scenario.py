@@ -13,9 +13,10 @@ from shiftsim.data.store import StoreWriter
 from shiftsim.data.synthetic import bench_scene
 from shiftsim.metrics import compute_metrics
 from shiftsim.noise import parse_noise
+from shiftsim.planner_entry import planner_entry
 from shiftsim.rollouts import Task
 from shiftsim.simulation import simulate
-from shiftsim.tasks import TaskRunner, planner_entry
+from shiftsim.tasks import TaskRunner
 from shiftsim.verify.nuplan_import import load_scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
@@ -47,7 +48,7 @@ def runner(scenes, tmp_path_factory):
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
     planners = {"constant-velocity": planner_entry("constant-velocity", {})}
     noises = {"none": parse_noise("none")}
-    return TaskRunner(path, planners, noises, "nonreactive", "lqr", "nuplan", (), True)
+    return TaskRunner(path, planners, noises, "nonreactive", "lqr", "nuplan", (), "all")
 
 
 NAMES = (
@@ -65,7 +66,7 @@ def test_whole_scenario(measure, runner, name):
 
     def whole():
         runner._last = None  # read the scenario again each time
-        result = runner(task)
+        (result,) = runner((task,))
         assert result.status == "ok", result.traceback
 
     measure(whole, calls=1, target=WHOLE_TARGET)
