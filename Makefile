@@ -27,7 +27,7 @@ test-docs: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/docs
 
 test-kill: install
-	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/run/test_kills.py
+	KILL_ROUNDS=24 KILL_SECONDS=60 $(BIN)/python -m pytest -n 4 tests/runs/test_kills.py
 
 test-browser: install
 	$(BIN)/python -m pytest tests/browser -rs

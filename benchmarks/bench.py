@@ -13,12 +13,12 @@ from typing import Any
 
 from shiftsim.benchmarks import Track, load_track
 from shiftsim.benchmarks.coverage import coverage
-from shiftsim.config import DEFAULT_STORE, make_config
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
-from shiftsim.results import Run, open_run
-from shiftsim.runner import RUNS, Prepared, Progress, execute, prepare
+from shiftsim.runs.config import DEFAULT_STORE, make_config
+from shiftsim.runs.execute import RUNS, Prepared, Progress, execute, prepare
+from shiftsim.runs.results import Run, open_run
 
 MANIFEST = "bench.json"
 DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said

@@ -6,9 +6,9 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.track_order import copy_columns, order_of_columns
-from shiftsim.map import VectorMap
-from shiftsim.scenario import Scenario
-from shiftsim.state import Tracks, TrafficLights
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks, TrafficLights
 
 
 @dataclass(frozen=True)

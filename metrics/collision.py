@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.geometry import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.metrics import kernels_collision
 from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Statistic, Violation
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.state import (
+from shiftsim.world.state import (
     LAST_AGENT_KIND,
     AgentKind,
     Tracks,

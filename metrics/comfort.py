@@ -15,7 +15,7 @@ from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import DataError
 from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.state import AX, AY, HEADING, center_accelerations
+from shiftsim.world.state import AX, AY, HEADING, center_accelerations
 
 NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from shiftsim.errors import ConfigError
-from shiftsim.log import SimulationLog
-from shiftsim.map import VectorMap
 from shiftsim.metrics.result import MetricRow
 from shiftsim.metrics.score import SHORT_NAMES, MetricResult
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.map import VectorMap
 
 CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
 

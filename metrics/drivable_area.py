@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.map import VectorMap
 from shiftsim.metrics import kernels_route
 from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.map import VectorMap
 
 NAME = "drivable_area_compliance"
 CORNERS_NAME = "corners_in_drivable_area"

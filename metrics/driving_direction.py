@@ -3,11 +3,11 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.map import VectorMap
 from shiftsim.metrics import kernels_progress
 from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.map import VectorMap
 
 NAME = "driving_direction_compliance"
 

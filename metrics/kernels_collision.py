@@ -7,8 +7,8 @@ diagonal). Most pairs are decided by distances with a margin; the rest exactly, 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry import EXTERIOR, convex_intersect, locate_in_ring, segments_intersect
-from shiftsim.layers import Polygons, in_any
+from shiftsim.geometry.rings import EXTERIOR, convex_intersect, locate_in_ring, segments_intersect
+from shiftsim.world.layers import Polygons, in_any
 
 STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = 0, 1, 2, 3, 4
 STOPPED_SPEED = 5e-2  # m/s, nuPlan at-fault collisions

@@ -3,8 +3,8 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
-from shiftsim.geometry import project_on_polyline
-from shiftsim.layers import Lists, Polygons, Polylines, contains
+from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.world.layers import Lists, Polygons, Polylines, contains
 
 
 @lean_kernel

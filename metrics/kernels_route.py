@@ -9,8 +9,8 @@ A length handed on starts as np.int64(0): for a literal the callee would be comp
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry import boundary_distance_below
-from shiftsim.layers import Lists, Polygons, containing, contains, distance_to, in_any
+from shiftsim.geometry.rings import boundary_distance_below
+from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
 
 _KEEP_DISTANCE = 5.0  # m, how far a connector is kept for inside an intersection
 _OVERLAP = -1  # several lanes hold the point

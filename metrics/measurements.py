@@ -6,14 +6,14 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import DataError
-from shiftsim.log import SimulationLog
-from shiftsim.map import VectorMap
 from shiftsim.metrics import collision, drivable_area, driving_direction, progress, speed_limit
 from shiftsim.metrics.comfort import MIN_SAMPLES, ComfortSignals, comfort_signals
 from shiftsim.metrics.result import Collision
 from shiftsim.metrics.route import EdgeLists, LaneChanges, corner_routes, driven_route, lane_changes
 from shiftsim.metrics.time_to_collision import TimeToCollision, time_to_collision
-from shiftsim.state import STATE_COLUMNS, VehicleParameters, center_poses
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import STATE_COLUMNS, VehicleParameters, center_poses
 
 
 @dataclass(frozen=True, slots=True)

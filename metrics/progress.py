@@ -6,11 +6,11 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import MapError
-from shiftsim.map import NONE, VectorMap
 from shiftsim.metrics import kernels_progress
 from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.map import NONE, VectorMap
 
 NAME = "ego_progress_along_expert_route"
 MAKING_NAME = "ego_is_making_progress"

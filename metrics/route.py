@@ -9,8 +9,8 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import MapError
-from shiftsim.map import VectorMap
 from shiftsim.metrics import kernels_route
+from shiftsim.world.map import VectorMap
 
 
 @dataclass(frozen=True, slots=True)

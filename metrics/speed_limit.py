@@ -4,11 +4,11 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import MapError
-from shiftsim.map import VectorMap
 from shiftsim.metrics import kernels_progress
 from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.map import VectorMap
 
 NAME = "speed_limit_compliance"
 _MIN_OVERSPEED = 1e-3  # m/s, nuPlan: floor of the threshold

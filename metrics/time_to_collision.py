@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.map import VectorMap
 from shiftsim.metrics import kernels_collision
 from shiftsim.metrics.collision import Contacts, Ego, FlatTracks
 from shiftsim.metrics.result import (
@@ -17,7 +16,8 @@ from shiftsim.metrics.result import (
     Violation,
 )
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.state import Tracks
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import Tracks
 
 NAME = "time_to_collision_within_bound"
 

@@ -14,11 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.geometry import wrap_angle
-from shiftsim.plan_check import find_fault
-from shiftsim.planner import History, Observation, SceneInfo
-from shiftsim.scenario import Scenario
-from shiftsim.state import Command, Tracks, Trajectory
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.sim.plan_check import find_fault
+from shiftsim.sim.planner import History, Observation, SceneInfo
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Command, Tracks, Trajectory
 
 CALLS = 20
 HISTORY = 22  # samples, as in a simulation
@@ -199,7 +199,7 @@ def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> list[Finding
                 "starts at the ego",
                 f"the plan is {distance:.1f} m away from the ego now",
                 "poses are the rear axle in the map frame, from observation.ego.pose on; "
-                "geometry.from_frame brings ego-frame poses there",
+                "shiftsim.geometry.frames.from_frame brings ego-frame poses there",
             )
         ]
     row = int(np.searchsorted(plan.time_us, now_us, side="right")) - 1

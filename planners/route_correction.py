@@ -16,9 +16,9 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
-from shiftsim.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
-from shiftsim.map import NONE, VectorMap
-from shiftsim.planners.pdm_centerline import nearest_vertex
+from shiftsim.planners.pdm.route import nearest_vertex
+from shiftsim.world.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
+from shiftsim.world.map import NONE, VectorMap
 
 MAX_HEADING_ERROR = np.pi / 4.0  # rad
 MAX_DISPLACEMENT = 3.0  # m

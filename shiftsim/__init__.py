@@ -6,46 +6,46 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from shiftsim.errors import ShiftsimError as ShiftsimError
-    from shiftsim.log import SimulationLog as SimulationLog
     from shiftsim.metrics import compute_metrics as score
-    from shiftsim.noise import NoiseModel as NoiseModel
-    from shiftsim.planner import Observation as Observation
-    from shiftsim.planner import Planner as Planner
-    from shiftsim.planner import SceneInfo as SceneInfo
     from shiftsim.planners.contract import check_planner as check_planner
-    from shiftsim.results import Run as Run
-    from shiftsim.results import open_run as open_run
-    from shiftsim.runner import open_named_store as open_store
-    from shiftsim.runner import run as run
-    from shiftsim.scenario import Scenario as Scenario
-    from shiftsim.simulation import simulate as simulate
-    from shiftsim.state import Command as Command
-    from shiftsim.state import EgoState as EgoState
-    from shiftsim.state import Tracks as Tracks
-    from shiftsim.state import Trajectory as Trajectory
-    from shiftsim.viewer.page import show as show
+    from shiftsim.runs.execute import open_named_store as open_store
+    from shiftsim.runs.execute import run as run
+    from shiftsim.runs.results import Run as Run
+    from shiftsim.runs.results import open_run as open_run
+    from shiftsim.sim.log import SimulationLog as SimulationLog
+    from shiftsim.sim.loop import simulate as simulate
+    from shiftsim.sim.noise import NoiseModel as NoiseModel
+    from shiftsim.sim.planner import Observation as Observation
+    from shiftsim.sim.planner import Planner as Planner
+    from shiftsim.sim.planner import SceneInfo as SceneInfo
+    from shiftsim.view.page import show as show
+    from shiftsim.world.scenario import Scenario as Scenario
+    from shiftsim.world.state import Command as Command
+    from shiftsim.world.state import EgoState as EgoState
+    from shiftsim.world.state import Tracks as Tracks
+    from shiftsim.world.state import Trajectory as Trajectory
 
 # public name -> where it is; imported when it is first used, so that `import shiftsim` is instant
 _PUBLIC = {
-    "Command": "shiftsim.state:Command",
-    "EgoState": "shiftsim.state:EgoState",
-    "NoiseModel": "shiftsim.noise:NoiseModel",
-    "Observation": "shiftsim.planner:Observation",
-    "Planner": "shiftsim.planner:Planner",
-    "Run": "shiftsim.results:Run",
-    "Scenario": "shiftsim.scenario:Scenario",
-    "SceneInfo": "shiftsim.planner:SceneInfo",
+    "Command": "shiftsim.world.state:Command",
+    "EgoState": "shiftsim.world.state:EgoState",
+    "NoiseModel": "shiftsim.sim.noise:NoiseModel",
+    "Observation": "shiftsim.sim.planner:Observation",
+    "Planner": "shiftsim.sim.planner:Planner",
+    "Run": "shiftsim.runs.results:Run",
+    "Scenario": "shiftsim.world.scenario:Scenario",
+    "SceneInfo": "shiftsim.sim.planner:SceneInfo",
     "ShiftsimError": "shiftsim.errors:ShiftsimError",
-    "SimulationLog": "shiftsim.log:SimulationLog",
-    "Tracks": "shiftsim.state:Tracks",
-    "Trajectory": "shiftsim.state:Trajectory",
+    "SimulationLog": "shiftsim.sim.log:SimulationLog",
+    "Tracks": "shiftsim.world.state:Tracks",
+    "Trajectory": "shiftsim.world.state:Trajectory",
     "check_planner": "shiftsim.planners.contract:check_planner",
-    "open_run": "shiftsim.results:open_run",
-    "open_store": "shiftsim.runner:open_named_store",
-    "run": "shiftsim.runner:run",
+    "open_run": "shiftsim.runs.results:open_run",
+    "open_store": "shiftsim.runs.execute:open_named_store",
+    "run": "shiftsim.runs.execute:run",
     "score": "shiftsim.metrics:compute_metrics",
-    "show": "shiftsim.viewer.page:show",
-    "simulate": "shiftsim.simulation:simulate",
+    "show": "shiftsim.view.page:show",
+    "simulate": "shiftsim.sim.loop:simulate",
 }
 
 __all__ = [

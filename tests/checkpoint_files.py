@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from shiftsim.planners.checkpoint import load_weights
+from shiftsim.planners.learned.checkpoint import load_weights
 
 LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 
@@ -77,7 +77,7 @@ def write_diffusion(folder: Path, state: dict[str, torch.Tensor], prefix: str = 
 
 def diffusion_args() -> dict[str, Any]:
     """Settings of Diffusion Planner as its training writes them."""
-    from shiftsim.planners.nets import diffusion_planner
+    from shiftsim.planners.learned.diffusion.network import model as diffusion_planner
 
     return dict(diffusion_planner.DEFAULT_ARGS)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numba
 
-from shiftsim.planners import load_planner
-from shiftsim.simulation import simulate
-from shiftsim.warmup import SHARES, scene
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import simulate
+from shiftsim.verify.warmup import SHARES, scene
 
 MARKER = "compiled-for-tests"
 GROUPS = (

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.results import FORMAT_VERSION, TABLES, open_run
+from shiftsim.runs.results import FORMAT_VERSION, TABLES, open_run
 
 METRICS = [name for name in SHORT_NAMES if name != "score"]
 

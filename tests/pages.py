@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 
-from shiftsim.viewer.pack import MISSING
+from shiftsim.view.pack import MISSING
 
 
 def unpack(text):

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from shiftsim.planners.nets import diffusion_encoder as encoder
-from shiftsim.planners.nets.diffusion_sampler import SCHEDULE, sample
+from shiftsim.planners.learned.diffusion.network import encoder
+from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE, sample
 
 
 def plain_network(network: Any) -> Any:

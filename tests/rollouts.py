@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.log import SimulationLog
-from shiftsim.state import AX, NUM_STATE, VX, AgentKind, Tracks, TrafficLights
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.state import AX, NUM_STATE, VX, AgentKind, Tracks, TrafficLights
 
 START_US = 1_600_000_000_000_000
 WORLDS = sorted((Path(__file__).parent / "golden" / "metric_worlds").glob("metric_world_*.json"))

@@ -6,8 +6,8 @@ import numpy as np
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import StoreWriter
-from shiftsim.state import AgentKind
+from shiftsim.data.store.reading import StoreWriter
+from shiftsim.world.state import AgentKind
 
 ITERATIONS = 25
 

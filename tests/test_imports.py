@@ -81,9 +81,10 @@ def test_a_module_imports_only_what_its_layer_may(path):
 def test_the_core_works_without_torch():
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "import shiftsim.runner, shiftsim.rescore, shiftsim.report, shiftsim.explain\n"
-        "import shiftsim.planners, shiftsim.data.store, shiftsim.verify, shiftsim.doctor\n"
-        "print(shiftsim.doctor._torch())\n"
+        "import shiftsim.runs.execute, shiftsim.runs.rescore, shiftsim.report.explain\n"
+        "import shiftsim.planners.registry, shiftsim.data.store.reading, shiftsim.verify\n"
+        "import shiftsim.cli.diagnosis\n"
+        "print(shiftsim.cli.diagnosis._torch())\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "not installed" in done.stdout

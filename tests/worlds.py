@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.geometry import wrap_angles
-from shiftsim.layers import Layer, make_layer
-from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
-from shiftsim.scenario import Scenario
-from shiftsim.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
+from shiftsim.geometry.frames import wrap_angles
+from shiftsim.world.layers import Layer, make_layer
+from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
 
 LANE_WIDTH = 3.5  # m
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.data.deepplan import convert_dsc3d
+from shiftsim.data.deepplan.convert import convert_dsc3d
 
 DURATION, PERIOD = 600.0, 0.08
 ROADS, LENGTH, SPACING = 20, 500.0, 20.0

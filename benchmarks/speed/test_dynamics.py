@@ -6,11 +6,11 @@ Run with `pytest benchmarks/speed/test_dynamics.py -s`.
 import numpy as np
 import pytest
 
-from shiftsim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bicycles
-from shiftsim.dynamics.lqr import TRACKED, track_and_step
-from shiftsim.dynamics.perfect import interpolate
-from shiftsim.noise import parse_noise, sample_noise
-from shiftsim.state import HEADING, NUM_STATE, VX
+from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bicycles
+from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
+from shiftsim.sim.dynamics.perfect import interpolate
+from shiftsim.sim.noise import parse_noise, sample_noise
+from shiftsim.world.state import HEADING, NUM_STATE, VX
 
 NOW = 1_630_000_000_000_000
 STEP_US = 100_000

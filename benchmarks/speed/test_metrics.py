@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.log import SimulationLog
-from shiftsim.map import VectorMap
 from shiftsim.metrics import compute_metrics, judge
 from shiftsim.metrics import measure as measure_rollout
-from shiftsim.state import Tracks
+from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.metric_worlds import read_world
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import Tracks
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "metric_worlds"
 TARGET = 5e-3  # s, all metrics of one 15 s rollout

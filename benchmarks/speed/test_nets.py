@@ -19,12 +19,12 @@ from time import perf_counter, process_time
 import numpy as np
 import pytest
 
-from shiftsim.data.store import open_store
-from shiftsim.data.synthetic import bench_scene, demo_store
-from shiftsim.planners import load_planner
-from shiftsim.simulation import Rollout
-from shiftsim.state import center_poses
-from shiftsim.verify.nuplan_import import load_scenes
+from shiftsim.data.demo.store import bench_scene, demo_store
+from shiftsim.data.store.reading import open_store
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import Rollout
+from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")
 
@@ -195,7 +195,7 @@ def test_diffusion_planner_against_the_plain_sampler(scenes, loaded):
     import torch
     from plain_diffusion import plain_network, plain_sample
 
-    from shiftsim.planners.diffusion_planner import INPUTS
+    from shiftsim.planners.learned.diffusion.planner import INPUTS
 
     planner = loaded("diffusion-planner")
     plain = plain_network(planner._network)
@@ -241,9 +241,9 @@ def test_batches_on_a_gpu(scenes, loaded, name):
 
 MEMORY = """
 import re, sys
-from shiftsim.data.store import open_store
-from shiftsim.planners import load_planner
-from shiftsim.simulation import Rollout
+from shiftsim.data.store.reading import open_store
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import Rollout
 store = open_store(sys.argv[1])
 planner = load_planner(sys.argv[2], {"checkpoint": "deterministic:drive"})
 def memory(word):  # ru_maxrss would be inherited

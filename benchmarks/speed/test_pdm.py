@@ -6,15 +6,15 @@ Run with `pytest benchmarks/speed/test_pdm.py -s`. Targets on one core: 6 ms wit
 import numpy as np
 import pytest
 
-from shiftsim.planners import load_planner
 from shiftsim.planners.contract import frozen_inputs
-from shiftsim.simulation import simulate
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import simulate
 
 
 @pytest.fixture(scope="module")
 def scenario():
     """A generated city with 100 agents around the ego."""
-    from shiftsim.data.synthetic import bench_scene
+    from shiftsim.data.demo.store import bench_scene
 
     return bench_scene(100, 0)
 

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shiftsim.plan_check import validate_plan
-from shiftsim.planners import load_planner
 from shiftsim.planners.contract import frozen_inputs
-from shiftsim.state import TrafficLights
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.plan_check import validate_plan
+from shiftsim.world.state import TrafficLights
 
 
 @pytest.fixture(scope="module")
 def scenario():
     """A generated city with 100 agents around the ego."""
-    from shiftsim.data.synthetic import bench_scene
+    from shiftsim.data.demo.store import bench_scene
 
     return bench_scene(100, 0)
 

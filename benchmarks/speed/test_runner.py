@@ -18,14 +18,14 @@ from time import process_time
 import numpy as np
 import pytest
 
-from shiftsim.executors import map_unordered
-from shiftsim.planners import load_planner
-from shiftsim.results import FORMAT_VERSION, TaskResult
-from shiftsim.rollouts import Task, encode_rollout
-from shiftsim.run_writer import RunWriter
-from shiftsim.runner import open_named_store
-from shiftsim.simulation import simulate
-from shiftsim.tasks import score_rollout
+from shiftsim.planners.registry import load_planner
+from shiftsim.runs.execute import open_named_store
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.results import FORMAT_VERSION, TaskResult
+from shiftsim.runs.rollouts import Task, encode_rollout
+from shiftsim.runs.task import score_rollout
+from shiftsim.runs.workers import map_unordered
+from shiftsim.sim.loop import simulate
 
 PLANNER, NOISE = "constant-velocity", "ou-high"
 FEW, MANY = 2, 10  # seeds

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import StoreWriter
-from shiftsim.data.synthetic import bench_scene
+from shiftsim.data.store.reading import StoreWriter
 from shiftsim.metrics import compute_metrics
-from shiftsim.noise import parse_noise
-from shiftsim.planner_entry import planner_entry
-from shiftsim.rollouts import Task
-from shiftsim.simulation import simulate
-from shiftsim.tasks import TaskRunner
-from shiftsim.verify.nuplan_import import load_scenes
+from shiftsim.runs.planners import planner_entry
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.task import TaskRunner
+from shiftsim.sim.loop import simulate
+from shiftsim.sim.noise import parse_noise
+from shiftsim.verify.nuplan.reading import load_scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, METRICS_TARGET = 25e-3, 5e-3  # s
@@ -105,10 +105,10 @@ def test_peak_memory_of_a_worker(runner):
     """Peak memory of a process that reads, drives and scores the city scene."""
     code = (
         "import re, sys\n"
-        "from shiftsim.data.store import open_store\n"
+        "from shiftsim.data.store.reading import open_store\n"
         "from shiftsim.metrics import compute_metrics\n"
-        "from shiftsim.planners import load_planner\n"
-        "from shiftsim.simulation import simulate\n"
+        "from shiftsim.planners.registry import load_planner\n"
+        "from shiftsim.sim.loop import simulate\n"
         "scene = open_store(sys.argv[1]).read('bench_scene_100')\n"
         "log = simulate(scene, load_planner('constant-velocity', {}))\n"
         "compute_metrics(log, scene.map)\n"

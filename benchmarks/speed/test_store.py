@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shiftsim.data.nuplan_map import read_map
+from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import ScenarioStore, StoreWriter, map_file, open_store
-from shiftsim.data.store_map import read_map_file
-from shiftsim.state import Tracks, TrafficLights
+from shiftsim.data.store.map import read_map_file
+from shiftsim.data.store.reading import ScenarioStore, StoreWriter, map_file, open_store
+from shiftsim.world.state import Tracks, TrafficLights
 
 ROWS, TRACKS = 520, 100  # 26 s at 20 Hz
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan_format"

@@ -8,8 +8,8 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from shiftsim.data.synthetic_city import bench_scene
-from shiftsim.traffic.idm import IdmTraffic
+from shiftsim.data.demo.city import bench_scene
+from shiftsim.sim.traffic.idm.model import IdmTraffic
 
 TARGET = 400e-6  # s, median of a step with 100 agents
 ROLLOUTS = 5

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.data.store import open_store
-from shiftsim.data.synthetic import bench_scene
-from shiftsim.planners import load_planner
-from shiftsim.simulation import simulate
-from shiftsim.viewer.build import Gallery, write_site
-from shiftsim.viewer.page import replay_page
-from shiftsim.viewer.scene import Shown
+from shiftsim.data.demo.store import bench_scene
+from shiftsim.data.store.reading import open_store
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import simulate
+from shiftsim.view.build import Gallery, write_site
+from shiftsim.view.page import replay_page
+from shiftsim.view.scene import Shown
 
 SCENARIOS, PLANNERS = 60, ("log-future", "idm", "constant-velocity")
 SEEKS = 150

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from shiftsim.benchmarks.bench import Plan
     from shiftsim.report import Group
     from shiftsim.report.figures import Figure
-    from shiftsim.runner import Progress
+    from shiftsim.runs.execute import Progress
 
 _UNFINISHED, _INTERRUPTED = 3, 130
 _MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustness"}

@@ -25,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 def inspect(path: Source, as_json: Json = False, debug: Debug = False) -> None:
     """Which planner a checkpoint is for, whether it loads, its hash, and what was left out."""
-    from shiftsim.planners.checkpoint_convert import inspect_checkpoint
+    from shiftsim.planners.learned.convert import inspect_checkpoint
 
     found = inspect_checkpoint(path)
     if as_json:
@@ -42,7 +42,7 @@ def convert(
     debug: Debug = False,
 ) -> None:
     """Write the weights that the planner loads, and nothing else, to a safetensors file."""
-    from shiftsim.planners.checkpoint_convert import convert_checkpoint
+    from shiftsim.planners.learned.convert import convert_checkpoint
 
     made = convert_checkpoint(path, out)
     if as_json:

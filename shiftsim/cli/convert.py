@@ -11,8 +11,8 @@ from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, s
 from shiftsim.cli.running import Workers, worker_count
 
 if TYPE_CHECKING:
-    from shiftsim.data.deepplan import ConversionReport
-    from shiftsim.data.deepplan_windows import ConversionConfig
+    from shiftsim.data.deepplan.convert import ConversionReport
+    from shiftsim.data.deepplan.windows import ConversionConfig
 
 _CONVERT = typer.Typer(help="Make a scenario store from recordings.")
 _PARTIAL, _INTERRUPTED = 3, 130
@@ -49,9 +49,9 @@ def nuplan(
     debug: Debug = False,
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
-    from shiftsim.config import store_path
-    from shiftsim.data.nuplan_convert import convert_nuplan
-    from shiftsim.data.nuplan_mapping import parse_mapping
+    from shiftsim.data.nuplan.convert import convert_nuplan
+    from shiftsim.data.nuplan.mapping import parse_mapping
+    from shiftsim.runs.config import store_path
 
     folder = store_path(store)
     with progress_bar(quiet=quiet or as_json) as advance:
@@ -86,7 +86,7 @@ def _token_list(text: str) -> list[str]:
     """Tokens from a file, or from the words themselves."""
     path = Path(text)
     if path.is_file():
-        from shiftsim.splits import read_split
+        from shiftsim.runs.splits import read_split
 
         return list(read_split(path).tokens)
     return [word.strip() for word in text.split(",")]
@@ -137,9 +137,9 @@ def dsc3d(
     """
     from functools import partial
 
-    from shiftsim.config import default_workers, store_path
-    from shiftsim.data.deepplan import convert_dsc3d
-    from shiftsim.executors import map_unordered
+    from shiftsim.data.deepplan.convert import convert_dsc3d
+    from shiftsim.runs.config import default_workers, store_path
+    from shiftsim.runs.workers import map_unordered
 
     flags = {
         "country": country,
@@ -194,9 +194,9 @@ def _category_map(words: list[str]) -> dict[str, str] | None:
 
 
 def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
-    from shiftsim.config import read_toml
-    from shiftsim.data.deepplan_windows import make_config
+    from shiftsim.data.deepplan.windows import make_config
     from shiftsim.errors import ConfigError
+    from shiftsim.runs.config import read_toml
 
     values = read_toml(path) if path else {}
     try:

@@ -21,8 +21,8 @@ def merge(
 ) -> None:
     """Join runs made with --shard: the same tables as without."""
     from shiftsim.cli.running import leave_with
-    from shiftsim.merge import merge_runs
-    from shiftsim.results import open_run
+    from shiftsim.runs.merge import merge_runs
+    from shiftsim.runs.results import open_run
 
     merged = merge_runs(
         [open_run(path) for path in runs],

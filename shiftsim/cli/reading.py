@@ -12,7 +12,7 @@ import typer
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
-    from shiftsim.results import Run
+    from shiftsim.runs.results import Run
 
 _USAGE, _DATA = 1, 2
 
@@ -75,9 +75,9 @@ def report(
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.config import one_of
     from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
+    from shiftsim.runs.config import one_of
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:
@@ -149,8 +149,8 @@ def explain(
     debug: Debug = False,
 ) -> None:
     """Why a rollout has its score, or why a task failed."""
-    from shiftsim.explain import explain_lines, select_tasks
-    from shiftsim.results import open_run
+    from shiftsim.report.explain import explain_lines, select_tasks
+    from shiftsim.runs.results import open_run
 
     run = open_run(source)
     chosen = select_tasks(run, token, planner=planner, noise=noise, seed=seed)
@@ -172,8 +172,8 @@ def diff(
     debug: Debug = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
-    from shiftsim.diff import diff_lines, diff_runs
-    from shiftsim.results import open_run
+    from shiftsim.runs.diff import diff_lines, diff_runs
+    from shiftsim.runs.results import open_run
 
     found = diff_runs(open_run(first), open_run(second), limit=limit)
     if as_json:
@@ -189,8 +189,8 @@ def check(
     debug: Debug = False,
 ) -> None:
     """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
-    from shiftsim.config import store_path
-    from shiftsim.data.check import check_store
+    from shiftsim.data.store.check import check_store
+    from shiftsim.runs.config import store_path
 
     path = store_path(store)
     problems = check_store(path)
@@ -219,7 +219,7 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
     """The planners that come with shiftsim, and whether they are ready to run."""
     from dataclasses import asdict
 
-    from shiftsim.planners import PLANNERS, readiness
+    from shiftsim.planners.registry import PLANNERS, readiness
 
     missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
     if as_json:
@@ -254,10 +254,10 @@ def check_one_planner(
     debug: Debug = False,
 ) -> None:
     """Does a planner obey the contract? Says what is wrong, and what to do."""
-    from shiftsim.config import parse_argument
-    from shiftsim.planners import load_planner
     from shiftsim.planners.contract import check_planner
-    from shiftsim.runner import open_named_store
+    from shiftsim.planners.registry import load_planner
+    from shiftsim.runs.config import parse_argument
+    from shiftsim.runs.execute import open_named_store
 
     arguments = {}
     for text in planner_arg or ():
@@ -298,7 +298,7 @@ def verify(
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).
     """
-    from shiftsim.config import one_of
+    from shiftsim.runs.config import one_of
     from shiftsim.verify import MODES
     from shiftsim.verify import verify as compare
 
@@ -312,7 +312,7 @@ def verify(
 
 def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
-    from shiftsim.doctor import examine
+    from shiftsim.cli.diagnosis import examine
 
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance)

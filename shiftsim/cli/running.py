@@ -14,8 +14,8 @@ from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, s
 from shiftsim.cli.merging import merge
 
 if TYPE_CHECKING:
-    from shiftsim.results import Run
-    from shiftsim.runner import Prepared, Progress
+    from shiftsim.runs.execute import Prepared, Progress
+    from shiftsim.runs.results import Run
 
 _UNFINISHED, _INTERRUPTED = 3, 130
 _DEMO_PLANNERS = ("log-future", "idm", "constant-velocity")
@@ -137,7 +137,7 @@ def run(
     debug: Debug = False,
 ) -> None:
     """Simulate and score planners on scenarios."""
-    from shiftsim.config import make_config, read_toml
+    from shiftsim.runs.config import make_config, read_toml
 
     values = read_toml(config) if config else {}
     flags: dict[str, Any] = {
@@ -180,7 +180,7 @@ def planner_arguments(
     texts: Sequence[str] | None, before: Mapping[str, Any], planners: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
     """Arguments by planner, those of the command line put over what a file says."""
-    from shiftsim.config import parse_argument
+    from shiftsim.runs.config import parse_argument
 
     arguments = {name: dict(table) for name, table in before.items()}
     for text in texts or ():
@@ -216,7 +216,7 @@ def worker_count(text: str | None) -> int:
 
 def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
     """Run what the settings say, print what it gave, and leave with the right code."""
-    from shiftsim.runner import execute, prepare
+    from shiftsim.runs.execute import execute, prepare
 
     prepared = prepare(config)
     if not as_json:
@@ -349,9 +349,9 @@ def demo(
     debug: Debug = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed."""
-    from shiftsim.config import DEFAULT_STORE, make_config, store_path
-    from shiftsim.data.synthetic import DEMO_SPLIT, demo_store
-    from shiftsim.warmup import warm_up
+    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
+    from shiftsim.runs.config import DEFAULT_STORE, make_config, store_path
+    from shiftsim.verify.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
@@ -392,8 +392,8 @@ def score(
     debug: Debug = False,
 ) -> None:
     """Score stored rollouts again, under another threshold profile, without simulating."""
-    from shiftsim.rescore import rescore
-    from shiftsim.results import open_run
+    from shiftsim.runs.rescore import rescore
+    from shiftsim.runs.results import open_run
 
     run = open_run(source)
     with progress_bar(quiet=quiet or as_json) as advance:

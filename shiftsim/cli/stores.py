@@ -9,8 +9,8 @@ from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, s
 from shiftsim.cli.running import AllScenarios, Split, Workers, worker_count
 
 if TYPE_CHECKING:
-    from shiftsim.data.store import ScenarioStore
-    from shiftsim.filtering import Verdicts
+    from shiftsim.data.store.reading import ScenarioStore
+    from shiftsim.runs.filter import Verdicts
 
 _EXPORT = typer.Typer(help="Write scenarios in the formats of others.")
 _PARTIAL = 3
@@ -46,8 +46,8 @@ def filter_scenarios(
     Dropped scenarios stay in the store and are listed; runs over the whole store leave them out.
     An interrupted filter goes on when it is started again.
     """
-    from shiftsim.filtering import FilterConfig, filter_store
-    from shiftsim.runner import open_named_store
+    from shiftsim.runs.execute import open_named_store
+    from shiftsim.runs.filter import FilterConfig, filter_store
 
     given: dict[str, Any] = {
         "thresholds": thresholds,
@@ -92,8 +92,8 @@ _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": 
 def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
-    from shiftsim.filtering import read_verdicts
-    from shiftsim.splits import find_split
+    from shiftsim.runs.filter import read_verdicts
+    from shiftsim.runs.splits import find_split
 
     if split:
         tokens = find_split(split, store.path, store.tokens).tokens
@@ -132,8 +132,8 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runner import open_named_store
-    from shiftsim.splits import choose_scenarios, write_split
+    from shiftsim.runs.execute import open_named_store
+    from shiftsim.runs.splits import choose_scenarios, write_split
 
     opened = open_named_store(store)
     found = choose_scenarios(
@@ -164,8 +164,8 @@ def export_to_nuplan(
     nuPlan's own code opens its four city maps whatever map is asked for: put them into the folder
     of the maps too, and merge the two index files.
     """
-    from shiftsim.data.nuplan_export import export_nuplan
-    from shiftsim.runner import open_named_store
+    from shiftsim.data.nuplan.export import export_nuplan
+    from shiftsim.runs.execute import open_named_store
 
     opened = open_named_store(store)
     tokens = _chosen(opened, split, all_scenarios)
@@ -221,10 +221,10 @@ def show_stats(
     debug: Debug = False,
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
-    from shiftsim.config import one_of
-    from shiftsim.data.stats import store_stats
-    from shiftsim.runner import open_named_store
-    from shiftsim.stats_report import draw_stats, stats_dict, stats_table
+    from shiftsim.data.store.statistics import store_stats
+    from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
+    from shiftsim.runs.config import one_of
+    from shiftsim.runs.execute import open_named_store
 
     one_of("column", by, ("city", "type"))
     opened = open_named_store(store)

@@ -8,7 +8,7 @@ import typer
 from shiftsim.cli.common import Debug, Quiet, plural, progress_bar, say
 
 if TYPE_CHECKING:
-    from shiftsim.viewer.build import Gallery
+    from shiftsim.view.build import Gallery
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
 Others = Annotated[
@@ -55,7 +55,7 @@ def view(
     debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
-    from shiftsim.viewer.build import page_name, write_site
+    from shiftsim.view.build import page_name, write_site
 
     gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
     folder = out or run / "view"
@@ -96,7 +96,7 @@ def plot(
     debug: Debug = False,
 ) -> None:
     """The driven paths of several rollouts over the map, as a still or a film."""
-    from shiftsim.viewer.figure import save_figure
+    from shiftsim.view.still import save_figure
 
     gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
     token = gallery.find(token)
@@ -115,10 +115,10 @@ def inspect(
     debug: Debug = False,
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
-    from shiftsim.data.review import REVIEW
-    from shiftsim.inspection.desk import Desk
-    from shiftsim.inspection.server import ReviewServer
-    from shiftsim.runner import open_named_store
+    from shiftsim.data.store.review import REVIEW
+    from shiftsim.runs.execute import open_named_store
+    from shiftsim.view.review.server import ReviewServer
+    from shiftsim.view.review.service import Desk
 
     path = open_named_store(store).path
     with ReviewServer(Desk(path, reviewer), port) as server:
@@ -140,9 +140,9 @@ def _gallery(
     seed: list[int] | None,
     store: str | None,
 ) -> "Gallery":
-    from shiftsim.bundle import open_run_store
-    from shiftsim.results import open_run
-    from shiftsim.viewer.build import Choice, Gallery
+    from shiftsim.runs.bundle import open_run_store
+    from shiftsim.runs.results import open_run
+    from shiftsim.view.build import Choice, Gallery
 
     opened = [open_run(path) for path in runs]
     found = open_run_store(opened[0], store)

@@ -10,7 +10,7 @@ from shiftsim.report.groups import Group
 from shiftsim.report.paper import distinct_sets, traffics
 from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, cluster_codes, compare, holm
 from shiftsim.report.tables import Cell, Number, Table
-from shiftsim.results import Run
+from shiftsim.runs.results import Run
 
 
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import MissingExtraError
-from shiftsim.palette import Look, looks
 from shiftsim.report.groups import COLUMNS, DataSet, Estimate, Group
+from shiftsim.report.palette import Look, looks
 from shiftsim.report.paper import METRICS, distinct_sets, traffics
 from shiftsim.report.statistics import Interval
 

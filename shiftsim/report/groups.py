@@ -16,9 +16,9 @@ import pyarrow.compute as pc
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.noise import NOISE_NAMES
 from shiftsim.report.statistics import Interval, bootstrap_interval, cluster_codes, seed_deviation
-from shiftsim.results import Run
+from shiftsim.runs.results import Run
+from shiftsim.sim.noise import NOISE_NAMES
 
 COLUMNS = {"cls": "CLS"} | {n: short for n, short in SHORT_NAMES.items() if n != "score"}
 TRAFFIC = {"nonreactive": "NR", "reactive": "R"}

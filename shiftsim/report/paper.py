@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 
-from shiftsim.noise import NOISE_NAMES
 from shiftsim.report.groups import DataSet, Estimate, Group
 from shiftsim.report.published import Published
 from shiftsim.report.statistics import FEW_CLUSTERS
 from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.sim.noise import NOISE_NAMES
 
 # the order of the paper's columns
 METRICS = {

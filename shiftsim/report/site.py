@@ -4,12 +4,12 @@ import html
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shiftsim.bundle import open_run_store
 from shiftsim.report.figures import Figure
 from shiftsim.report.tables import Table
 from shiftsim.report.writers import render
-from shiftsim.results import Run
-from shiftsim.viewer.build import Choice, galleries, write_site
+from shiftsim.runs.bundle import open_run_store
+from shiftsim.runs.results import Run
+from shiftsim.view.build import Choice, galleries, write_site
 
 
 def write_report_site(

@@ -10,17 +10,17 @@ import pyarrow.parquet as pq
 import pyproj
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.deepplan_recording import convert_recording
-from shiftsim.data.deepplan_states import sample_runs
-from shiftsim.data.deepplan_windows import EGO, ConversionConfig, find_runs, judge_windows
-from shiftsim.data.dsc3d import Annotations, Site, find_map, open_site, read_recording
-from shiftsim.data.opendrive_lanes import LaneKey
+from shiftsim.data.deepplan.recording import convert_recording
+from shiftsim.data.deepplan.states import sample_runs
+from shiftsim.data.deepplan.windows import EGO, ConversionConfig, find_runs, judge_windows
+from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site, read_recording
+from shiftsim.data.opendrive.lanes import LaneKey
 from shiftsim.errors import DataError
-from shiftsim.geometry import wrap_angles
-from shiftsim.state import center_poses
+from shiftsim.geometry.frames import wrap_angles
 from shiftsim.verify.dsc3d_lanes import LocalMap, keys_at, lane_sequences, load_map, placed_map
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import Group, read_groups
+from shiftsim.world.state import center_poses
 
 _EXACT = 1e-9  # rad, m in the local frame, degrees: the same formula on both sides
 _UTM = 1e-8  # m, spacing of floats at UTM coordinates

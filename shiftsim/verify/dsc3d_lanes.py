@@ -8,13 +8,13 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.dsc3d import Site
-from shiftsim.data.opendrive import read_opendrive
-from shiftsim.data.opendrive_geometry import ReferenceLine
-from shiftsim.data.opendrive_lanes import LaneKey, section_borders
-from shiftsim.data.opendrive_map import Origin, build_road_map
-from shiftsim.data.opendrive_records import OpenDrive
-from shiftsim.map import VectorMap
+from shiftsim.data.dsc3d.recording import Site
+from shiftsim.data.opendrive.curves import ReferenceLine
+from shiftsim.data.opendrive.lanes import LaneKey, section_borders
+from shiftsim.data.opendrive.map import Origin, build_road_map
+from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.opendrive.records import OpenDrive
+from shiftsim.world.map import VectorMap
 
 _STEP_S = 0.05
 _MIN_PIECE_S = 0.5  # shorter pieces at the ends of a lane sequence may be missing (expected.json)

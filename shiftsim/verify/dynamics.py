@@ -11,11 +11,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.dynamics import lqr
-from shiftsim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
-from shiftsim.dynamics.perfect import interpolate
 from shiftsim.errors import DataError, ShiftsimError
-from shiftsim.geometry import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.metrics.comfort import (
     BOUNDED_SIGNALS,
     MIN_SAMPLES,
@@ -24,8 +21,15 @@ from shiftsim.metrics.comfort import (
     within_bounds,
 )
 from shiftsim.metrics.thresholds import PROFILES
-from shiftsim.noise import NOISE_NAMES, noise_from_normals, parse_noise
-from shiftsim.state import (
+from shiftsim.sim.dynamics import lqr
+from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
+from shiftsim.sim.dynamics.perfect import interpolate
+from shiftsim.sim.noise import NOISE_NAMES, noise_from_normals, parse_noise
+from shiftsim.sim.traffic.idm.policy import idm_acceleration, idm_step
+from shiftsim.verify.array_file import EXACT, ArrayFile
+from shiftsim.verify.idm_worlds import verify_idm_world
+from shiftsim.verify.report import Report
+from shiftsim.world.state import (
     AX,
     AY,
     HEADING,
@@ -44,10 +48,6 @@ from shiftsim.state import (
     rear_states,
     speeds,
 )
-from shiftsim.traffic.idm_policy import idm_acceleration, idm_step
-from shiftsim.verify.array_file import EXACT, ArrayFile
-from shiftsim.verify.idm_worlds import verify_idm_world
-from shiftsim.verify.report import Report
 
 CORNER_TOLERANCE = 2e-9  # m, coordinates near 4e6 are spaced 5e-10
 LOOP_TOLERANCE = 1e-6  # closed loops: m, m/s, m/s^2, rad/s

@@ -1,8 +1,8 @@
 """The route that follows from where the expert drove."""
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.nuplan_log import Log, read_ego
-from shiftsim.map import VectorMap
+from shiftsim.data.nuplan.log import Log, read_ego
+from shiftsim.world.map import VectorMap
 
 _MAX_SECONDS = 60.0  # nuPlan looks ahead at most so far
 _ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples asked for

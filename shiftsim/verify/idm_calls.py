@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.planner import Observation, SceneInfo
-from shiftsim.planners.idm import STEP_US, STEPS, Idm
-from shiftsim.scenario import Scenario
-from shiftsim.state import VX, VY, AgentKind, LightStatus
+from shiftsim.planners.idm.planner import STEP_US, STEPS, Idm
+from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.observing import observe, scene_info
 from shiftsim.verify.report import Report
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import VX, VY, AgentKind, LightStatus
 
 TOLERANCE = 1e-9
 _KEY = ("scene", "first_call_iteration", "iteration")

@@ -10,12 +10,12 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import DataError, ShiftsimError
-from shiftsim.map import AreaSpec, EdgeSpec, VectorMap, build_map
-from shiftsim.scenario import Scenario
-from shiftsim.state import NUM_STATE, VY, AgentKind, LightStatus, Tracks, TrafficLights
-from shiftsim.traffic.idm import IdmTraffic
-from shiftsim.traffic.idm_agents import order_observed
+from shiftsim.sim.traffic.idm.agents import order_observed
+from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.report import Report
+from shiftsim.world.map import AreaSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import NUM_STATE, VY, AgentKind, LightStatus, Tracks, TrafficLights
 
 TOLERANCE = 1e-6  # m, rad, m/s
 VEHICLE_COLUMNS = ("token", "x", "y", "heading", "vx", "vy", "path_speed", "route_edge_ids")

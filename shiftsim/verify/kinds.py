@@ -40,7 +40,7 @@ class Kind:
 
 KINDS = (
     Kind("nuplan", ("scenes.json", "expected/*.parquet"), "nuplan:verify_nuplan", ("mode",)),
-    Kind("nuplan_format", ("devkit_readback.json",), "nuplan_format:verify_nuplan_format"),
+    Kind("nuplan_format", ("devkit_readback.json",), "nuplan.format:verify_nuplan_format"),
     Kind("metric_worlds", ("metric_world_*.json",), "metric_worlds:verify_metric_worlds"),
     Kind(
         "pdm",

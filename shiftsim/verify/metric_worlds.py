@@ -10,13 +10,14 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import DataError, ShiftsimError
-from shiftsim.log import SimulationLog
-from shiftsim.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.metrics import Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN
-from shiftsim.state import (
+from shiftsim.sim.log import SimulationLog
+from shiftsim.verify.report import Report
+from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.state import (
     AX,
     AY,
     HEADING,
@@ -31,7 +32,6 @@ from shiftsim.state import (
     X,
     Y,
 )
-from shiftsim.verify.report import Report
 
 TOLERANCE = 1e-9
 _CONTINUOUS = {"ego_progress_along_expert_route", "speed_limit_compliance", "score"}  # scores

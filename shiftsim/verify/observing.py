@@ -3,9 +3,9 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.planner import History, Observation, SceneInfo
-from shiftsim.scenario import Scenario
-from shiftsim.state import Tracks
+from shiftsim.sim.planner import History, Observation, SceneInfo
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks
 
 
 def scene_info(scenario: Scenario) -> SceneInfo:

@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive import read_opendrive
-from shiftsim.data.opendrive_areas import is_crosswalk, object_origin, object_rings
-from shiftsim.data.opendrive_geometry import ReferenceLine, arc_length_deviation
-from shiftsim.data.opendrive_lanes import LaneKey, lane_links, section_borders
-from shiftsim.data.opendrive_records import OpenDrive, Road, RoadObject
+from shiftsim.data.opendrive.areas import is_crosswalk, object_origin, object_rings
+from shiftsim.data.opendrive.curves import ReferenceLine, arc_length_deviation
+from shiftsim.data.opendrive.lanes import LaneKey, lane_links, section_borders
+from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.opendrive.records import OpenDrive, Road, RoadObject
 from shiftsim.errors import ShiftsimError
 from shiftsim.verify.report import Report
 

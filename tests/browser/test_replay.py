@@ -5,13 +5,13 @@ from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
 import shiftsim
-from shiftsim.data.store import open_store
-from shiftsim.planners import load_planner
-from shiftsim.simulation import simulate
-from shiftsim.state import AgentKind
-from shiftsim.viewer.build import Gallery, page_name, write_site
-from shiftsim.viewer.page import embedded, replay_page
-from shiftsim.viewer.scene import Shown
+from shiftsim.data.store.reading import open_store
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import simulate
+from shiftsim.view.build import Gallery, page_name, write_site
+from shiftsim.view.page import embedded, replay_page
+from shiftsim.view.scene import Shown
+from shiftsim.world.state import AgentKind
 
 SIZES = [(1440, 900), (800, 600)]
 HOSTILE = (

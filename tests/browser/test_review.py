@@ -5,9 +5,9 @@ import pytest
 from stores import write_toy_store
 
 import shiftsim
-from shiftsim.data.review import REVIEW
-from shiftsim.inspection.desk import Desk
-from shiftsim.inspection.server import ReviewServer
+from shiftsim.data.store.review import REVIEW
+from shiftsim.view.review.server import ReviewServer
+from shiftsim.view.review.service import Desk
 
 SIZES = [(1440, 900), (800, 600)]
 FIRST, SECOND = "0000cafe", "0001cafe"

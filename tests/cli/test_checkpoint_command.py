@@ -13,7 +13,7 @@ if importlib.util.find_spec("torch") is None:
 
 from checkpoint_files import LEARNED, Callback, lightning_entries, save, state_of, write_published
 
-from shiftsim.planners.checkpoint import load_weights
+from shiftsim.planners.learned.checkpoint import load_weights
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow, pytest.mark.thorough]
 

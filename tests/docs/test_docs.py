@@ -31,15 +31,17 @@ from doc_pages import (
     table_below,
 )
 
-from shiftsim import config
 from shiftsim.benchmarks import load_track
-from shiftsim.data import schema, store_map, synthetic
-from shiftsim.data.deepplan_states import resample
-from shiftsim.data.deepplan_windows import find_runs
-from shiftsim.data.dsc3d import find_map, open_site, read_recording
+from shiftsim.data.deepplan.states import resample
+from shiftsim.data.deepplan.windows import find_runs
+from shiftsim.data.demo import store as synthetic
+from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
+from shiftsim.data.store import schema
+from shiftsim.data.store import map as store_map
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
-from shiftsim.planners import PLANNERS
-from shiftsim.results import TABLES
+from shiftsim.planners.registry import PLANNERS
+from shiftsim.runs import config
+from shiftsim.runs.results import TABLES
 
 DOCS = REPOSITORY / "docs"
 BLOCKS = [block for page in PAGES for block in read_blocks(page)]
@@ -289,7 +291,7 @@ def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: p
 
 
 def test_verdicts_of_the_filter_are_described() -> None:
-    from shiftsim.filtering import _SCHEMA
+    from shiftsim.runs.filter import _SCHEMA
 
     rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
     assert [row[:3] for row in rows] == _described(_SCHEMA)

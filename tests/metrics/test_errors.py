@@ -9,8 +9,8 @@ from rollouts import boxes, rollout, states_of, straight_poses
 from worlds import straight_road
 
 from shiftsim.errors import ConfigError, DataError, MapError
-from shiftsim.map import BlockSpec, EdgeSpec, build_map
 from shiftsim.metrics import MetricRow, compute_metrics, judge, measure
+from shiftsim.world.map import BlockSpec, EdgeSpec, build_map
 
 LOG = rollout(states_of(straight_poses(20), 10.0))
 

@@ -7,7 +7,7 @@ from worlds import straight_road
 
 from shiftsim.metrics import MetricResult, MetricRow, compute_metrics, judge, measure
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.state import VX, AgentKind, Tracks, join_tracks
+from shiftsim.world.state import VX, AgentKind, Tracks, join_tracks
 
 K = 60
 ROAD = straight_road()

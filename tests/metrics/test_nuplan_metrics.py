@@ -10,10 +10,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.data.nuplan_map import read_map
-from shiftsim.map import VectorMap
-from shiftsim.verify.nuplan_metrics import verify_nuplan_metrics
+from shiftsim.data.nuplan.map import read_map
+from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.report import Report
+from shiftsim.world.map import VectorMap
 
 pytestmark = pytest.mark.golden
 TABLES = (

@@ -7,7 +7,7 @@ import pytest
 from worlds import cruise_scenario
 
 from shiftsim.planners.contract import check_planner
-from shiftsim.state import Command, Trajectory
+from shiftsim.world.state import Command, Trajectory
 
 TIMES = np.arange(41) * 0.1
 

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from shiftsim.errors import ConfigError
-from shiftsim.planners import PLANNERS, load_planner, planner_factory, planner_fingerprint
+from shiftsim.planners.registry import PLANNERS, load_planner, planner_factory, planner_fingerprint
 
 OWN = """
 class Own:

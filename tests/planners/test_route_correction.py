@@ -6,17 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
-from shiftsim.data.synthetic import bench_scene
+from shiftsim.data.demo.store import bench_scene
 from shiftsim.errors import PlannerError
-from shiftsim.geometry import boxes_to_corners
-from shiftsim.layers import square_around
-from shiftsim.map import build_map
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.route_correction import (
     RouteCorrector,
     correct_route,
     find_start,
     known_blocks,
 )
+from shiftsim.world.layers import square_around
+from shiftsim.world.map import build_map
 
 
 def names(road, blocks):

@@ -5,19 +5,20 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import places
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.nets_common import Scenes
+from shiftsim.verify.nets.common import Scenes
 from shiftsim.verify.report import Report
 
 pytest.importorskip("torch")
 
-from shiftsim.verify.nets_plantf import verify_plantf
+from shiftsim.verify.nets.plantf import verify_plantf
 
 pytestmark = [pytest.mark.golden, pytest.mark.learned]
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "nets" / "plantf"
+GOLDEN = places.GOLDEN / "nets" / "plantf"
 FORWARD, LOOP = "forward_b2_drive.npz", "closed_loop_s04_left_turn_drive.npz"
 KEPT = 2  # iterations of the loop in which values are changed
 PER_ITERATION = ("ego/current", "ego/current_time_us", "out/trajectory", "out/trajectory_time_us")

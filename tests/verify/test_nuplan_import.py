@@ -7,16 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import places
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.nuplan_format import verify_nuplan_format
-from shiftsim.verify.nuplan_import import load_maps, verify_nuplan_import
-from shiftsim.verify.nuplan_maps import verify_maps
+from shiftsim.verify.nuplan.format import verify_nuplan_format
+from shiftsim.verify.nuplan.maps import verify_maps
+from shiftsim.verify.nuplan.reading import load_maps, verify_nuplan_import
 from shiftsim.verify.report import Report
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "nuplan_format"
+GOLDEN = places.GOLDEN / "nuplan_format"
 pytestmark = pytest.mark.golden
 
 

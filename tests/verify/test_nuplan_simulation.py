@@ -7,8 +7,8 @@ import pytest
 
 from shiftsim.errors import DataError
 from shiftsim.verify import verify
-from shiftsim.verify.nuplan_import import load_scenes
-from shiftsim.verify.nuplan_simulation import verify_simulation
+from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.nuplan.simulation import verify_simulation
 from shiftsim.verify.report import Report
 
 pytestmark = pytest.mark.golden

@@ -2,21 +2,21 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
+import places
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.nuplan_import import load_scenes
-from shiftsim.verify.pdm_kernels import verify_kernels
-from shiftsim.verify.pdm_loops import verify_calls
-from shiftsim.verify.pdm_routes import verify_routes
+from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.pdm.kernels import verify_kernels
+from shiftsim.verify.pdm.loops import verify_calls
+from shiftsim.verify.pdm.routes import verify_routes
 from shiftsim.verify.report import Report
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "pdm"
+GOLDEN = places.GOLDEN / "pdm"
 RUN = "s02_curve_objects"
 
 pytestmark = pytest.mark.golden

@@ -6,19 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import places
 import pytest
 
-from shiftsim.planners.carl import Carl
+from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.verify import verify
-from shiftsim.verify.nets_carl import verify_carl
-from shiftsim.verify.nets_common import Scenes, open_loop
-from shiftsim.verify.nets_routes import verify_routes
+from shiftsim.verify.nets.carl import verify_carl
+from shiftsim.verify.nets.common import Scenes, open_loop
+from shiftsim.verify.nets.routes import verify_routes
 from shiftsim.verify.report import Report
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.golden, pytest.mark.learned]
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "nets"
+GOLDEN = places.GOLDEN / "nets"
 LOOP = "closed_loop_s04_left_turn.npz"
 ROUTES = "route_correction_s04_left_turn.json"
 

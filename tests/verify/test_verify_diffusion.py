@@ -2,21 +2,21 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
+import places
 import pytest
 
 from shiftsim.verify.nets import verify_nets
-from shiftsim.verify.nets_common import Scenes
+from shiftsim.verify.nets.common import Scenes
 from shiftsim.verify.report import Report
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.learned, pytest.mark.golden, pytest.mark.slow]
 
-from shiftsim.verify import nets_diffusion  # noqa: E402  # needs torch
+from shiftsim.verify.nets import diffusion as nets_diffusion  # noqa: E402  # needs torch
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "nets" / "diffusion_planner"
+GOLDEN = places.GOLDEN / "nets" / "diffusion_planner"
 LOOP, FORWARD = "closed_loop_s01_lead_brakes.npz", "forward_empty.npz"
 AGENTS, LANES = "overflow_agents_b.npz", "overflow_lanes_b.npz"
 # where a change counts: the last sample of a track in sight, a lane that is kept, …

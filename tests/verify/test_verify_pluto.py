@@ -1,21 +1,23 @@
 """PLUTO's reference folder: all of it agrees, and any changed value is seen."""
 
 import json
-from pathlib import Path
 
 import numpy as np
+import places
 import pytest
 
 from shiftsim.verify.nets import verify_nets
-from shiftsim.verify.nets_common import Scenes
+from shiftsim.verify.nets.common import Scenes
 from shiftsim.verify.report import Report
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.learned, pytest.mark.golden, pytest.mark.slow]
 
-from shiftsim.verify import nets_pluto, nets_pluto_loops, nets_pluto_network  # noqa: E402
+from shiftsim.verify.nets import pluto as nets_pluto  # noqa: E402
+from shiftsim.verify.nets import pluto_loops as nets_pluto_loops  # noqa: E402
+from shiftsim.verify.nets import pluto_network as nets_pluto_network  # noqa: E402
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "nets" / "pluto"
+GOLDEN = places.GOLDEN / "nets" / "pluto"
 LOOP, BRAKES = "closed_loop_s02_curve_objects_drive.npz", "closed_loop_s03_queue_start_drive.npz"
 FORWARD, BRAKE = "forward_b1_sparse.npz", "emergency_brake.npz"
 # what the network does not read, and what decides nothing in the unit cases of the brake

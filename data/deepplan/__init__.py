@@ -1,0 +1,1 @@
+"""DeepPlan's conversion of aerial recordings."""

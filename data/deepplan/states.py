@@ -1,0 +1,232 @@
+"""A recording at 20 Hz, and the states of its egos (deepplan-conversion.md §5, §6).
+
+Rows are 0.05 s apart, counted from the first frame; poses are linear between frames, angles by the
+shorter way round. Nothing is stretched: time is `frame_id / frame_rate`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.deepplan.windows import ROW_S, Runs, rows_of
+from shiftsim.data.dsc3d.recording import Annotations
+from shiftsim.data.recording import EgoTrace, Recording
+from shiftsim.geometry.frames import wrap_angles
+from shiftsim.world import state
+from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
+
+_EPS = 1e-9  # s
+_HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second order
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Boxes of runs at given times. G samples, local frame.
+
+    Attributes:
+        poses: (G, 3) box centre x [m], y [m], heading [rad].
+        velocities: (G, 2) [m/s].
+        heights: (G,) z of the box centre [m].
+    """
+
+    poses: FloatArray
+    velocities: FloatArray
+    heights: FloatArray
+
+
+def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatArray) -> Samples:
+    """Boxes at any time, linear between the frames of a run.
+
+    Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
+    heading. Callers decide how far that is allowed.
+
+    Args:
+        recording: The recording.
+        runs: Its runs.
+        run: (G,) run to sample.
+        time: (G,) since the first frame [s].
+    """
+    num_frames = len(recording.clock)
+    frame = np.searchsorted(recording.clock, time + _EPS, side="right") - 1
+    row = np.searchsorted(runs.row_key, run * num_frames + frame, side="right") - 1
+    row = np.clip(row, runs.first[run], np.maximum(runs.last[run] - 1, runs.first[run]))
+    following = np.minimum(row + 1, runs.last[run])
+    row_time = recording.time
+    span = np.where(following > row, row_time[following] - row_time[row], recording.period)
+    share = (time - row_time[row]) / span
+    reach = recording.period / span
+    linear = np.clip(share, -reach, 1.0 + reach)
+    beyond = ((share - linear) * span)[:, None]  # s
+    end_velocity = recording.velocities[np.where(share < 0, row, following)]
+    center = recording.centers
+    place = center[row] + linear[:, None] * (center[following] - center[row])
+    turn = wrap_angles(recording.headings[following] - recording.headings[row])
+    heading = wrap_angles(recording.headings[row] + linear * turn)
+    inside = np.clip(share, 0.0, 1.0)[:, None]
+    change = recording.velocities[following] - recording.velocities[row]
+    return Samples(
+        np.column_stack([place[:, :2] + beyond * end_velocity, heading]),
+        recording.velocities[row] + inside * change,
+        place[:, 2],
+    )
+
+
+def run_rows(recording: Annotations, runs: Runs) -> tuple[IntArray, IntArray]:
+    """(U,) first and last 20 Hz row of every run; a run between two rows has first > last."""
+    return _rows_between(recording.time[runs.first], recording.time[runs.last])
+
+
+def _rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
+    first = np.ceil(first_s / ROW_S - _EPS).astype(np.int64)
+    return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
+
+
+def run_token(recording: Annotations, runs: Runs, run: int) -> str:
+    """Track token of a run: the track id; a presence after a long hole is a track of its own."""
+    number = int(runs.number[run])
+    name = str(recording.track_ids[runs.track[run]])
+    return f"{name}_{number + 1}" if number else name
+
+
+def resample(
+    recording: Annotations,
+    runs: Runs,
+    *,
+    log_name: str,
+    city: str,
+    offset: FloatArray,
+    padding_s: float = 0.0,
+) -> Recording:
+    """A whole recording at 20 Hz in UTM, every run a track.
+
+    Args:
+        recording: The source.
+        runs: Its runs.
+        log_name: Name in the store.
+        city: Name of the map.
+        offset: (2,) UTM of the local origin [m].
+        padding_s: Rows to make up before the first frame, with constant velocity [s].
+    """
+    padding = rows_of(padding_s)
+    num_rows = int(np.floor(recording.duration / ROW_S + _EPS)) + 1 + padding
+    first, last = run_rows(recording, runs)
+    first = np.where(recording.frame[runs.first] == 0, -padding, first)
+    kept = np.flatnonzero(last >= first)
+    kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
+    lengths = last[kept] - first[kept] + 1
+    column = np.repeat(np.arange(len(kept)), lengths)
+    step = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    row = first[kept][column] + step
+    samples = sample_runs(recording, runs, kept[column], row * ROW_S)
+    kinds = recording.kinds[runs.track[kept]]
+    tracks = Tracks(
+        np.zeros((num_rows, len(kept)), np.bool_),
+        np.full((num_rows, len(kept), 3), np.nan),
+        np.full((num_rows, len(kept), 2), np.nan),
+        np.full((num_rows, len(kept), 2), np.nan),
+        kinds,
+        tuple(run_token(recording, runs, run) for run in kept.tolist()),
+    )
+    row = row + padding
+    tracks.valid[row, column] = True
+    tracks.poses[row, column] = samples.poses
+    tracks.poses[row, column, :2] += offset
+    moves = (kinds <= LAST_AGENT_KIND)[column]
+    tracks.velocities[row[moves], column[moves]] = samples.velocities[moves]
+    tracks.sizes[row, column] = recording.sizes[runs.track[kept]][column, :2]
+    times = recording.start_us + (np.arange(num_rows) - padding) * rows_us(1)
+    return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
+
+
+def rows_us(rows: int) -> int:
+    """Microseconds between rows."""
+    return rows * 50_000
+
+
+def ego_trace(
+    recording: Annotations,
+    runs: Runs,
+    run: int,
+    *,
+    log_name: str,
+    offset: FloatArray,
+    first_row: int,
+    last_row: int,
+    padding: int = 0,
+) -> EgoTrace:
+    """States of a run as the ego: the Pacifica's box centre on the recorded one.
+
+    Args:
+        recording: The source.
+        runs: Its runs.
+        run: Which one.
+        log_name: Name of the recording in the store.
+        offset: (2,) UTM of the local origin [m].
+        first_row: First row that is wanted.
+        last_row: One past the last row that is wanted.
+        padding: Rows made up before the first frame; row numbers count from there.
+    """
+    ends = recording.time[[runs.first[run], runs.last[run]]]
+    begin, end = _rows_between(ends[:1], ends[1:])
+    low = min(int(begin[0]) + padding, first_row)
+    high = max(int(end[0]) + 1 + padding, last_row)
+    rows = np.arange(low, high)
+    samples = sample_runs(
+        recording,
+        runs,
+        np.full(len(rows), run, np.int64),
+        (rows - padding).astype(np.float64) * ROW_S,
+    )
+    states = ego_states(samples.poses, samples.velocities)
+    states[:, :2] += offset
+    kept = np.ascontiguousarray(states[first_row - low : last_row - low])
+    return EgoTrace(log_name, run_token(recording, runs, run), first_row, kept)
+
+
+def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:
+    """Ego states from box centres at 20 Hz.
+
+    Args:
+        centers: (R, 3) box centre x [m], y [m], heading [rad].
+        velocities: (R, 2) of the box centre in the map frame [m/s].
+
+    Returns:
+        (R, 11) states. Steering and yaw rates stay 0: nuPlan reads none from a log
+        (nuplan-formats.md §2), so that an exported scenario is the same one.
+    """
+    states = np.zeros((len(centers), state.NUM_STATE))
+    states[:, :3] = state.rear_poses(centers)
+    cos, sin = np.cos(centers[:, 2]), np.sin(centers[:, 2])
+    yaw_rate = slope(np.unwrap(centers[:, 2]), ROW_S)
+    states[:, state.VX] = velocities[:, 0] * cos + velocities[:, 1] * sin
+    sideways = velocities[:, 1] * cos - velocities[:, 0] * sin
+    states[:, state.VY] = sideways - yaw_rate * PACIFICA.rear_axle_to_center
+    states[:, state.AX] = slope(states[:, state.VX], ROW_S)
+    states[:, state.AY] = states[:, state.VX] * yaw_rate
+    return states
+
+
+def slope(values: FloatArray, dt: float) -> FloatArray:
+    """Savitzky-Golay first derivative (second order, 11 samples; the ends by the last fit).
+
+    Args:
+        values: (R,) samples.
+        dt: Time between them [s].
+    """
+    half = min(_HALF_WINDOW, (len(values) - 1) // 2)
+    if half == 0:
+        return np.gradient(values, dt) if len(values) > 1 else np.zeros(len(values))
+    offsets = np.arange(-half, half + 1.0)
+    weights = offsets / (offsets @ offsets)
+    out = np.empty(len(values))
+    out[half : len(values) - half] = np.convolve(values, weights[::-1], mode="valid")
+    fit = np.linalg.pinv(np.vander(offsets, min(3, len(offsets)), increasing=True))
+    for part, where in (
+        (values[: 2 * half + 1], slice(0, half)),
+        (values[-2 * half - 1 :], slice(len(values) - half, len(values))),
+    ):
+        _, rate, bend = fit @ part
+        at = offsets[:half] if where.start == 0 else offsets[half + 1 :]
+        out[where] = rate + 2.0 * bend * at
+    return out / dt

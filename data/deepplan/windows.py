@@ -1,0 +1,326 @@
+"""Windows of a recording, and which tracks may serve as ego (deepplan-conversion.md §3, §4).
+
+A window is a span of time, whatever the frame rate. Each track seen in it gets a verdict: `ego`, or
+the first rule it fails: category, presence, speed, overlap (later stages add lane and route).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.data.dsc3d.recording import Annotations
+from shiftsim.errors import ConfigError
+from shiftsim.geometry.boxes import box_corners
+from shiftsim.runs.config import one_of
+
+ROW_S = 0.05  # s between rows of a converted recording
+EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
+LANE, ROUTE = "lane", "route"
+_EPS = 1e-9  # s
+
+
+@dataclass(frozen=True)
+class ConversionConfig:
+    """Every threshold of the conversion, with the names of deepplan-conversion.md.
+
+    Attributes:
+        window_s: Length of a window [s].
+        overlap_s: Overlap of consecutive windows [s].
+        history_s: Part of a window before iteration 0 [s].
+        padding_s: History made up before the first frame of a recording, by constant velocity, for
+            recordings too short to spare any [s].
+        ego_categories: Categories that may serve as ego.
+        min_peak_speed: An ego must be faster than this at some frame [m/s].
+        max_overlap: Boxes may share this much area [m^2].
+        max_hole_s: Longest hole of a track that is filled [s].
+        max_lane_distance: Farthest lane an ego may start from [m].
+        max_lane_angle: Largest angle between the ego and that lane at the start [rad].
+        route_extension: How far the route reaches beyond the last ego position [m].
+        route_extension_blocks: How many blocks that may add.
+        min_drivable_share: Share of moving vehicles that must be on drivable area.
+        max_per_window: At most so many egos per window, in the order of track ids; None for all.
+        country: Whose default speed limits hold where the map has none.
+        category_map: Known category by category of the data set.
+    """
+
+    window_s: float = 18.0
+    overlap_s: float = 6.0
+    history_s: float = 3.0
+    padding_s: float = 0.0
+    ego_categories: tuple[str, ...] = ("car", "van", "pickup")
+    min_peak_speed: float = 1.0
+    max_overlap: float = 0.01
+    max_hole_s: float = 0.5
+    max_lane_distance: float = 3.0
+    max_lane_angle: float = np.pi / 2
+    route_extension: float = 100.0
+    route_extension_blocks: int = 3
+    min_drivable_share: float = 0.95
+    max_per_window: int | None = None
+    country: str = "DE"
+    category_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            _check_type(item.name, getattr(self, item.name))
+        for name in ("window_s", "overlap_s", "history_s", "padding_s"):
+            value = getattr(self, name)
+            if not np.isfinite(value) or value < 0 or abs(rows_of(value) * ROW_S - value) > _EPS:
+                raise ConfigError(f"{name} = {value!r} is not a multiple of {ROW_S} s, 0 or more")
+        if self.overlap_s >= self.window_s:
+            raise ConfigError(f"overlap_s {self.overlap_s!r} must be below window_s")
+        if self.window_s - self.history_s < 0.3:
+            raise ConfigError(
+                f"window_s {self.window_s!r} leaves less than 0.3 s after history_s"
+                f" {self.history_s!r}"
+            )
+
+    @property
+    def is_short(self) -> bool:
+        """Whether scenarios are shorter than the benchmark's, so that scores do not compare."""
+        return self.window_s < 18.0 or self.history_s < 3.0
+
+
+def make_config(values: Mapping[str, Any]) -> ConversionConfig:
+    """Thresholds from plain values, such as those of a TOML file.
+
+    Raises:
+        ConfigError: A name is unknown, or a value is wrong.
+    """
+    for name in values:
+        one_of("setting", name, [item.name for item in fields(ConversionConfig)])
+    plain: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+    return ConversionConfig(**plain)
+
+
+def _check_type(name: str, value: Any) -> None:
+    """Types are checked strictly: TOML and Python callers get the same message."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if name == "ego_categories":
+        good, wanted = isinstance(value, tuple) and all(map(_is_text, value)), "a list of names"
+    elif name == "category_map":
+        good = isinstance(value, dict) and all(map(_is_text, [*value, *value.values()]))
+        wanted = "a table of names"
+    elif name == "country":
+        good, wanted = _is_text(value), "a name"
+    elif name == "route_extension_blocks":
+        good, wanted = whole and value >= 0, "an integer from 0 on"
+    elif name == "max_per_window":
+        good, wanted = value is None or (whole and value > 0), "an integer from 1 on"
+    else:
+        number = whole or isinstance(value, float)
+        good, wanted = number and 0 <= value < np.inf, "a number from 0 on"
+    if not good:
+        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Stretches of rows in which a track is present without a hole that is too long. U runs.
+
+    Attributes:
+        first: (U,) first row.
+        last: (U,) last row.
+        track: (U,) track.
+        number: (U,) how many runs of the same track came before.
+        row_key: (A,) run of a row times the number of frames, plus its frame: increasing.
+    """
+
+    first: IntArray
+    last: IntArray
+    track: IntArray
+    number: IntArray
+    row_key: IntArray
+
+
+@dataclass(frozen=True)
+class WindowVerdicts:
+    """What became of every track seen in one window. n tracks.
+
+    Attributes:
+        start_s: Start of the window since the first frame [s].
+        tracks: (n,) tracks, ascending.
+        runs: (n,) run that covers the whole window, -1 where none does.
+        verdicts: n names of a rule, or `ego`.
+        partners: (n,) track whose box it overlapped, -1 where the verdict is another one.
+    """
+
+    start_s: float
+    tracks: IntArray
+    runs: IntArray
+    verdicts: tuple[str, ...]
+    partners: IntArray
+
+
+def rows_of(seconds: float) -> int:
+    """How many 20 Hz rows a time span has."""
+    return round(seconds / ROW_S)
+
+
+def find_runs(recording: Annotations, max_hole_s: float) -> Runs:
+    """Split the tracks where they are absent for longer than `max_hole_s`."""
+    time = recording.time
+    gap = np.r_[np.inf, np.diff(time)]
+    new_track = np.r_[True, np.diff(recording.track) != 0]
+    starts = new_track | (gap > max_hole_s + recording.period + 1e-6)
+    first = np.flatnonzero(starts)
+    last = np.r_[first[1:] - 1, len(time) - 1]
+    track = recording.track[first]
+    first_run = np.searchsorted(track, track)
+    row_key = (np.cumsum(starts) - 1) * len(recording.clock) + recording.frame
+    return Runs(first, last, track, np.arange(len(first)) - first_run, row_key)
+
+
+def window_starts(duration: float, config: ConversionConfig) -> FloatArray:
+    """Start of every window that fits into a recording [s]."""
+    stride = config.window_s - config.overlap_s
+    count = int(np.floor((duration - config.window_s) / stride + _EPS)) + 1
+    return np.arange(max(count, 0), dtype=np.float64) * stride
+
+
+def judge_windows(
+    recording: Annotations, runs: Runs, config: ConversionConfig
+) -> list[WindowVerdicts]:
+    """The verdict on every track in every window, rules of category to overlap."""
+    allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
+    speed = _median_of_three(
+        np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]), recording.track
+    )
+    partner = overlap_partners(recording, allowed, config.max_overlap)
+    return [
+        _judge(float(start), recording, runs, config, allowed, speed, partner)
+        for start in window_starts(recording.duration, config)
+    ]
+
+
+def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap: float) -> IntArray:
+    """(A,) a track whose box overlaps the row's at its frame, -1 where none does.
+
+    Args:
+        recording: The recording.
+        candidates: (N,) tracks whose rows are looked at; the partner may be any track.
+        max_overlap: Area that boxes may share [m^2].
+    """
+    by_frame = np.lexsort((recording.track, recording.frame))
+    frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
+    boxes = np.column_stack(
+        [
+            recording.centers[:, :2],
+            recording.angles[:, 0],
+            recording.sizes[recording.track, :2],
+        ]
+    )[by_frame]
+    asked = candidates[recording.track[by_frame]]
+    found = _first_overlaps(np.ascontiguousarray(boxes), frame_ptr, asked, max_overlap)
+    out = np.full(len(by_frame), -1, np.int64)
+    out[by_frame] = np.where(found >= 0, recording.track[by_frame[found]], -1)
+    return out
+
+
+def _judge(
+    start: float,
+    recording: Annotations,
+    runs: Runs,
+    config: ConversionConfig,
+    allowed: BoolArray,
+    speed: FloatArray,
+    partner: IntArray,
+) -> WindowVerdicts:
+    num_tracks = len(recording.track_ids)
+    first = int(np.searchsorted(recording.clock, start - _EPS))
+    last = int(np.searchsorted(recording.clock, start + config.window_s - _EPS)) - 1
+    rows = np.flatnonzero((recording.frame >= first) & (recording.frame <= last))
+    tracks = np.unique(recording.track[rows])
+    peak = np.zeros(num_tracks)
+    np.maximum.at(peak, recording.track[rows], speed[rows])
+    covering = (recording.frame[runs.first] <= first) & (recording.frame[runs.last] >= last)
+    run = np.full(num_tracks, -1, np.int64)
+    run[runs.track[covering]] = np.flatnonzero(covering)
+    hit = np.full(num_tracks, -1, np.int64)
+    touching = rows[partner[rows] >= 0][::-1]  # the earliest row of a track is written last
+    hit[recording.track[touching]] = partner[touching]
+    verdict = np.select(
+        [~allowed, run < 0, peak <= config.min_peak_speed, hit >= 0],
+        [CATEGORY, PRESENCE, SPEED, OVERLAP],
+        EGO,
+    )
+    return WindowVerdicts(
+        start,
+        tracks,
+        run[tracks],
+        tuple(verdict[tracks].tolist()),
+        np.where(verdict[tracks] == OVERLAP, hit[tracks], -1),
+    )
+
+
+def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:
+    """Median of each row and its neighbours of the same track; the ends keep their value."""
+    same_before = np.r_[False, track[1:] == track[:-1]]
+    same_after = np.r_[track[1:] == track[:-1], False]
+    inside = same_before & same_after
+    stack = np.stack([np.roll(values, 1), values, np.roll(values, -1)])
+    return np.where(inside, np.median(stack, axis=0), values)
+
+
+@kernel
+def _first_overlaps(
+    boxes: FloatArray, frame_ptr: IntArray, asked: BoolArray, max_overlap: float
+) -> IntArray:
+    """(A,) first row of the same frame whose box shares more than `max_overlap` with the row's."""
+    out = np.full(len(boxes), -1, np.int64)
+    radius = 0.5 * np.hypot(boxes[:, 3], boxes[:, 4])
+    ring, other = np.empty((4, 2)), np.empty((4, 2))
+    for frame in range(len(frame_ptr) - 1):
+        for i in range(frame_ptr[frame], frame_ptr[frame + 1]):
+            if not asked[i]:
+                continue
+            for j in range(frame_ptr[frame], frame_ptr[frame + 1]):
+                dx, dy = boxes[j, 0] - boxes[i, 0], boxes[j, 1] - boxes[i, 1]
+                reach = radius[i] + radius[j]
+                if j == i or dx * dx + dy * dy > reach * reach:
+                    continue
+                box_corners(0.0, 0.0, boxes[i, 2], boxes[i, 3], boxes[i, 4], ring)
+                box_corners(dx, dy, boxes[j, 2], boxes[j, 3], boxes[j, 4], other)
+                if shared_area(ring, other) > max_overlap:
+                    out[i] = j
+                    break
+    return out
+
+
+@kernel
+def shared_area(a: FloatArray, b: FloatArray) -> float:
+    """Area of the intersection of two convex rings (V, 2), both counter-clockwise [m^2]."""
+    ring = np.empty((len(a) + len(b), 2))
+    clipped = np.empty((len(a) + len(b), 2))
+    count = len(a)
+    ring[:count] = a
+    for edge in range(len(b)):
+        x, y = b[edge]
+        nx, ny = y - b[(edge + 1) % len(b), 1], b[(edge + 1) % len(b), 0] - x  # to the left
+        kept = 0
+        for index in range(count):
+            px, py = ring[index]
+            qx, qy = ring[(index + 1) % count]
+            p, q = (px - x) * nx + (py - y) * ny, (qx - x) * nx + (qy - y) * ny
+            if p >= 0.0:
+                clipped[kept, 0], clipped[kept, 1] = px, py
+                kept += 1
+            if p * q < 0.0:
+                share = p / (p - q)
+                clipped[kept, 0], clipped[kept, 1] = px + share * (qx - px), py + share * (qy - py)
+                kept += 1
+        ring, clipped, count = clipped, ring, kept
+        if count < 3:
+            return 0.0
+    area = 0.0
+    for index in range(count):
+        following = (index + 1) % count
+        area += ring[index, 0] * ring[following, 1] - ring[following, 0] * ring[index, 1]
+    return 0.5 * area

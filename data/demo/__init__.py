@@ -1,0 +1,1 @@
+"""Generated towns and their recordings."""

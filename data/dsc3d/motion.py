@@ -1,0 +1,113 @@
+"""Motion of annotated boxes: angles from rotation vectors, and velocities and headings to believe.
+
+Rows are sorted by track, then time, as in `dsc3d.Annotations`.
+"""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.geometry.frames import wrap_angles
+
+_MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
+_MAX_SPEED = 200.0  # m/s along an axis
+_STANDSTILL = 0.3  # m/s
+_MAX_STANDING_TURN = 0.5  # rad/s
+_EPS = 1e-9  # s
+
+
+def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Yaw, pitch and roll of rotation vectors, and where they turn the z axis.
+
+    Args:
+        rotation: (A, 3) axis times angle, object to local frame [rad].
+
+    Returns:
+        (A, 3) yaw, pitch, roll [rad], and (A, 3) unit vector along the height of the object.
+    """
+    angle = np.linalg.norm(rotation, axis=1)
+    x, y, z = rotation.T
+    sine = np.sinc(angle / np.pi)  # sin(a) / a
+    rest = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos(a)) / a^2
+    cos = np.cos(angle)
+    yaw = np.arctan2(z * sine + x * y * rest, cos + x * x * rest)
+    pitch = -np.arcsin(np.clip(x * z * rest - y * sine, -1.0, 1.0))
+    up = np.stack([y * sine + x * z * rest, y * z * rest - x * sine, cos + z * z * rest], axis=1)
+    roll = np.arctan2(x * sine + y * z * rest, up[:, 2])
+    return np.stack([yaw, pitch, roll], axis=1), up
+
+
+def believed_velocities(
+    stored: FloatArray | None,
+    xy: FloatArray,
+    time: FloatArray,
+    track: IntArray,
+    warnings: dict[str, int],
+) -> FloatArray:
+    """Stored velocities of the tracks where they fit the positions, else central differences.
+
+    Args:
+        stored: (A, 2) as recorded, None where the file has none [m/s].
+        xy: (A, 2) positions [m].
+        time: (A,) [s].
+        track: (A,) track of the row.
+        warnings: Counts, added to.
+    """
+    derived = _central_differences(xy, time, track)
+    if stored is None:
+        count(warnings, "tracks without stored velocity (derived)", int(track[-1]) + 1)
+        return derived
+    error = np.hypot(*(derived - stored).T)
+    first = np.searchsorted(track, np.arange(track[-1] + 1))
+    last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
+    refused = track_medians(error, track) >= _MAX_VELOCITY_ERROR
+    refused &= last > first  # a single row has nothing to compare with
+    refused[track[np.abs(stored).max(axis=1) > _MAX_SPEED]] = True
+    count(warnings, "tracks whose stored velocity does not fit (derived)", int(refused.sum()))
+    return np.where(refused[track][:, None], derived, stored)
+
+
+def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
+    """(N,) median of the rows of each track; values and track: (A,), sorted by track."""
+    ranked = values[np.lexsort((values, track))]
+    first = np.searchsorted(track, np.arange(track[-1] + 1))
+    last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
+    return 0.5 * (ranked[(first + last) // 2] + ranked[(first + last + 1) // 2])
+
+
+def _central_differences(xy: FloatArray, time: FloatArray, track: IntArray) -> FloatArray:
+    """(A, 2) difference of the neighbouring rows of the same track, one-sided at its ends."""
+    index = np.arange(len(track))
+    before = np.where(np.r_[False, track[1:] == track[:-1]], index - 1, index)
+    after = np.where(np.r_[track[1:] == track[:-1], False], index + 1, index)
+    span = np.maximum(time[after] - time[before], _EPS)
+    return (xy[after] - xy[before]) / span[:, None]
+
+
+def held_headings(
+    yaw: FloatArray,
+    velocities: FloatArray,
+    time: FloatArray,
+    track: IntArray,
+    warnings: dict[str, int],
+) -> FloatArray:
+    """Headings, where a standing object's spins: the one before, until it moves again."""
+    standing = np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDSTILL
+    same = np.r_[False, track[1:] == track[:-1]]
+    turn = np.r_[0.0, np.abs(wrap_angles(np.diff(yaw)))]
+    fast = turn > _MAX_STANDING_TURN * np.r_[np.inf, np.diff(time)]
+    spins = standing & same & fast
+    starts = ~(standing & same & np.r_[False, standing[:-1]]) | ~standing
+    stretch = np.cumsum(starts)  # rows of one standstill share a number
+    index = np.arange(len(yaw))
+    first_spin = np.full(stretch[-1] + 1, len(yaw), np.int64)
+    np.minimum.at(first_spin, stretch[spins], index[spins])
+    held = standing & (index >= first_spin[stretch])
+    count(warnings, "rows with a heading that spins at standstill (held)", int(held.sum()))
+    source = np.where(held, np.maximum(first_spin[stretch] - 1, 0), index)
+    return yaw[source]
+
+
+def count(warnings: dict[str, int], what: str, number: int) -> None:
+    """Add to a count, unless there is nothing to add."""
+    if number:
+        warnings[what] = warnings.get(what, 0) + number

@@ -1,0 +1,220 @@
+"""nuPlan logs and maps -> a scenario store."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter
+from shiftsim.data.nuplan.log import Log, open_log
+from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.data.nuplan.scenarios import EGO, cut_window, find_maps, load_map, offered, read_span
+from shiftsim.data.recording import Window
+from shiftsim.data.store.reading import StoreWriter
+from shiftsim.errors import ConversionError, DataError
+from shiftsim.world.map import VectorMap
+
+_LOG = logging.getLogger(__name__)
+_MAX_ROWS = 1800  # of one stored part of a log, 90 s: dense tracks of an hour would not fit
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass
+class ConversionReport:
+    """What a conversion did.
+
+    Attributes:
+        converted: Tokens of the scenarios written.
+        unchanged: Tokens that were in the store already, cut in the same way.
+        failed: Reason by token, or by log where the whole log failed.
+        flaws: Counts of what the source got wrong and nuPlan tolerates, by `where: what`.
+    """
+
+    converted: list[str] = field(default_factory=list)
+    unchanged: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    flaws: Counter[str] = field(default_factory=Counter)
+
+
+def convert_nuplan(
+    logs: Path,
+    maps: Path,
+    store: Path,
+    *,
+    tokens: Iterable[str] | None = None,
+    types: Iterable[str] | None = None,
+    filter_file: Path | None = None,
+    mapping: Mapping | None = None,
+    progress: Progress | None = None,
+) -> ConversionReport:
+    """Convert scenarios of nuPlan logs into a store, or add them to one.
+
+    Args:
+        logs: Folder that holds the logs (.db) at any depth, or one log.
+        maps: Folder with `nuplan-maps-v1.0.json` and the maps.
+        store: Folder of the store.
+        tokens: Only these scenarios.
+        types: Only these scenario types.
+        filter_file: nuPlan's scenario-filter YAML, or a text file with one token per line.
+        mapping: Duration [s], offset [s] and subsample ratio of all; nuPlan's by type where None.
+        progress: Called with logs done, number of logs, and the log's name.
+
+    Returns:
+        What was converted, and what failed and why. One broken scenario stops no other.
+
+    Raises:
+        DataError: There are no logs or no maps, or the store cannot be written.
+        ConfigError: The filter asks for something that is not supported.
+    """
+    chosen = _choice(tokens, types, filter_file)
+    files = _log_files(Path(logs), chosen)
+    known_maps = find_maps(Path(maps))
+    report = ConversionReport()
+    roads: dict[str, VectorMap] = {}
+    found: set[str] = set()
+    with StoreWriter(store) as writer:
+        for done, path in enumerate(files):
+            if progress is not None:
+                progress(done, len(files), path.stem)
+            try:
+                with open_log(path) as log:
+                    found |= _convert_log(log, chosen, mapping, known_maps, roads, writer, report)
+            except DataError as error:
+                report.failed[path.stem] = _reason(error)
+    for token in sorted((chosen.tokens or frozenset()) - found):
+        names = ", ".join(path.name for path in files[:5]) + (", …" if len(files) > 5 else "")
+        report.failed[token] = f"not offered by any of {len(files)} logs searched ({names})"
+    for flaw, count in report.flaws.items():
+        _LOG.warning("%s (%d)", flaw, count)
+    return report
+
+
+def _choice(
+    tokens: Iterable[str] | None, types: Iterable[str] | None, filter_file: Path | None
+) -> ScenarioFilter:
+    chosen = ScenarioFilter() if filter_file is None else read_filter(Path(filter_file))
+    if tokens is not None:
+        given = frozenset(tokens)
+        chosen = replace(chosen, tokens=given if chosen.tokens is None else given & chosen.tokens)
+    if types is not None:
+        named = frozenset(types)
+        chosen = replace(chosen, types=named if chosen.types is None else named & chosen.types)
+    return chosen
+
+
+def _log_files(logs: Path, chosen: ScenarioFilter) -> list[Path]:
+    files = [logs] if logs.is_file() else sorted(logs.rglob("*.db"))
+    if chosen.logs is not None:
+        files = [path for path in files if path.stem in chosen.logs]
+    if not files:
+        raise DataError(f"{logs}: there is no log (.db)", hint="give the folder with the logs")
+    return files
+
+
+def _reason(error: DataError) -> str:
+    return f"{error} ({error.hint})" if error.hint else str(error)
+
+
+def _convert_log(
+    log: Log,
+    chosen: ScenarioFilter,
+    mapping: Mapping | None,
+    known_maps: dict[str, Path],
+    roads: dict[str, VectorMap],
+    writer: StoreWriter,
+    report: ConversionReport,
+) -> set[str]:
+    """Convert the chosen scenarios of one log; returns the tokens found."""
+    entries = offered(
+        log,
+        tokens=chosen.tokens,
+        types=chosen.types,
+        remove_invalid_goals=chosen.remove_invalid_goals,
+    )
+    if chosen.maps is not None and log.map_name not in chosen.maps:
+        entries = []
+    windows: list[Window] = []
+    for entry in entries:
+        try:
+            window = cut_window(log, entry.token, mapping)
+        except ConversionError as error:
+            report.failed[entry.token] = _reason(error)
+            continue
+        if _is_stored(writer, window):
+            report.unchanged.append(window.token)
+        else:
+            windows.append(window)
+    if windows:
+        road = _road(log.map_name, known_maps, roads, writer, report)
+        for group in _parts(windows):
+            _write_part(log, group, road, writer, report)
+    return {entry.token for entry in entries}
+
+
+def _is_stored(writer: StoreWriter, window: Window) -> bool:
+    if window.token not in writer.tokens:
+        return False
+    stored = writer.window(window.token)
+    return stored.mapping == window.mapping and stored.scenario_type == window.scenario_type
+
+
+def _road(
+    name: str,
+    known_maps: dict[str, Path],
+    roads: dict[str, VectorMap],
+    writer: StoreWriter,
+    report: ConversionReport,
+) -> VectorMap:
+    if name not in roads:
+        roads[name] = load_map(known_maps, name)
+        writer.add_map(roads[name])
+        report.flaws.update({f"map {name}: {w}": n for w, n in roads[name].flaws.items()})
+    return roads[name]
+
+
+def _parts(windows: Sequence[Window]) -> list[list[Window]]:
+    """Windows that overlap in time share a part of the log, up to a length."""
+    parts: list[list[Window]] = []
+    for window in sorted(windows, key=lambda w: (w.first_row, w.token)):
+        last = parts[-1] if parts else []
+        overlaps = any(window.first_row < other.last_row for other in last)
+        if overlaps and window.last_row - last[0].first_row <= _MAX_ROWS:
+            last.append(window)
+        else:
+            parts.append([window])
+    return parts
+
+
+def _write_part(
+    log: Log, windows: list[Window], road: VectorMap, writer: StoreWriter, report: ConversionReport
+) -> None:
+    first, last = windows[0].first_row, max(window.last_row for window in windows)
+    name = f"{log.name}@{log.time_us[first]}-{log.time_us[last - 1]}"
+    flaws: dict[str, int] = {}
+    try:
+        recording, ego = read_span(log, name, first, last, flaws)
+    except ConversionError as error:
+        if len(windows) == 1:
+            report.failed[windows[0].token] = _reason(error)
+        else:  # only the scenarios that hold the broken rows fail
+            for window in windows:
+                _write_part(log, [window], road, writer, report)
+        return
+    writer.add_recording(recording)
+    writer.add_ego(ego)
+    report.flaws.update({f"log {log.name}: {what}": count for what, count in flaws.items()})
+    for window in windows:
+        unknown = sum(block not in road.blocks.index for block in window.route)
+        report.flaws.update({f"log {log.name}: unknown route ids": unknown} if unknown else {})
+        writer.add_window(
+            replace(
+                window,
+                log_name=name,
+                ego=EGO,
+                first_row=window.first_row - first,
+                last_row=window.last_row - first,
+                iteration_rows=window.iteration_rows - first,
+            )
+        )
+        report.converted.append(window.token)

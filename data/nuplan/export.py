@@ -1,0 +1,145 @@
+"""A scenario store -> nuPlan's own files, one log per scenario (nuplan-formats.md §6).
+
+OUT/nuplan-v1.1/splits/<store>/<log>.db
+OUT/maps/nuplan-maps-v1.0.json, OUT/maps/<map>/<version>/map.gpkg
+OUT/tokens.txt                      tokens of the scenarios, one per line
+"""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
+from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
+from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.data.recording import Window
+from shiftsim.data.store.files import write_json
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.errors import ConversionError
+
+MAP_VERSION = "1.0.0"
+# Maps that nuPlan's own code opens whatever map is asked for, nuplan-formats.md §1.
+ALWAYS_OPENED = (
+    "sg-one-north",
+    "us-ma-boston",
+    "us-nv-las-vegas-strip",
+    "us-pa-pittsburgh-hazelwood",
+)
+_INDEX = "nuplan-maps-v1.0.json"
+_IDENTITY = [[float(i == j) for j in range(4)] for i in range(4)]
+_RASTER = {"shape": [1, 1], "transform_matrix": _IDENTITY}
+
+
+@dataclass
+class ExportReport:
+    """What an export wrote.
+
+    Attributes:
+        logs: Folder of the logs.
+        maps: Folder of the maps.
+        token_file: File that lists the tokens.
+        tokens: Token in nuPlan's files by scenario; the same unless it had another form.
+        cities: Names of the maps written.
+        mappings: Number of scenarios by type and mapping (duration, offset, ratio).
+        missing_maps: Maps that nuPlan's own code opens and that are not in the folder.
+    """
+
+    logs: Path
+    maps: Path
+    token_file: Path
+    tokens: dict[str, str] = field(default_factory=dict)
+    cities: list[str] = field(default_factory=list)
+    mappings: Counter[tuple[str, Mapping]] = field(default_factory=Counter)
+    missing_maps: list[str] = field(default_factory=list)
+
+    @property
+    def renamed(self) -> dict[str, str]:
+        """Scenarios whose token had to be replaced, with the new one."""
+        return {old: new for old, new in self.tokens.items() if old != new}
+
+
+def export_nuplan(
+    store: ScenarioStore,
+    out: Path,
+    *,
+    tokens: Sequence[str] | None = None,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> ExportReport:
+    """Write scenarios and their maps in nuPlan's formats. The same input gives the same bytes.
+
+    Args:
+        store: The store.
+        out: Folder that is written to; maps that are there already stay listed.
+        tokens: Only these scenarios; all where None.
+        progress: Called with scenarios done, scenarios in all, and the log's name.
+
+    Raises:
+        DataError: The store is damaged, or holds something that the formats have no place for.
+    """
+    chosen = store.tokens if tokens is None else tuple(tokens)
+    windows = {token: store.window(token) for token in chosen}
+    names = _log_names(store, windows)
+    report = ExportReport(
+        logs=out / "nuplan-v1.1" / "splits" / _plain(store.path.resolve().name),
+        maps=out / "maps",
+        token_file=out / "tokens.txt",
+    )
+    cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
+    report.cities = sorted({cities[token] for token in chosen})
+    _write_maps(store, report)
+    for done, token in enumerate(chosen):
+        progress(done, len(chosen), names[token])
+        scenario = store.read(token)
+        path = report.logs / f"{names[token]}.db"
+        mapping = write_nuplan_log(path, scenario, epsg=epsg_of(scenario.map))
+        report.tokens[token] = log_token(token).hex()
+        report.mappings[scenario.scenario_type, mapping] += 1
+    progress(len(chosen), len(chosen), "")
+    lines = sorted(report.tokens.values())
+    report.token_file.write_text("\n".join(lines) + "\n", "utf-8")
+    return report
+
+
+def _log_names(store: ScenarioStore, windows: dict[str, Window]) -> dict[str, str]:
+    """`<map>_<recording>_<ego track>_<first frame>`, with the token where that is not unique."""
+    cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
+    names = {}
+    for token, window in windows.items():
+        recording = window.log_name.removeprefix(f"{cities[token]}_")
+        parts = (cities[token], recording, window.ego, str(window.first_row))
+        names[token] = "_".join(map(_plain, parts))
+    count = Counter(names.values())
+    return {t: name if count[name] == 1 else f"{name}_{_plain(t)}" for t, name in names.items()}
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._+-]+", "-", name)
+
+
+def _write_maps(store: ScenarioStore, report: ExportReport) -> None:
+    index = report.maps / _INDEX
+    try:
+        listed = json.loads(index.read_text("utf-8")) if index.is_file() else {}
+        versions = {name: entry["version"] for name, entry in listed.items()}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ConversionError(
+            f"{index}: not an index of maps: {error!r}", hint="choose another folder"
+        ) from error
+    for city in report.cities:
+        if versions.get(city, MAP_VERSION) != MAP_VERSION:
+            raise ConversionError(
+                f"{index}: lists another map {city!r}, version {versions[city]!r}",
+                hint="choose another folder; maps of one name cannot be told apart",
+            )
+        if city in (".", "..") or "/" in city:
+            raise ConversionError(f"map {city!r} cannot be a folder", hint="rename the site")
+        write_nuplan_map(
+            report.maps / city / MAP_VERSION / "map.gpkg", store.map(city), MAP_VERSION
+        )
+        layers = {"drivable_area": _RASTER, "Intensity": _RASTER}
+        listed[city] = {"version": MAP_VERSION, "layers": layers}
+    write_json(index, listed)
+    report.missing_maps = [name for name in ALWAYS_OPENED if name not in listed]

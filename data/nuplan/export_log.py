@@ -1,0 +1,293 @@
+"""Scenario -> one nuPlan log (.db) of its own (nuplan-formats.md §2, §6)."""
+
+import hashlib
+import pickle
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from shiftsim.arrays import IntArray
+from shiftsim.data.nuplan.geopackage_writer import Value, write_database
+from shiftsim.data.nuplan.log import LIDAR_CHANNEL
+from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.errors import ConversionError
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind, LightStatus
+
+Rows: TypeAlias = list[tuple[Value, ...]]
+
+UNKNOWN_TYPE = "unknown"
+_TOKEN = re.compile(r"[0-9a-f]{16}\Z")
+# Heights are not kept in a store and are not used in the plane; typical ones are written.
+_HEIGHTS = {
+    AgentKind.VEHICLE: 1.6,
+    AgentKind.PEDESTRIAN: 1.75,
+    AgentKind.BICYCLE: 1.7,
+    AgentKind.TRAFFIC_CONE: 0.7,
+    AgentKind.BARRIER: 1.0,
+    AgentKind.CZONE_SIGN: 1.2,
+    AgentKind.GENERIC_OBJECT: 1.0,
+}  # m
+_STATUS = {
+    LightStatus.GREEN: "green",
+    LightStatus.YELLOW: "yellow",
+    LightStatus.RED: "red",
+    LightStatus.UNKNOWN: "unknown",
+}
+_SCENES = 5  # nuPlan ignores the first two and the last two, nuplan-formats.md §2
+_PICKLE = 2  # protocol
+
+_TABLES = {
+    "log": "token BLOB NOT NULL, vehicle_name VARCHAR(64), date VARCHAR(64), timestamp INTEGER, "
+    "logfile VARCHAR(64), location VARCHAR(64), map_version VARCHAR(64), PRIMARY KEY (token)",
+    "lidar": "token BLOB NOT NULL, log_token BLOB NOT NULL, channel VARCHAR(64), "
+    "model VARCHAR(64), translation BLOB, rotation BLOB, PRIMARY KEY (token)",
+    "camera": "token BLOB NOT NULL, log_token BLOB NOT NULL, channel VARCHAR(64), "
+    "model VARCHAR(64), translation BLOB, rotation BLOB, intrinsic BLOB, distortion BLOB, "
+    "width INTEGER, height INTEGER, PRIMARY KEY (token)",
+    "image": "token BLOB NOT NULL, next_token BLOB, prev_token BLOB, "
+    "ego_pose_token BLOB NOT NULL, camera_token BLOB NOT NULL, filename_jpg VARCHAR(128), "
+    "timestamp INTEGER, PRIMARY KEY (token)",
+    "ego_pose": "token BLOB NOT NULL, timestamp INTEGER, x FLOAT, y FLOAT, z FLOAT, qw FLOAT, "
+    "qx FLOAT, qy FLOAT, qz FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, acceleration_x FLOAT, "
+    "acceleration_y FLOAT, acceleration_z FLOAT, angular_rate_x FLOAT, angular_rate_y FLOAT, "
+    "angular_rate_z FLOAT, epsg INTEGER, log_token BLOB NOT NULL, PRIMARY KEY (token)",
+    "scene": "token BLOB NOT NULL, log_token BLOB NOT NULL, name TEXT, goal_ego_pose_token BLOB, "
+    "roadblock_ids TEXT, PRIMARY KEY (token)",
+    "lidar_pc": "token BLOB NOT NULL, next_token BLOB, prev_token BLOB, "
+    "ego_pose_token BLOB NOT NULL, lidar_token BLOB NOT NULL, scene_token BLOB NOT NULL, "
+    "filename VARCHAR(128), timestamp INTEGER, PRIMARY KEY (token)",
+    "category": "token BLOB NOT NULL, name VARCHAR(64), description TEXT, PRIMARY KEY (token)",
+    "track": "token BLOB NOT NULL, category_token BLOB NOT NULL, width FLOAT, length FLOAT, "
+    "height FLOAT, PRIMARY KEY (token)",
+    "lidar_box": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, track_token BLOB NOT NULL, "
+    "next_token BLOB, prev_token BLOB, x FLOAT, y FLOAT, z FLOAT, width FLOAT, length FLOAT, "
+    "height FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, yaw FLOAT, confidence FLOAT, "
+    "PRIMARY KEY (token)",
+    "scenario_tag": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, type TEXT, "
+    "agent_track_token BLOB, PRIMARY KEY (token)",
+    "traffic_light_status": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, "
+    "lane_connector_id INTEGER, status VARCHAR(8), PRIMARY KEY (token)",
+}
+_INDEXES = tuple(
+    f"CREATE INDEX {table}_{column}_idx ON {table} ({column})"
+    for table, column in (
+        ("lidar_pc", "timestamp"),
+        ("lidar_box", "lidar_pc_token"),
+        ("scenario_tag", "lidar_pc_token"),
+        ("traffic_light_status", "lidar_pc_token"),
+    )
+)
+
+
+def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
+    """Row that carries token and tag, and the mapping that cuts the scenario out again from it.
+
+    The mapping is the scenario's own, unless that does not give its iterations.
+
+    Raises:
+        ConversionError: Its iterations are not evenly spaced rows.
+    """
+    time, rows = scenario.time_us, scenario.iteration_rows
+    span = float(time[rows[-1]] - time[rows[0]]) * 1e-6
+    for mapping in (scenario.mapping, (span, 0.0, 1.0 / scenario.row_step)):
+        starts = time + int(mapping[1] * 1e6)
+        fitting = np.flatnonzero(np.searchsorted(time, starts) == rows[0])
+        for anchor in fitting[::-1].tolist():  # several where the log starts too late
+            if np.array_equal(_iterations(time, int(time[anchor]), mapping), rows):
+                return anchor, mapping
+    raise ConversionError(
+        f"scenario {scenario.token!r}: its iterations are not every n-th row of its recording",
+        hint="nuPlan cuts a scenario by duration, offset and ratio; convert it so",
+    )
+
+
+def _iterations(time: IntArray, anchor_us: int, mapping: Mapping) -> IntArray:
+    """Rows of the iterations as nuPlan cuts them, nuplan-formats.md §2."""
+    duration, offset, ratio = mapping
+    start = int(anchor_us + offset * 1e6)
+    first = int(np.searchsorted(time, start))
+    last = int(np.searchsorted(time, int(start + duration * 1e6), side="right"))
+    return np.arange(first, last, int(1.0 / ratio), dtype=np.int64)
+
+
+def log_token(text: str) -> bytes:
+    """A token of 8 bytes; one of 16 hexadecimal digits stays as it is."""
+    if _TOKEN.match(text):
+        return bytes.fromhex(text)
+    return hashlib.blake2b(text.encode(), digest_size=8).digest()
+
+
+def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
+    """Write one scenario as a log: five scenes, of which the middle one holds all rows.
+
+    Args:
+        path: The file; its name is the log's.
+        scenario: The scenario.
+        epsg: Code of the coordinate system of its map.
+
+    Returns:
+        Duration [s], offset [s] and subsample ratio that cut the scenario out again.
+
+    Raises:
+        ConversionError: A light belongs to a connector without an integer id, or the iterations
+            are not evenly spaced rows.
+    """
+    rows: dict[str, Rows] = {}
+    log = _Log(path.stem, scenario, epsg)
+    rows["log"] = log.header()
+    rows["lidar"] = [
+        (
+            log.lidar,
+            log.token,
+            LIDAR_CHANNEL,
+            "none",
+            pickle.dumps([0.0, 0.0, 0.0], _PICKLE),
+            pickle.dumps([1.0, 0.0, 0.0, 0.0], _PICKLE),
+        )
+    ]
+    rows["ego_pose"] = log.ego_poses()
+    rows["scene"] = log.scene_rows()
+    rows["lidar_pc"] = log.lidar_pcs()
+    rows["category"] = [(t, k.name.lower(), k.name.lower()) for k, t in log.categories.items()]
+    rows["track"], rows["lidar_box"] = log.boxes()
+    if scenario.scenario_type != UNKNOWN_TYPE:
+        anchor = log_token(scenario.token)
+        rows["scenario_tag"] = [(log.make("tag"), anchor, scenario.scenario_type, None)]
+    rows["traffic_light_status"] = log.lights()
+    write_database(path, _TABLES, rows, _INDEXES)
+    return log.mapping
+
+
+class _Log:
+    """The rows of one log. Tokens are digests of what they name."""
+
+    def __init__(self, name: str, scenario: Scenario, epsg: int) -> None:
+        self.name, self.scenario, self.epsg = name, scenario, epsg
+        self.token, self.lidar = self.make("log"), self.make("lidar")
+        count = len(scenario.time_us)
+        self.samples = [self.make(f"lidar_pc {row}") for row in range(count)]
+        anchor, self.mapping = cut_of(scenario)
+        self.samples[anchor] = log_token(scenario.token)
+        self.poses = [self.make(f"ego_pose {row}") for row in range(count)]
+        self.scenes = [self.make(f"scene {number}") for number in range(_SCENES)]
+        self.categories = {kind: self.make(kind.name) for kind in AgentKind}
+
+    def make(self, what: str) -> bytes:
+        return hashlib.blake2b(f"{self.name}|{what}".encode(), digest_size=8).digest()
+
+    def header(self) -> Rows:
+        start = int(self.scenario.time_us[0])
+        date = datetime.fromtimestamp(start * 1e-6, UTC).date().isoformat()
+        city = self.scenario.city
+        return [(self.token, "shiftsim", date, start, self.name, city, city)]
+
+    def ego_poses(self) -> Rows:
+        scenario, zero = self.scenario, 0.0
+        half = scenario.ego[:, 2] / 2.0
+        columns = np.column_stack([scenario.ego, np.cos(half), np.sin(half)]).tolist()
+        out: Rows = []
+        for token, time, row in zip(self.poses, scenario.time_us.tolist(), columns, strict=True):
+            x, y, _, vx, vy, ax, ay, *_, qw, qz = row
+            quaternion = (qw, zero, zero, qz)
+            motion = (vx, vy, zero, ax, ay, zero, zero, zero, zero)
+            out.append((token, time, x, y, zero, *quaternion, *motion, self.epsg, self.token))
+        goal = scenario.mission_goal
+        if goal is not None:
+            x, y, heading = goal.tolist()
+            quaternion = (float(np.cos(heading / 2)), zero, zero, float(np.sin(heading / 2)))
+            after = int(scenario.time_us[-1]) + 1
+            still = (zero,) * 9
+            token = self.make("goal")
+            out.append((token, after, x, y, zero, *quaternion, *still, self.epsg, self.token))
+        return out
+
+    def scene_rows(self) -> Rows:
+        goal = None if self.scenario.mission_goal is None else self.make("goal")
+        route = " ".join(self.scenario.route)
+        return [
+            (token, self.token, f"scene-{number:03d}", goal, route)
+            for number, token in enumerate(self.scenes)
+        ]
+
+    def lidar_pcs(self) -> Rows:
+        after, before = [*self.samples[1:], None], [None, *self.samples[:-1]]
+        scene = self.scenes[_SCENES // 2]
+        times = self.scenario.time_us.tolist()
+        return [
+            (token, after[i], before[i], self.poses[i], self.lidar, scene, f"{i:06d}.pcd", times[i])
+            for i, token in enumerate(self.samples)
+        ]
+
+    def boxes(self) -> tuple[Rows, Rows]:
+        tracks = self.scenario.tracks
+        row, track = np.nonzero(tracks.valid)  # each row lists the tracks in our order
+        names = self._track_tokens()
+        heights = [_HEIGHTS[AgentKind(kind)] for kind in tracks.kinds.tolist()]
+        after, before = _neighbours(row, track)
+        prefix = self.make("lidar_box")[:4]
+        own: list[bytes | None] = [prefix + i.to_bytes(4, "big") for i in range(len(row))]
+        own.append(None)  # number -1: no neighbour
+        velocities = np.nan_to_num(tracks.velocities[row, track])
+        values = np.column_stack(
+            [tracks.poses[row, track], tracks.sizes[row, track], velocities]
+        ).tolist()
+        lines: Rows = []
+        for i, (at, who) in enumerate(zip(row.tolist(), track.tolist(), strict=True)):
+            x, y, heading, length, width, vx, vy = values[i]
+            height = heights[who]
+            links = (own[i], self.samples[at], names[who], own[after[i]], own[before[i]])
+            sizes = (width, length, height)
+            lines.append((*links, x, y, height / 2.0, *sizes, vx, vy, 0.0, heading, 1.0))
+        first = np.argmax(tracks.valid, axis=0) if len(names) else np.zeros(0, np.int64)
+        sizes_of = tracks.sizes[first, np.arange(len(names))].tolist()
+        kinds = [self.categories[AgentKind(kind)] for kind in tracks.kinds.tolist()]
+        listed: Rows = [
+            (name, kind, width, length, height)
+            for name, kind, (length, width), height in zip(
+                names, kinds, sizes_of, heights, strict=True
+            )
+        ]
+        return listed, lines
+
+    def _track_tokens(self) -> list[bytes]:
+        """A number becomes the token of that value, so that it can be read."""
+        out = [
+            int(name).to_bytes(8, "big") if name.isdecimal() and len(name) < 16 else log_token(name)
+            for name in self.scenario.tracks.tokens
+        ]
+        if len(set(out)) == len(out):
+            return out
+        return [self.make(f"track {name}") for name in self.scenario.tracks.tokens]
+
+    def lights(self) -> Rows:
+        lights = self.scenario.traffic_lights
+        row, connector = np.nonzero(lights.status != LightStatus.ABSENT)
+        codes = lights.status[row, connector].tolist()
+        names = [self._integer(name) for name in lights.connector_ids]
+        return [
+            (self.make(f"light {at} {which}"), self.samples[at], names[which], _STATUS[code])
+            for at, which, code in zip(row.tolist(), connector.tolist(), codes, strict=True)
+        ]
+
+    def _integer(self, name: str) -> int:
+        try:
+            return int(name)
+        except ValueError as error:
+            raise ConversionError(
+                f"scenario {self.scenario.token!r}: a traffic light names connector {name!r}",
+                hint="nuPlan's format has integer ids",
+            ) from error
+
+
+def _neighbours(row: IntArray, track: IntArray) -> tuple[list[int], list[int]]:
+    """Number of the next and of the previous box of the same track, -1 where there is none."""
+    order = np.lexsort((row, track))
+    same = track[order[1:]] == track[order[:-1]]
+    after, before = (np.full(len(row), -1, np.int64) for _ in range(2))
+    after[order[:-1][same]] = order[1:][same]
+    before[order[1:][same]] = order[:-1][same]
+    return after.tolist(), before.tolist()

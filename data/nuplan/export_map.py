@@ -1,0 +1,358 @@
+"""VectorMap -> nuPlan's map.gpkg (nuplan-formats.md §3)."""
+
+from collections.abc import Iterable, Mapping
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+from shiftsim.data.nuplan.geopackage_writer import FeatureLayer, Value, write_geopackage
+from shiftsim.errors import ConversionError
+from shiftsim.world.layers import Layer, Polylines
+from shiftsim.world.map import NONE, VectorMap
+
+# A map in a local frame goes to the origin of this zone: only metres matter, and they stay.
+LOCAL_EPSG = 32632
+_SOLID = 2  # boundary type
+_HINT = "nuPlan's format has integer ids, and lane - connector - lane, always"
+
+_POLYGON, _LINE = "POLYGON", "LINESTRING"
+# Layers with their columns; `name` is text, `name:i` an integer, `name:r` a real.
+_LAYERS: dict[str, tuple[str, str]] = {
+    "baseline_paths": (
+        _LINE,
+        "path_type_fid:i creator_id lane_fid:i lane_connector_fid:i dubins_node_fids",
+    ),
+    "boundaries": (
+        _LINE,
+        "boundary_segment_fids has_reflectors:i boundary_type_fid:i creator_id",
+    ),
+    "carpark_areas": (_POLYGON, "heading:r creator_id"),
+    "crosswalks": (_POLYGON, "intersection_fids lane_fids creator_id is_marked:i"),
+    "dubins_nodes": ("POINT", "radius:r heading:r creator_id"),
+    "gen_lane_connectors_scaled_width_polygons": (
+        _POLYGON,
+        "baseline_path_fid:i lane_connector_fid:i from_edge_fid:i to_edge_fid:i"
+        " left_boundary_fid:i right_boundary_fid:i",
+    ),
+    "generic_drivable_areas": (_POLYGON, "creator_id"),
+    "intersections": (_POLYGON, "creator_id intersection_type_fid:i is_mini:i"),
+    "lane_connectors": (
+        _LINE,
+        "exit_lane_group_fid:i exit_lane_fid:i entry_lane_group_fid:i lane_group_connector_fid:i"
+        " entry_lane_fid:i intersection_fid:i turn_type_fid:i bulb_fids"
+        " traffic_light_stop_line_fids overlap:i creator_id left_has_reflectors:i"
+        " right_has_reflectors:i speed_limit_mps:r",
+    ),
+    "lane_group_connectors": (
+        _POLYGON,
+        "intersection_fid:i from_lane_group_fid:i to_lane_group_fid:i creator_id from_edge_fid:i"
+        " to_edge_fid:i left_boundary_fid:i right_boundary_fid:i",
+    ),
+    "lane_groups_polygons": (
+        _POLYGON,
+        "creator_id left_boundary_fid:i right_boundary_fid:i from_edge_fid:i to_edge_fid:i",
+    ),
+    "lanes_polygons": (
+        _POLYGON,
+        "lane_group_fid:i lane_fid:i lane_index:i creator_id name road_type_fid:i lane_type_fid:i"
+        " width:i left_offset:r right_offset:r min_speed:r max_speed:r stops:i"
+        " left_boundary_fid:i right_boundary_fid:i speed_limit_mps:r left_has_reflectors:i"
+        " right_has_reflectors:i from_edge_fid:i to_edge_fid:i",
+    ),
+    "road_segments": (_POLYGON, "lane_group_fids"),
+    "stop_polygons": (
+        _POLYGON,
+        "stop_polygon_type_fid:i lane_group_fid:i lane_fids lane_connector_fids"
+        " traffic_light_fids crosswalk_fids precedence_area_fids creator_id",
+    ),
+    "traffic_lights": (
+        "POINT",
+        "traffic_light_type_fid:i intersection_fid:i heading:r creator_id",
+    ),
+    "walkways": (_POLYGON, "creator_id"),
+}
+_TYPES = {"": "TEXT", "i": "INTEGER", "r": "REAL"}
+
+
+def epsg_of(road: VectorMap) -> int:
+    """Code of the coordinate system that a map is exported in."""
+    return road.epsg or LOCAL_EPSG
+
+
+def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
+    """Write a map in nuPlan's layers. Ids stay as they are.
+
+    Args:
+        path: The file `map.gpkg`.
+        road: The map.
+        version: Version of the map.
+
+    Raises:
+        ConversionError: The map has something that nuPlan's format has no place for.
+    """
+    layers = {
+        name: FeatureLayer(
+            name,
+            kind,
+            {c.partition(":")[0]: _TYPES[c.partition(":")[2]] for c in columns.split()},
+        )
+        for name, (kind, columns) in _LAYERS.items()
+    }
+    _Writer(road, layers).write()
+    meta = {
+        "map_version": version,
+        "geographicCoordSystem": "epsg:4326",
+        "projectedCoordSystem": f"epsg:{epsg_of(road)}",
+    }
+    write_geopackage(path, list(layers.values()), epsg=epsg_of(road), meta=meta)
+
+
+class _Writer:
+    """Fills the layers of one map."""
+
+    def __init__(self, road: VectorMap, layers: Mapping[str, FeatureLayer]) -> None:
+        self.road, self.layers = road, layers
+        self.edges = [self._fid(name) for name in road.edges.ids]
+        self.blocks = [self._fid(name) for name in road.blocks.ids]
+        self.intersections = [self._fid(name) for name in road.intersections.ids]
+        self.stops = [self._fid(name) for name in road.stop_polygons.ids]
+        others = (road.crosswalks, road.walkways, road.car_parks, road.drivable_areas)
+        used = [
+            *(self.edges + self.blocks + self.intersections + self.stops),
+            *(self._fid(name) for layer in others for name in layer.ids),
+            *(self._fid(name) for pair in road.boundary_ids for name in pair if name),
+        ]
+        self.fresh = count(max(used, default=0) + 1)  # ids of what has none in our map
+        self.lines: dict[int, bytes] = {}  # boundaries written
+
+    def _fid(self, name: str) -> int:
+        try:
+            if str(int(name)) == name:
+                return int(name)
+        except ValueError:
+            pass
+        raise ConversionError(f"map {self.road.name!r}: id {name!r} cannot be exported", hint=_HINT)
+
+    def _add(self, layer: str, fid: int, shape: shapely.Geometry, **values: Value) -> None:
+        self.layers[layer].rows.append((fid, shape, values))
+
+    def write(self) -> None:
+        road = self.road
+        for edge in range(len(road.edges)):
+            self._connector(edge) if road.is_connector(edge) else self._lane(edge)
+        for block in range(len(road.blocks)):
+            self._block(block)
+        for fid, shape, at in self._areas(road.intersections):
+            kind = int(road.intersection_kinds[at])
+            self._add("intersections", fid, shape, intersection_type_fid=kind, is_mini=0)
+        governed: dict[int, list[str]] = {}
+        for edge, name in enumerate(road.edges.ids):
+            for stop in road.stop_lines.at(edge).tolist():
+                governed.setdefault(stop, []).append(name)
+        for fid, shape, at in self._areas(road.stop_polygons):
+            self._add(
+                "stop_polygons",
+                fid,
+                shape,
+                stop_polygon_type_fid=int(road.stop_kinds[at]),
+                lane_fids="",
+                lane_connector_fids=",".join(governed.get(at, [])),
+                traffic_light_fids="",
+                crosswalk_fids="",
+            )
+        for fid, shape, _ in self._areas(road.crosswalks):
+            self._add("crosswalks", fid, shape, intersection_fids="", lane_fids="", is_marked=1)
+        for fid, shape, _ in self._areas(road.walkways):
+            self._add("walkways", fid, shape)
+        for fid, shape, _ in self._areas(road.car_parks):
+            self._add("carpark_areas", fid, shape, heading=0.0)
+        self._drivable()
+
+    def _lane(self, edge: int) -> None:
+        road, fid = self.road, self.edges[edge]
+        for other in (*road.incoming.at(edge), *road.outgoing.at(edge)):
+            if not road.is_connector(int(other)):
+                raise ConversionError(
+                    f"map {road.name!r}: lane {road.edges.ids[edge]!r} is linked to lane"
+                    f" {road.edges.ids[int(other)]!r} without a connector",
+                    hint=_HINT,
+                )
+        self._baseline(edge, "lane_fid")
+        left, right = self._boundaries(edge)
+        index = int(road.lane_index[edge])
+        self._add(
+            "lanes_polygons",
+            fid,
+            road.edges.shape(edge),
+            lane_group_fid=self._block_of(edge),
+            lane_fid=fid,
+            lane_index=None if index == NONE else index,
+            road_type_fid=1,
+            lane_type_fid=int(road.is_bike[edge]),
+            left_boundary_fid=left,
+            right_boundary_fid=right,
+            speed_limit_mps=self._speed(edge),
+            left_has_reflectors=0,
+            right_has_reflectors=0,
+        )
+
+    def _connector(self, edge: int) -> None:
+        road, fid = self.road, self.edges[edge]
+        start, end = (
+            self._single(road.edges.ids[edge], links.at(edge).tolist())
+            for links in (road.incoming, road.outgoing)
+        )
+        baseline = self._baseline(edge, "lane_connector_fid")
+        left, right = self._boundaries(edge)
+        crossing = int(road.intersection_of[edge])
+        self._add(
+            "lane_connectors",
+            fid,
+            _line(road.baselines, edge),
+            exit_lane_group_fid=None if start is None else self._block_of(start),
+            exit_lane_fid=None if start is None else self.edges[start],
+            entry_lane_group_fid=None if end is None else self._block_of(end),
+            lane_group_connector_fid=self._block_of(edge),
+            entry_lane_fid=None if end is None else self.edges[end],
+            intersection_fid=None if crossing == NONE else self.intersections[crossing],
+            turn_type_fid=int(road.turn_type[edge]),
+            bulb_fids="",
+            traffic_light_stop_line_fids=self._lit_stop_lines(edge),
+            overlap=0,
+            left_has_reflectors=0,
+            right_has_reflectors=0,
+            speed_limit_mps=self._speed(edge),
+        )
+        self._add(
+            "gen_lane_connectors_scaled_width_polygons",
+            next(self.fresh),
+            road.edges.shape(edge),
+            baseline_path_fid=baseline,
+            lane_connector_fid=fid,
+            left_boundary_fid=left,
+            right_boundary_fid=right,
+        )
+
+    def _single(self, name: str, links: list[int]) -> int | None:
+        """The lane at one end of a connector."""
+        if len(links) > 1 or any(self.road.is_connector(edge) for edge in links):
+            raise ConversionError(
+                f"map {self.road.name!r}: connector {name!r} does not join one lane to one lane",
+                hint=_HINT,
+            )
+        return links[0] if links else None
+
+    def _lit_stop_lines(self, edge: int) -> str:
+        """Stop lines of lit connectors only: any text there means that lights govern it."""
+        road = self.road
+        if not road.has_traffic_lights[edge]:
+            return ""
+        listed = [self.stops[stop] for stop in road.stop_lines.at(edge).tolist()]
+        return ",".join(map(str, listed or [next(self.fresh)]))
+
+    def _speed(self, edge: int) -> float | None:
+        limit = float(self.road.speed_limits[edge])
+        return None if np.isnan(limit) else limit
+
+    def _block_of(self, edge: int) -> int | None:
+        block = int(self.road.block_of[edge])
+        return None if block == NONE else self.blocks[block]
+
+    def _baseline(self, edge: int, owner: str) -> int:
+        fid = next(self.fresh)
+        line = _line(self.road.baselines, edge)
+        self._add("baseline_paths", fid, line, path_type_fid=0, **{owner: self.edges[edge]})
+        return fid
+
+    def _boundaries(self, edge: int) -> list[int | None]:
+        road = self.road
+        pair = zip(
+            road.boundary_ids[edge], (road.left_boundaries, road.right_boundaries), strict=True
+        )
+        return [self._boundary(name, lines, edge) for name, lines in pair]
+
+    def _boundary(self, name: str, lines: Polylines, edge: int) -> int | None:
+        if lines.ptr[edge + 1] - lines.ptr[edge] < 2:
+            return None
+        line = _line(lines, edge)
+        fid = self._fid(name) if name else next(self.fresh)
+        if self.lines.get(fid, line.wkb) != line.wkb:
+            fid = next(self.fresh)
+        if fid not in self.lines:
+            self.lines[fid] = line.wkb
+            self._add(
+                "boundaries",
+                fid,
+                line,
+                boundary_segment_fids="",
+                has_reflectors=0,
+                boundary_type_fid=_SOLID,
+            )
+        return fid
+
+    def _block(self, block: int) -> None:
+        road, fid, shape = self.road, self.blocks[block], self.road.blocks.shape(block)
+        if block < road.num_roadblocks:
+            self._add("lane_groups_polygons", fid, shape)
+            return
+        name = road.blocks.ids[block]
+        ends = [links.at(block).tolist() for links in (road.block_incoming, road.block_outgoing)]
+        if any(len(end) > 1 or any(b >= road.num_roadblocks for b in end) for end in ends):
+            raise ConversionError(
+                f"map {road.name!r}: roadblock connector {name!r} does not join one roadblock to"
+                " one roadblock",
+                hint=_HINT,
+            )
+        members = road.block_edges.at(block).tolist()
+        crossings = [
+            int(road.intersection_of[e]) for e in members if road.intersection_of[e] != NONE
+        ]
+        self._add(
+            "lane_group_connectors",
+            fid,
+            shape,
+            intersection_fid=self.intersections[crossings[0]] if crossings else None,
+            from_lane_group_fid=self.blocks[ends[0][0]] if ends[0] else None,
+            to_lane_group_fid=self.blocks[ends[1][0]] if ends[1] else None,
+        )
+
+    def _areas(
+        self, layer: Layer, keep: Iterable[int] | None = None
+    ) -> list[tuple[int, shapely.Geometry, int]]:
+        """Id, shape and first position; pieces of one id are one row."""
+        pieces: dict[int, list[int]] = {}
+        for at in range(len(layer)) if keep is None else keep:
+            pieces.setdefault(self._fid(layer.ids[at]), []).append(at)
+        return [
+            (
+                fid,
+                layer.shape(places[0])
+                if len(places) == 1
+                else shapely.MultiPolygon([layer.shape(at) for at in places]),
+                places[0],
+            )
+            for fid, places in pieces.items()
+        ]
+
+    def _drivable(self) -> None:
+        """What is drivable besides intersections and car parks, which count as such."""
+        road, layer = self.road, self.road.drivable_areas
+        known = {
+            (other.ids[at], other.shape(at).wkb): other
+            for other in (road.intersections, road.car_parks)
+            for at in range(len(other))
+        }
+        owners = [known.get((layer.ids[at], layer.shape(at).wkb)) for at in range(len(layer))]
+        # nuPlan lists road segments, intersections, generic areas and car parks, in this order
+        first = next((at for at, owner in enumerate(owners) if owner is not None), len(layer))
+        rest = [at for at, owner in enumerate(owners) if owner is None]
+        for fid, shape, _ in self._areas(layer, [at for at in rest if at < first]):
+            self._add("road_segments", fid, shape, lane_group_fids="")
+        for fid, shape, _ in self._areas(layer, [at for at in rest if at > first]):
+            self._add("generic_drivable_areas", fid, shape)
+
+
+def _line(lines: Polylines, index: int) -> shapely.LineString:
+    return shapely.LineString(lines.at(index))

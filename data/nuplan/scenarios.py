@@ -1,0 +1,232 @@
+"""nuPlan logs and maps -> scenarios (nuplan-formats.md §5).
+
+`read_scenario` gives one scenario straight from a log; `nuplan_convert` writes many to a store.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.arrays import IntArray
+from shiftsim.data.nuplan.log import (
+    Log,
+    has_goals,
+    make_tracks,
+    open_log,
+    read_boxes,
+    read_ego,
+    read_lights,
+    read_route,
+)
+from shiftsim.data.nuplan.map import read_map
+from shiftsim.data.nuplan.mapping import Mapping, mapping_of
+from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.recording import scenario as make_scenario
+from shiftsim.errors import ConversionError, DataError
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+
+ROW_SECONDS = 0.05  # nominal distance of log rows
+_PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window, nuplan-formats.md §5
+# Rows are counted, not timed, where nuPlan looks back and ahead: keep at least as many.
+_PAST_ROWS, _FUTURE_ROWS = 60, 161
+_MIN_ITERATIONS = 3
+EGO = "ego"
+
+
+@dataclass(frozen=True)
+class ScenarioEntry:
+    """One scenario that a log offers.
+
+    Attributes:
+        token: Token of its anchor row.
+        scenario_type: Its tag; `unknown` without one.
+        log_name: The log.
+        city: Map name.
+        time_us: Time stamp of the anchor [us].
+    """
+
+    token: str
+    scenario_type: str
+    log_name: str
+    city: str
+    time_us: int
+
+
+def list_scenarios(
+    path: Path,
+    *,
+    tokens: frozenset[str] | None = None,
+    types: frozenset[str] | None = None,
+    remove_invalid_goals: bool = False,
+) -> list[ScenarioEntry]:
+    """The scenarios that nuPlan finds in a log, ordered by time.
+
+    Rows of the first two and of the last two scenes (by name) are not offered.
+
+    Args:
+        path: The log.
+        tokens: Only these; all where None.
+        types: Only these scenario types; all where None.
+        remove_invalid_goals: Leave out scenes without a goal.
+
+    Raises:
+        DataError: The log cannot be read.
+    """
+    with open_log(path) as log:
+        return offered(log, tokens=tokens, types=types, remove_invalid_goals=remove_invalid_goals)
+
+
+def offered(
+    log: Log,
+    *,
+    tokens: frozenset[str] | None = None,
+    types: frozenset[str] | None = None,
+    remove_invalid_goals: bool = False,
+) -> list[ScenarioEntry]:
+    """As `list_scenarios`, of an open log."""
+    keep = log.is_offered
+    if remove_invalid_goals:
+        keep = keep & has_goals(log)
+    return [
+        ScenarioEntry(
+            log.tokens[row], log.types[row], log.name, log.map_name, int(log.time_us[row])
+        )
+        for row in np.flatnonzero(keep).tolist()
+        if (tokens is None or log.tokens[row] in tokens)
+        and (types is None or log.types[row] in types)
+    ]
+
+
+def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
+    """The rows of a scenario; the window counts rows from the start of the log.
+
+    Args:
+        log: The log.
+        token: Token of the anchor row.
+        mapping: Duration [s], offset [s] and subsample ratio; nuPlan's for the type where None.
+
+    Raises:
+        ConversionError: The log lacks the token, or has too few rows there.
+    """
+    if token not in log.row_of:
+        raise ConversionError(f"{log.path}: there is no lidar_pc {token!r}", hint="check the token")
+    row = log.row_of[token]
+    scenario_type = log.types[row]
+    chosen = mapping_of(scenario_type) if mapping is None else mapping
+    duration, offset, ratio = chosen
+    start = int(int(log.time_us[row]) + offset * 1e6)
+    end = int(start + duration * 1e6)
+    step = int(1.0 / ratio)
+    first = int(np.searchsorted(log.time_us, start))
+    last = int(np.searchsorted(log.time_us, end, side="right"))
+    iterations: IntArray = np.arange(first, last, step, dtype=np.int64)
+    if len(iterations) < _MIN_ITERATIONS:
+        raise ConversionError(
+            f"{log.path}: scenario {token!r} has {len(iterations)} iterations",
+            hint=f"at least {_MIN_ITERATIONS} are needed: choose another mapping",
+        )
+    early = int(np.searchsorted(log.time_us, start - int(_PAST_SECONDS * 1e6)))
+    late = int(np.searchsorted(log.time_us, end + int(_FUTURE_SECONDS * 1e6), side="right"))
+    route, goal = read_route(log, row)
+    return Window(
+        token=token,
+        scenario_type=scenario_type,
+        log_name=log.name,
+        ego=EGO,
+        first_row=max(min(early, first - _PAST_ROWS), 0),
+        last_row=min(max(late, int(iterations[-1]) + 1 + _FUTURE_ROWS), len(log.time_us)),
+        iteration_rows=iterations,
+        row_step=step,
+        route=route,
+        mission_goal=goal,
+        mapping=chosen,
+        is_short=bool(end - log.time_us[-1] > 0.9e6 * ROW_SECONDS),  # a row is missing
+    )
+
+
+def read_span(
+    log: Log, name: str, first: int, last: int, flaws: dict[str, int]
+) -> tuple[Recording, EgoTrace]:
+    """The rows first … last - 1 of a log as a recording of its own, with the ego."""
+    recording = Recording(
+        log_name=name,
+        city=log.map_name,
+        time_us=log.time_us[first:last].copy(),
+        tracks=make_tracks(read_boxes(log, first, last), first, last, flaws),
+        lights=read_lights(log, first, last, flaws),
+    )
+    return recording, EgoTrace(name, EGO, 0, read_ego(log, first, last))
+
+
+def read_scenario(
+    path: Path,
+    token: str,
+    road: VectorMap,
+    mapping: Mapping | None = None,
+    flaws: dict[str, int] | None = None,
+) -> Scenario:
+    """One scenario of a log.
+
+    Args:
+        path: The log (.db).
+        token: Token of the anchor row.
+        road: Map of the log.
+        mapping: Duration [s], offset [s] and subsample ratio; nuPlan's for the type where None.
+        flaws: Counts of what is wrong in the log and tolerated are added here.
+
+    Raises:
+        DataError: The log or the scenario cannot be read.
+    """
+    with open_log(path) as log:
+        window = cut_window(log, token, mapping)
+        recording, ego = read_span(
+            log, log.name, window.first_row, window.last_row, {} if flaws is None else flaws
+        )
+    return make_scenario(recording, ego, window, road, offset=window.first_row)
+
+
+def find_maps(folder: Path) -> dict[str, Path]:
+    """Files `map.gpkg` of a folder of nuPlan maps, by map name.
+
+    Raises:
+        DataError: There is no index file, or it is broken or names a missing map.
+    """
+    indexes = sorted(folder.glob("*maps*.json"))
+    if not indexes:
+        raise DataError(
+            f"{folder}: no index such as nuplan-maps-v1.0.json",
+            hint="give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT",
+        )
+    out = {}
+    for index in indexes:
+        try:
+            entries = {name: str(entry["version"]) for name, entry in _load(index).items()}
+        except (TypeError, KeyError, AttributeError) as error:
+            raise DataError(f"{index}: a map has no version", hint="get it again") from error
+        for name, version in entries.items():
+            out[name] = folder / name / version / "map.gpkg"
+    return out
+
+
+def _load(path: Path) -> dict[str, dict[str, object]]:
+    try:
+        content: dict[str, dict[str, object]] = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not readable JSON: {error}", hint="get it again") from error
+    return content
+
+
+def load_map(maps: dict[str, Path], name: str) -> VectorMap:
+    """Read one of the maps found by `find_maps`.
+
+    Raises:
+        DataError: There is no such map.
+    """
+    if name not in maps:
+        raise DataError(
+            f"there is no map {name!r} in the map folder", hint=f"found: {', '.join(sorted(maps))}"
+        )
+    return read_map(maps[name], name)

@@ -1,0 +1,265 @@
+"""Areas of the map: intersections, drivable area, walkways, car parks, crosswalks."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.opendrive.curves import ReferenceLine
+from shiftsim.data.opendrive.graph import DRIVABLE, ConnectorRun
+from shiftsim.data.opendrive.records import OpenDrive, Outline, Repeat, RoadObject, Signal
+from shiftsim.data.opendrive.shapes import Shapes, lane_polygon, largest_part
+
+PAVED = frozenset(("shoulder", "stop", "parking", "roadWorks", "restricted"))
+WALKED = frozenset(("sidewalk", "walking"))
+SEAMS = frozenset(("border", "curb"))  # merged into a neighbouring walkway where narrow
+_SEAM_WIDTH = 0.5  # m
+_MIN_OVERLAP = 1.0  # m², deepplan-conversion.md §2.7
+_CLOSING = 0.5  # m
+_SLIVER = 0.05  # m, cracks between lanes that are closed in the drivable area
+_TILE, _TILE_OVERLAP = 50.0, 0.5  # m
+_CROSSWALK_WORDS = ("crosswalk", "zebra", "pedestrian")
+
+
+@dataclass(frozen=True)
+class LaneAreas:
+    """Polygons of lanes that are no lanes of the map: by what they are used for."""
+
+    paved: list[shapely.Polygon]
+    walked: list[shapely.Polygon]
+    parking: list[shapely.Polygon]
+
+
+def group_connectors(
+    connectors: Sequence[ConnectorRun],
+    polygons: Sequence[shapely.Polygon],
+    blocks: Sequence[tuple[int, int]],
+    are_stacked: Callable[[int, int], bool],
+) -> IntArray:
+    """Number of the intersection of each connector.
+
+    Connectors belong together when they lie in one junction, belong to one roadblock connector, or
+    overlap by more than 1 m² without sharing the lane they start or end at.
+
+    Args:
+        connectors: Lane connectors.
+        polygons: Their areas.
+        blocks: Their (from, to) roadblocks.
+        are_stacked: Whether two of them lie on different levels.
+    """
+    parent = list(range(len(connectors)))
+
+    def find(item: int) -> int:
+        while parent[item] != item:
+            parent[item] = parent[parent[item]]
+            item = parent[item]
+        return item
+
+    first: dict[object, int] = {}
+    for number, connector in enumerate(connectors):
+        for label in (*sorted(connector.junctions), blocks[number]):
+            parent[find(number)] = find(first.setdefault(label, number))
+    shapes = np.array(polygons, dtype=object)
+    if len(shapes):
+        a, b = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+        for i, j in zip(a.tolist(), b.tolist(), strict=True):
+            one, two = connectors[i], connectors[j]
+            if i >= j or find(i) == find(j):
+                continue
+            if one.source == two.source or one.target == two.target:
+                continue
+            overlap = shapely.intersection(shapes[i], shapes[j]).area
+            if overlap > _MIN_OVERLAP and not are_stacked(i, j):
+                parent[find(i)] = find(j)
+    roots = [find(i) for i in range(len(connectors))]
+    order = {root: n for n, root in enumerate(dict.fromkeys(roots))}
+    return np.array([order[root] for root in roots], np.int64)
+
+
+def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.Polygon:
+    """One polygon that covers all: their union closed by `radius` [m], else their convex hull."""
+    union = shapely.union_all(list(polygons))
+    closed = union.buffer(radius, join_style="mitre").buffer(-radius, join_style="mitre")
+    closed = shapely.union(closed, union)
+    return closed if isinstance(closed, shapely.Polygon) else largest_part(union.convex_hull)
+
+
+def without_holes(polygon: shapely.Polygon) -> shapely.Polygon:
+    """The polygon with its holes filled."""
+    return shapely.Polygon(polygon.exterior)
+
+
+def lane_areas(od: OpenDrive, shapes: Shapes) -> LaneAreas:
+    """Areas of all lanes that cars do not follow."""
+    areas = LaneAreas([], [], [])
+    for road in od.roads.values():
+        for index, section in enumerate(road.sections):
+            if road.section_end(index) - section.s < 0.01:
+                continue
+            if all(lane.type in DRIVABLE or lane.type == "none" for lane in section.lanes.values()):
+                continue
+            shape = shapes.section(road.id, index)
+            for number, lane in section.lanes.items():
+                inner, outer = shape.inner[number], shape.outer[number]
+                width = float(np.hypot(*(outer - inner).T).max())
+                if width < 1e-3 or lane.type not in PAVED | WALKED | SEAMS:
+                    continue
+                area = lane_polygon(inner, outer)
+                step = 1 if number > 0 else -1
+                beside = [section.lanes.get(number + k * step) for k in (-1, 1)]
+                is_seam = lane.type in SEAMS and width < _SEAM_WIDTH
+                if lane.type in PAVED:
+                    areas.paved.append(area)
+                elif lane.type in WALKED or (
+                    is_seam and any(other and other.type in WALKED for other in beside)
+                ):
+                    areas.walked.append(area)
+                if lane.type == "parking":
+                    areas.parking.append(area)
+    return areas
+
+
+def merge_areas(polygons: Sequence[shapely.Polygon], radius: float) -> list[shapely.Polygon]:
+    """Separate polygons whose union is the closed union of all, by position."""
+    if not polygons:
+        return []
+    union = shapely.union_all([p.buffer(radius, join_style="mitre") for p in polygons])
+    return _parts(union.buffer(-radius, join_style="mitre"))
+
+
+def drivable_tiles(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Small overlapping polygons whose union is that of all, with cracks closed.
+
+    One polygon for a town would have thousands of edges to test against for each corner of a car.
+    """
+    waiting = merge_areas(polygons, _SLIVER)
+    tiles = []
+    while waiting:
+        part = waiting.pop()
+        left, bottom, right, top = part.bounds
+        if max(right - left, top - bottom) <= _TILE:
+            tiles.append(part)
+            continue
+        x, y, lap = 0.5 * (left + right), 0.5 * (bottom + top), 0.5 * _TILE_OVERLAP
+        halves = (
+            (shapely.box(left, bottom, x + lap, top), shapely.box(x - lap, bottom, right, top))
+            if right - left > top - bottom
+            else (shapely.box(left, bottom, right, y + lap), shapely.box(left, y - lap, right, top))
+        )
+        for half in halves:
+            waiting += _parts(shapely.intersection(part, half))
+    return sorted(tiles, key=lambda tile: tile.bounds)
+
+
+def _parts(shape: shapely.Geometry) -> list[shapely.Polygon]:
+    if not shape.is_valid:
+        shape = shapely.make_valid(shape)
+    parts = [p for p in shapely.get_parts(shape) if isinstance(p, shapely.Polygon)]
+    return sorted((p for p in parts if p.area > 1e-4), key=lambda p: p.bounds)
+
+
+def is_crosswalk(thing: RoadObject) -> bool:
+    """Whether an object marks a crosswalk, by type, or by name of a marking."""
+    if thing.type == "crosswalk":
+        return True
+    if thing.type not in ("roadMark", "-1", "none", "") and "crosswalk" not in thing.type.lower():
+        return False
+    words = f"{thing.type} {thing.name} {thing.subtype}".lower()
+    return any(word in words for word in _CROSSWALK_WORDS)
+
+
+def is_stop_line(thing: RoadObject) -> bool:
+    """Whether an object is a stop line, by any of its names."""
+    return any("stopline" in text.lower() for text in (thing.type, thing.name, thing.subtype))
+
+
+def object_rings(line: ReferenceLine, thing: RoadObject) -> list[FloatArray]:
+    """Outlines (V, 2) of an object and its copies, as the file draws them [m]."""
+    places = [(thing.s, thing.t)]
+    for repeat in thing.repeats:
+        places = _repeated(repeat)
+    return [
+        _place_ring(line, thing, outline, s, t)
+        for s, t in places
+        for outline in thing.outlines or (_box(thing),)
+    ]
+
+
+def object_origin(line: ReferenceLine, thing: RoadObject) -> FloatArray:
+    """(2,) where an object stands [m]."""
+    return line.evaluate(np.array([thing.s])).offset(np.array([thing.t]))[0]
+
+
+def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
+    count = int(min(repeat.length / repeat.distance, 1000)) + 1 if repeat.distance > 0 else 1
+    share = np.arange(count) * repeat.distance / repeat.length if repeat.length > 0 else np.zeros(1)
+    s = repeat.s + share * repeat.length
+    t = repeat.t_start + share * (repeat.t_end - repeat.t_start)
+    return list(zip(s.tolist(), t.tolist(), strict=True))
+
+
+def _box(thing: RoadObject) -> Outline:
+    length, width = (thing.length or 0.0) / 2, (thing.width or 0.0) / 2
+    corners = [[length, width], [-length, width], [-length, -width], [length, -width]]
+    return Outline(on_road=False, corners=np.array(corners))
+
+
+def _place_ring(
+    line: ReferenceLine, thing: RoadObject, outline: Outline, s: float, t: float
+) -> FloatArray:
+    if outline.on_road:
+        return line.evaluate(outline.corners[:, 0] + (s - thing.s)).offset(outline.corners[:, 1])
+    pose = line.evaluate(np.array([s]))
+    origin = pose.offset(np.array([t]))[0]
+    angle = float(pose.heading[0]) + thing.heading
+    cos, sin = np.cos(angle), np.sin(angle)
+    return origin + outline.corners @ np.array([[cos, sin], [-sin, cos]])
+
+
+def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
+    """All crosswalks that enclose an area."""
+    rings = [
+        ring
+        for road in od.roads.values()
+        for thing in road.objects
+        if is_crosswalk(thing)
+        for ring in object_rings(shapes.line(road.id), thing)
+        if len(ring) > 2 and np.isfinite(ring).all()
+    ]
+    for road in od.roads.values():
+        for signal in road.signals:
+            if _is_crosswalk_signal(signal):
+                rings.append(_signal_ring(road.id, signal, shapes))
+    polygons = [largest_part(shapely.Polygon(ring)) for ring in rings if np.isfinite(ring).all()]
+    return [polygon for polygon in polygons if polygon.area > 0.1]
+
+
+def _is_crosswalk_signal(signal: Signal) -> bool:
+    return (
+        not signal.reference
+        and not signal.dynamic
+        and (signal.type == "293" or "crosswalk" in signal.name.lower())
+        and signal.width is not None
+    )
+
+
+def _signal_ring(road: str, signal: Signal, shapes: Shapes) -> FloatArray:
+    """A crosswalk given as a signal: its width lies across the road, its value along it."""
+    half_width = (signal.width or 0.0) / 2
+    half_depth = (signal.value if signal.value and signal.value > 0 else 4.0) / 2
+    s = signal.s + half_depth * np.array([-1.0, -1.0, 1.0, 1.0])
+    return shapes.line(road).evaluate(s).offset(signal.t + half_width * np.array([-1, 1, 1, -1]))
+
+
+def parking_spaces(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
+    """Areas of parkingSpace objects."""
+    return [
+        largest_part(shapely.Polygon(ring))
+        for road in od.roads.values()
+        for thing in road.objects
+        if thing.type == "parkingSpace"
+        for ring in object_rings(shapes.line(road.id), thing)
+        if len(ring) > 2 and np.isfinite(ring).all()
+    ]

@@ -1,0 +1,160 @@
+"""What controls traffic at junctions: lights, signs, stop lines (deepplan-conversion.md §2.9)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive.areas import is_stop_line, object_rings
+from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, Piece
+from shiftsim.data.opendrive.records import OpenDrive, Road, Signal
+from shiftsim.data.opendrive.shapes import Shapes, largest_part
+from shiftsim.data.opendrive.speed import applies_to
+
+LIGHT, STOP, YIELD = "light", "stop", "yield"
+STOP_LINE_DEPTH = 1.0  # m
+_APPROACH = 100.0  # m before a junction within which a signal governs it
+_NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
+_STOP_TYPES = frozenset(("206", "R1-1"))
+_YIELD_TYPES = frozenset(("205", "R1-2"))
+
+
+@dataclass(frozen=True)
+class StopLine:
+    """A stop line across a lane: its area, what it is for, and the lane."""
+
+    polygon: shapely.Polygon
+    control: str
+    lane: int
+
+
+def signal_control(signal: Signal) -> str | None:
+    """What a signal asks of traffic: LIGHT, STOP, YIELD, or None."""
+    if signal.dynamic and signal.type.startswith("1000"):
+        return LIGHT
+    if signal.type in _STOP_TYPES:
+        return STOP
+    return YIELD if signal.type in _YIELD_TYPES else None
+
+
+def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
+    """What governs each connector: signals on its own roads, or before it on its lane."""
+    known = {
+        signal.id: signal
+        for road in od.roads.values()
+        for signal in road.signals
+        if not signal.reference
+    }
+    controls = []
+    for connector in graph.connectors:
+        found: set[str | None] = set()
+        if connector.junctions:
+            for piece in connector.pieces:
+                found |= _controls_on(od.roads[piece.key.road], piece, known, reach=np.inf)
+            last = graph.lanes[connector.source].pieces[-1]
+            found |= _controls_on(od.roads[last.key.road], last, known, reach=_APPROACH)
+        controls.append(frozenset(control for control in found if control))
+    return controls
+
+
+def _controls_on(
+    road: Road, piece: Piece, known: dict[str, Signal], reach: float
+) -> set[str | None]:
+    forward = piece.end >= piece.begin
+    return {
+        signal_control(known.get(signal.id, signal))
+        for signal in road.signals
+        if signal.orientation in ("none", "+" if forward else "-")
+        and applies_to(signal, piece.key.lane)
+        and abs(signal.s - piece.end) <= reach
+    }
+
+
+def stop_lines(
+    od: OpenDrive,
+    graph: LaneGraph,
+    shapes: Shapes,
+    controls: Sequence[frozenset[str]],
+    polygons: Sequence[shapely.Polygon],
+) -> list[StopLine]:
+    """One stop line per lane that ends at a controlled or marked junction.
+
+    Args:
+        od: The file.
+        graph: Lanes and connectors.
+        shapes: Their geometry.
+        controls: What governs each connector.
+        polygons: Areas of the lanes.
+    """
+    by_lane: dict[int, set[str]] = {}
+    for connector, governed in zip(graph.connectors, controls, strict=True):
+        if connector.junctions:
+            by_lane.setdefault(connector.source, set()).update(governed)
+    drawn = _drawn_lines(od, shapes)
+    tree = shapely.STRtree(np.array(drawn, dtype=object))
+    lines = []
+    for lane, found in sorted(by_lane.items(), key=lambda item: item[0]):
+        left, right = shapes.borders(graph.lanes[lane].pieces[-1])
+        box = _end_box(left, right)
+        near = tree.query(box.buffer(_NEAR_END), predicate="intersects").tolist()
+        near = [i for i in near if _lies_across(drawn[i], polygons[lane], box)]
+        if near:
+            nearest = min(near, key=lambda i: drawn[i].distance(box))
+            box = shapely.intersection(_deepened(drawn[nearest]), polygons[lane])
+        if (found or near) and (polygon := largest_part(box)).area > 0.01:
+            control = next((c for c in (LIGHT, STOP, YIELD) if c in found), STOP)
+            lines.append(StopLine(polygon, control, lane))
+    return lines
+
+
+def _drawn_lines(od: OpenDrive, shapes: Shapes) -> list[shapely.Geometry]:
+    drawn = []
+    for road in od.roads.values():
+        line = shapes.line(road.id)
+        for thing in road.objects:
+            if is_stop_line(thing):
+                drawn += [
+                    shapely.MultiPoint(ring).convex_hull
+                    for ring in object_rings(line, thing)
+                    if len(ring) > 1 and np.isfinite(ring).all()
+                ]
+        for signal in road.signals:
+            if (
+                signal.type == "294"
+                and not signal.reference
+                and np.isfinite([signal.s, signal.t]).all()
+            ):
+                half = (signal.width or 3.0) / 2
+                ends = line.evaluate(np.full(2, signal.s))
+                drawn.append(shapely.LineString(ends.offset(signal.t + np.array([-half, half]))))
+    return drawn
+
+
+def _end_box(left: FloatArray, right: FloatArray) -> shapely.Polygon:
+    """A rectangle across the end of a lane, as deep as a stop line."""
+    across = left[-1] - right[-1]
+    width = float(np.hypot(*across))
+    if width < 1e-3:
+        return shapely.Polygon()
+    back = STOP_LINE_DEPTH * np.array([across[1], -across[0]]) / width
+    if back @ (left[-2] - left[-1]) < 0:
+        back = -back
+    return shapely.Polygon([left[-1], right[-1], right[-1] + back, left[-1] + back])
+
+
+def _deepened(line: shapely.Geometry) -> shapely.Geometry:
+    """A drawn line as an area: itself where it has one, else widened to the depth of a line."""
+    if line.area > 0.1:
+        return line
+    return line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
+
+
+def _lies_across(line: shapely.Geometry, lane: shapely.Polygon, box: shapely.Polygon) -> bool:
+    return bool(lane.intersects(line)) and line.distance(box) < _NEAR_END
+
+
+def is_lit(connector: ConnectorRun, found: frozenset[str]) -> bool:
+    """Whether lights govern a connector."""
+    return bool(connector.junctions) and LIGHT in found

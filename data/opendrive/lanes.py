@@ -1,0 +1,234 @@
+"""Lane borders along a road, and which lane leads to which.
+
+Borders are distances t to the left of the reference line; lanes stack outward from the shifted
+centre line. Links are directed edges in the direction of travel (opendrive.md §2, §3).
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive.curves import ReferenceLine
+from shiftsim.data.opendrive.records import Connection, Lane, OpenDrive, Road, RoadLink
+
+BEFORE_END = 1e-9  # m: the end of a section still belongs to it
+_MAX_OFFSET = 500.0  # m from the reference line, so that absurd polynomials stay harmless
+START, END = "start", "end"
+_Side: TypeAlias = tuple[Road, int, int, str]  # road, section, lane, and the end that touches
+
+
+class LaneKey(NamedTuple):
+    """A lane of one section of one road: what the lane graph is made of."""
+
+    road: str
+    section: int
+    lane: int
+
+
+@dataclass(frozen=True)
+class SectionBorders:
+    """Borders of all lanes of a section at K places.
+
+    Attributes:
+        inner: Per lane, (K,) distance t of the border next to the centre [m].
+        outer: Per lane, (K,) distance t of the other border [m].
+    """
+
+    inner: dict[int, FloatArray]
+    outer: dict[int, FloatArray]
+
+
+def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> FloatArray:
+    """Piecewise cubic at `s` (K,), 0 before its first record.
+
+    Args:
+        records: (n, 5) s, a, b, c, d.
+        s: Where to evaluate [m].
+        look_up: Where to look for the record; differs from `s` at the end of a section.
+    """
+    if len(records) == 0:
+        return np.zeros_like(s)
+    index = np.searchsorted(records[:, 0], look_up, side="right") - 1
+    start, a, b, c, d = records[np.maximum(index, 0)].T
+    x = s - start
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd polynomials are cut off later
+        return np.where(index < 0, 0.0, a + x * (b + x * (c + x * d)))
+
+
+def section_borders(
+    road: Road,
+    section: int,
+    s: FloatArray,
+    *,
+    mend: bool = False,
+    look_up: FloatArray | None = None,
+) -> SectionBorders:
+    """Borders of the lanes of a section at road distances `s` (K,) within it [m].
+
+    Args:
+        road: The road.
+        section: Number of the section.
+        s: Distances from the start of the road [m].
+        mend: Whether negative widths count as 0, borders of right lanes that were written as
+            positive numbers are put on the right, and records that begin at the very end of the
+            section are left to the next one.
+        look_up: Where to look for the records instead of at `s`: which side of a step counts.
+    """
+    s = np.asarray(s, np.float64)
+    begin, end = road.sections[section].s, road.section_end(section)
+    if look_up is None:
+        look_up = np.minimum(s, max(end - BEFORE_END, begin)) if mend else s
+    lanes = road.sections[section].lanes
+    center = evaluate_cubics(road.offsets, s, look_up)
+    if mend:
+        center = np.clip(np.nan_to_num(center), -0.5 * _MAX_OFFSET, 0.5 * _MAX_OFFSET)
+    borders = SectionBorders({}, {})
+    for sign in (1, -1):
+        previous = center
+        for number in sorted((i for i in lanes if i * sign > 0), key=abs):
+            lane = lanes[number]
+            borders.inner[number] = previous
+            if len(lane.widths) or not len(lane.borders):  # nothing at all is width 0
+                outer = previous + sign * evaluate_cubics(lane.widths, s - begin, look_up - begin)
+            else:
+                outer = evaluate_cubics(lane.borders, s - begin, look_up - begin)
+                outer = -outer if mend and border_is_mirrored(lane) else outer
+            if mend:
+                if not np.isfinite(outer).all():
+                    outer = np.nan_to_num(outer, nan=0.0)
+                outer = np.clip(sign * outer, sign * previous, _MAX_OFFSET) * sign
+            previous = outer
+            borders.outer[number] = previous
+    return borders
+
+
+def border_is_mirrored(lane: Lane) -> bool:
+    """Whether all border records of a right lane lie on the left."""
+    return lane.id < 0 and not len(lane.widths) and bool((lane.borders[:, 1] > 0).all())
+
+
+def runs_forward(road: Road, section: int, lane: int) -> bool:
+    """Whether traffic on a lane moves in the direction of s.
+
+    Lanes for both directions count as lanes of their own side.
+    """
+    is_reversed = road.sections[section].lanes[lane].direction == "reversed"
+    return ((lane < 0) != road.left_hand) != is_reversed
+
+
+def lane_links(od: OpenDrive, warnings: Counter[str]) -> list[tuple[LaneKey, LaneKey]]:
+    """Directed edges between lanes of all types, in the direction of travel, sorted.
+
+    Only what the file links; nothing is inferred from geometry.
+
+    Args:
+        od: The file.
+        warnings: Takes one count per link that leads nowhere.
+    """
+    linker = _Linker(od, warnings)
+    for road in od.roads.values():
+        linker.link_sections(road)
+        for end, link in ((START, road.predecessor), (END, road.successor)):
+            if link is not None and link.kind == "road":
+                linker.link_roads(road, end, link)
+            elif link is not None and link.id not in od.junctions:
+                warnings["link to a junction that does not exist, dropped"] += 1
+    for junction in od.junctions.values():
+        if junction.type == "virtual":
+            warnings["virtual junction: its side connections are left out"] += 1
+            continue
+        for connection in junction.connections:
+            linker.link_connection(junction.id, connection)
+    return sorted(linker.edges)
+
+
+@dataclass
+class _Linker:
+    """Collects edges between lanes that touch, in the direction of travel."""
+
+    od: OpenDrive
+    warnings: Counter[str]
+    edges: set[tuple[LaneKey, LaneKey]] = field(default_factory=set)
+
+    def link_sections(self, road: Road) -> None:
+        """Links between the sections of one road."""
+        for index in range(len(road.sections) - 1):
+            before, after = road.sections[index], road.sections[index + 1]
+            pairs = {(i, j) for i, lane in before.lanes.items() for j in lane.successors}
+            pairs |= {(i, j) for j, lane in after.lanes.items() for i in lane.predecessors}
+            for i, j in sorted(pairs):
+                self._add((road, index, i, END), (road, index + 1, j, START))
+
+    def link_roads(self, road: Road, end: str, link: RoadLink) -> None:
+        """Links from one end of a road to the next road."""
+        other = self.od.roads.get(link.id)
+        if other is None:
+            self.warnings["link to a road that does not exist, dropped"] += 1
+            return
+        if not road.sections or not other.sections:
+            return
+        contact = link.contact or nearer_end(road, end, other)
+        here, there = _end_section(road, end), _end_section(other, contact)
+        for number, lane in road.sections[here].lanes.items():
+            for target in lane.successors if end == END else lane.predecessors:
+                self._add((road, here, number, end), (other, there, target, contact))
+
+    def link_connection(self, junction: str, connection: Connection) -> None:
+        """Lane links of a junction."""
+        incoming = self.od.roads.get(connection.incoming)
+        connecting = self.od.roads.get(connection.connecting)
+        if incoming is None or connecting is None:
+            self.warnings["link to a road that does not exist, dropped"] += 1
+            return
+        if not incoming.sections or not connecting.sections:
+            return
+        ends = [
+            end
+            for end, link in ((START, incoming.predecessor), (END, incoming.successor))
+            if link is not None and link.kind == "junction" and link.id == junction
+        ]
+        contact = connection.contact or nearer_end(incoming, (ends or [END])[0], connecting)
+        end = ends[0] if len(ends) == 1 else nearer_end(connecting, contact, incoming)
+        here, there = _end_section(incoming, end), _end_section(connecting, contact)
+        for source, target in connection.lane_links:
+            self._add((incoming, here, source, end), (connecting, there, target, contact))
+
+    def _add(self, side: _Side, other: _Side) -> None:
+        """An edge between two lanes that touch, if traffic can pass from one to the other."""
+        if 0 in (side[2], other[2]):
+            return
+        if any(
+            lane not in road.sections[section].lanes for road, section, lane, _ in (side, other)
+        ):
+            self.warnings["link to a lane that does not exist, dropped"] += 1
+            return
+        keys = [LaneKey(road.id, section, lane) for road, section, lane, _ in (side, other)]
+        leaves = [
+            runs_forward(road, section, lane) == (end == END)
+            for road, section, lane, end in (side, other)
+        ]
+        if leaves[0] == leaves[1]:
+            self.warnings["lane link against the direction of travel, dropped"] += 1
+        else:
+            self.edges.add((keys[0], keys[1]) if leaves[0] else (keys[1], keys[0]))
+
+
+def _end_section(road: Road, end: str) -> int:
+    return 0 if end == START else len(road.sections) - 1
+
+
+def end_point(road: Road, end: str) -> FloatArray:
+    """(2,) start or end of the reference line [m]."""
+    at = np.array([0.0 if end == START else road.length])
+    pose = ReferenceLine(road.geometries).evaluate(at)
+    return np.array([pose.x[0], pose.y[0]])
+
+
+def nearer_end(road: Road, end: str, other: Road) -> str:
+    """The end of `other` that lies nearer to an end of `road`."""
+    here = end_point(road, end)
+    distances = [float(np.hypot(*(end_point(other, e) - here))) for e in (START, END)]
+    return START if distances[0] <= distances[1] else END

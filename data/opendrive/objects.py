@@ -1,0 +1,100 @@
+"""Objects and signals of an OpenDRIVE road, from their XML elements."""
+
+from typing import Any
+
+import numpy as np
+
+from shiftsim.data.opendrive.records import Outline, Repeat, RoadObject, Signal
+from shiftsim.data.opendrive.xml import Reader
+
+
+def read_object(element: Any, reader: Reader) -> RoadObject:
+    """One object; outlines with numbers that are not finite are left out."""
+    reader.counts[f"object {element.get('type', '')}"] += 1
+    outlines = []
+    for outline in element.iter("outline"):
+        corners = _read_outline(outline, reader)
+        if corners is not None:
+            outlines.append(corners)
+    return RoadObject(
+        id=element.get("id", ""),
+        type=element.get("type", ""),
+        subtype=element.get("subtype", ""),
+        name=element.get("name", ""),
+        s=reader.number(element, "s"),
+        t=reader.number(element, "t"),
+        heading=reader.number(element, "hdg"),
+        length=_optional(element, "length", reader),
+        width=_optional(element, "width", reader),
+        outlines=tuple(outlines),
+        repeats=tuple(_read_repeat(e, reader) for e in element.findall("repeat")),
+        lanes=_read_validity(element, reader),
+    )
+
+
+def _read_outline(element: Any, reader: Reader) -> Outline | None:
+    on_road = element.find("cornerRoad") is not None
+    tag, keys = ("cornerRoad", ("s", "t")) if on_road else ("cornerLocal", ("u", "v"))
+    corners = np.array(
+        [[reader.number(e, k) for k in keys] for e in element.findall(tag)], np.float64
+    ).reshape(-1, 2)
+    if len(corners) == 0:
+        return None
+    if not np.isfinite(corners).all():
+        reader.warn("outline that is not finite, left out")
+        return None
+    return Outline(on_road, corners)
+
+
+def _read_repeat(element: Any, reader: Reader) -> Repeat:
+    t_start = reader.number(element, "tStart")
+    return Repeat(
+        reader.number(element, "s"),
+        reader.number(element, "length"),
+        reader.number(element, "distance"),
+        t_start,
+        reader.number(element, "tEnd", t_start),
+    )
+
+
+def _read_validity(element: Any, reader: Reader) -> tuple[tuple[int, int], ...]:
+    ranges = []
+    for child in element.findall("validity"):
+        first, last = reader.integer(child, "fromLane"), reader.integer(child, "toLane")
+        if first is not None and last is not None:
+            ranges.append((min(first, last), max(first, last)))
+    return tuple(ranges)
+
+
+def _optional(element: Any, name: str, reader: Reader) -> float | None:
+    if element.get(name) is None:
+        return None
+    value = reader.number(element, name)
+    return value if np.isfinite(value) else None
+
+
+def read_signal(element: Any, reader: Reader) -> Signal:
+    """One signal, or a reference to one."""
+    kind, subtype = element.get("type", ""), element.get("subtype", "")
+    subtype = "" if subtype in ("-1", "none") else subtype
+    is_reference = element.tag == "signalReference"
+    if not is_reference:
+        label = f"{element.get('country', '')}:{kind}" + (f".{subtype}" if subtype else "")
+        reader.counts[f"signal {label}"] += 1
+    value = _optional(element, "value", reader)
+    return Signal(
+        id=element.get("id", ""),
+        name=element.get("name", ""),
+        type=kind,
+        subtype=subtype,
+        country=element.get("country", ""),
+        dynamic=element.get("dynamic") == "yes",
+        s=reader.number(element, "s"),
+        t=reader.number(element, "t"),
+        orientation=element.get("orientation", "none"),
+        value=value,
+        unit=element.get("unit", ""),
+        width=_optional(element, "width", reader),
+        lanes=_read_validity(element, reader),
+        reference=is_reference,
+    )

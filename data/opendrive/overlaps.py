@@ -1,0 +1,290 @@
+"""Lanes that lie over each other: crossings without a junction, slivers, bridges.
+
+No point may lie inside two lanes (deepplan-conversion.md §2.6). Where lanes cross, both roadblocks
+are cut and the pieces in between become connectors of an intersection. Other overlaps are taken
+away from the longer lane. Lanes on different levels stay as they are.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, LaneRun, Piece, split_pieces
+from shiftsim.data.opendrive.lanes import evaluate_cubics
+from shiftsim.data.opendrive.records import OpenDrive
+from shiftsim.data.opendrive.shapes import Shapes, lane_polygon, largest_part
+
+OVERLAP = 1e-6  # m², less is a shared border
+LEVEL = 3.0  # m of height between lanes that do not meet
+_CROSSING_ANGLE = np.deg2rad(20.0)  # flatter overlaps are merges, not crossings
+_MARGIN, _MIN_LANE = 0.5, 1.0  # m around a crossing; shorter lanes beside it join it
+_SAMPLE = 1.0  # m
+_MAX_VANISHED = 8  # lanes in a row that lie within crossings
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Points along a chain of pieces, to find places on it.
+
+    Attributes:
+        xy: (K, 2) centre points [m].
+        distance: (K,) along the reference lines from the start [m].
+        height: (K,) of the road [m].
+    """
+
+    xy: FloatArray
+    distance: FloatArray
+    height: FloatArray
+
+    def nearest(self, points: FloatArray) -> list[int]:
+        """Index of the nearest point for each of `points` (N, 2)."""
+        index: list[int] = cKDTree(self.xy).query(points)[1].tolist()
+        return index
+
+    def heading(self, index: int) -> float:
+        """Direction of the chain at a point [rad]."""
+        last = len(self.xy) - 1
+        step = self.xy[min(index + 1, last)] - self.xy[max(index - 1, 0)]
+        return float(np.arctan2(step[1], step[0]))
+
+
+def trace(od: OpenDrive, shapes: Shapes, pieces: Sequence[Piece]) -> Trace:
+    """Points along a chain of pieces, one per metre."""
+    parts, done = [], 0.0
+    for piece in pieces:
+        share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _SAMPLE)), 1) + 1)
+        s = piece.begin + share * (piece.end - piece.begin)
+        elevation = od.roads[piece.key.road].elevation
+        height = evaluate_cubics(elevation, s, s)
+        parts.append((shapes.centers(piece, s), done + share * piece.length, height))
+        done += piece.length
+    xy, distance, heights = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Trace(xy, distance, heights)
+
+
+def overlapping(polygons: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of polygons that share more than a border."""
+    shapes = np.array(polygons, dtype=object)
+    if len(shapes) == 0:
+        return []
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    one, two = one[one < two], two[one < two]
+    areas = shapely.area(shapely.intersection(shapes[one], shapes[two]))
+    kept = areas > OVERLAP
+    return sorted(zip(one[kept].tolist(), two[kept].tolist(), strict=True))
+
+
+class Levels:
+    """Tells which chains of pieces pass over each other; each chain is traced once."""
+
+    def __init__(
+        self,
+        od: OpenDrive,
+        shapes: Shapes,
+        chains: Sequence[Sequence[Piece]],
+        polygons: Sequence[shapely.Polygon],
+    ) -> None:
+        self._od, self._shapes, self._chains, self._polygons = od, shapes, chains, polygons
+        self._traces: dict[int, Trace] = {}
+        self._is_flat = not any(road.elevation[:, 1:].any() for road in od.roads.values())
+
+    def trace(self, chain: int) -> Trace:
+        """Points along one chain."""
+        if chain not in self._traces:
+            self._traces[chain] = trace(self._od, self._shapes, self._chains[chain])
+        return self._traces[chain]
+
+    def are_stacked(self, first: int, second: int) -> bool:
+        """Whether two chains pass their common area on different levels."""
+        if self._is_flat:
+            return False
+        region = shapely.intersection(self._polygons[first], self._polygons[second])
+        return are_stacked(self.trace(first), self.trace(second), region)
+
+
+def are_stacked(first: Trace, second: Trace, region: shapely.Geometry) -> bool:
+    """Whether two chains pass a common region on different levels."""
+    point = np.array([[region.centroid.x, region.centroid.y]])
+    heights = [t.height[t.nearest(point)[0]] for t in (first, second)]
+    return bool(abs(heights[0] - heights[1]) > LEVEL)
+
+
+def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[LaneGraph, int]:
+    """Make intersections where lanes cross on one level without a junction.
+
+    Returns:
+        The graph, new where something was cut, and how many pairs of lanes cross.
+    """
+    polygons = [lane_polygon(*shapes.joined_borders(lane.pieces)) for lane in graph.lanes]
+    levels = Levels(od, shapes, [lane.pieces for lane in graph.lanes], polygons)
+    intervals: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    crossings = 0
+    for pair in overlapping(polygons):
+        if graph.lanes[pair[0]].block == graph.lanes[pair[1]].block:
+            continue
+        traces = [levels.trace(lane) for lane in pair]
+        region = shapely.intersection(polygons[pair[0]], polygons[pair[1]])
+        if not _cross(traces[0], traces[1], region):
+            continue
+        crossings += 1
+        corners = shapely.get_coordinates(region)
+        for lane, points in zip(pair, traces, strict=True):
+            along = points.distance[points.nearest(corners)]
+            span = float(along.min()) - _MARGIN, float(along.max()) + _MARGIN
+            intervals[graph.lanes[lane].block].append(span)
+    return (_Cutter(graph, intervals).cut() if crossings else graph), crossings
+
+
+def _cross(first: Trace, second: Trace, region: shapely.Geometry) -> bool:
+    if are_stacked(first, second, region):
+        return False
+    point = np.array([[region.centroid.x, region.centroid.y]])
+    turn = first.heading(first.nearest(point)[0]) - second.heading(second.nearest(point)[0])
+    angle = abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    return bool(_CROSSING_ANGLE < angle < np.pi - _CROSSING_ANGLE)
+
+
+class _Cutter:
+    """Cuts roadblocks at intervals; what lies in the intervals becomes connectors."""
+
+    def __init__(self, graph: LaneGraph, intervals: dict[int, list[tuple[float, float]]]) -> None:
+        self.old = graph
+        self.intervals = intervals
+        self.blocks: dict[tuple[int, int], int] = {}
+        self.lanes: list[LaneRun] = []
+        self.inner: list[ConnectorRun] = []
+        self.ends: dict[int, tuple[int, int]] = {}  # first and last new lane of an old one
+        self.lead: dict[int, list[Piece]] = {}  # pieces that go to the connectors before
+        self.trail: dict[int, list[Piece]] = {}
+        self.whole: dict[int, list[Piece]] = {}  # lanes that vanish into connectors
+        self.onward: dict[int, list[ConnectorRun]] = defaultdict(list)
+        self.dropped = list(graph.dropped)
+
+    def cut(self) -> LaneGraph:
+        """The graph after all cuts."""
+        for number, lane in enumerate(self.old.lanes):
+            self._cut_lane(number, lane)
+        outer = self._outer_connectors()
+        order = sorted(range(len(self.lanes)), key=lambda i: (self.lanes[i].block, i))
+        place = {old: new for new, old in enumerate(order)}
+        connectors = [
+            replace(c, source=place[c.source], target=place[c.target])
+            for c in (*outer, *self.inner)
+        ]
+        return LaneGraph([self.lanes[i] for i in order], connectors, self.dropped)
+
+    def _cut_lane(self, number: int, lane: LaneRun) -> None:
+        length = sum(piece.length for piece in lane.pieces)
+        spans = _merge(self.intervals.get(lane.block, []), length)
+        stops = [0.0, *(stop for span in spans for stop in span), length]
+        free = [
+            (part, begin, end)
+            for part, (begin, end) in enumerate(zip(stops[::2], stops[1::2], strict=True))
+            if end > begin
+        ]
+        if not free:
+            self.whole[number] = lane.pieces
+            return
+        first = len(self.lanes)
+        for part, begin, end in free:
+            block = self.blocks.setdefault((lane.block, part), len(self.blocks))
+            pieces = _pieces_between(lane.pieces, begin, end) if spans else lane.pieces
+            self.lanes.append(LaneRun(pieces, block, lane.index))
+        for k, ((_, _, begin), (part, end, _)) in enumerate(pairwise(free)):
+            label = frozenset({f"crossing before part {part} of block {lane.block}"})
+            pieces = _pieces_between(lane.pieces, begin, end)
+            self.inner.append(ConnectorRun(pieces, first + k, first + k + 1, label))
+        self.ends[number] = first, len(self.lanes) - 1
+        self.lead[number] = _pieces_between(lane.pieces, 0.0, free[0][1])
+        self.trail[number] = _pieces_between(lane.pieces, free[-1][2], length)
+
+    def _outer_connectors(self) -> list[ConnectorRun]:
+        """Connectors of the old graph, longer where lanes were cut at their ends."""
+        for connector in self.old.connectors:
+            self.onward[connector.source].append(connector)
+        out: list[ConnectorRun] = []
+        for connector in self.old.connectors:
+            if connector.source not in self.whole:
+                pieces = [*self.trail[connector.source], *connector.pieces]
+                out += self._extend(connector, pieces, connector.junctions, ())
+        sources, targets = {c.source for c in out}, {c.target for c in out}
+        for number, (first, last) in self.ends.items():
+            self.dropped += self.lead[number] if first not in targets else []
+            self.dropped += self.trail[number] if last not in sources else []
+        for pieces in self.whole.values():
+            self.dropped += pieces  # part of the drivable area in any case
+        return out
+
+    def _extend(
+        self,
+        connector: ConnectorRun,
+        pieces: list[Piece],
+        junctions: frozenset[str],
+        passed: tuple[int, ...],
+    ) -> list[ConnectorRun]:
+        """A connector up to the next lane that is left, through lanes that vanished."""
+        target = passed[-1] if passed else connector.target
+        if target not in self.whole:
+            source = self.ends[connector.source][1]
+            pieces = [*pieces, *self.lead[target]]
+            return [ConnectorRun(pieces, source, self.ends[target][0], junctions)]
+        found = []
+        for following in self.onward[target]:
+            if following.target not in passed and len(passed) < _MAX_VANISHED:
+                found += self._extend(
+                    connector,
+                    [*pieces, *self.whole[target], *following.pieces],
+                    junctions | following.junctions | {f"crossing over lane {target}"},
+                    (*passed, following.target),
+                )
+        return found
+
+
+def _merge(spans: Sequence[tuple[float, float]], length: float) -> list[tuple[float, float]]:
+    """Spans within a lane, in order, without lanes too short to stay between them."""
+    merged: list[tuple[float, float]] = []
+    for begin, end in sorted(spans):
+        begin = 0.0 if begin < _MIN_LANE else begin
+        end = length if end > length - _MIN_LANE else end
+        if begin >= length or end <= 0.0:
+            continue
+        if merged and begin - merged[-1][1] < _MIN_LANE:
+            merged[-1] = (merged[-1][0], max(end, merged[-1][1]))
+        else:
+            merged.append((begin, end))
+    return merged
+
+
+def _pieces_between(pieces: list[Piece], begin: float, end: float) -> list[Piece]:
+    if end <= begin:
+        return []
+    _, tail = split_pieces(pieces, begin)
+    return split_pieces(tail, end - begin)[0]
+
+
+def subtract_overlaps(
+    polygons: Sequence[shapely.Polygon], lengths: Sequence[float], stacked: set[tuple[int, int]]
+) -> tuple[list[shapely.Polygon], int]:
+    """Polygons without the overlaps, which go to the shorter of two; and how many there were.
+
+    Args:
+        polygons: Areas.
+        lengths: How long each is [m].
+        stacked: Pairs (i, j), i < j, that may overlap.
+    """
+    out = list(polygons)
+    pairs = [pair for pair in overlapping(polygons) if pair not in stacked]
+    for i, j in pairs:
+        longer, other = (i, j) if lengths[i] >= lengths[j] else (j, i)
+        for loser, keeper in ((longer, other), (other, longer)):
+            rest = largest_part(out[loser].difference(out[keeper]))
+            if rest.area > 0.01:
+                out[loser] = rest
+                break
+    return out, len(pairs)

@@ -1,0 +1,91 @@
+"""What is done to the records of a file before a map is made of them."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from shiftsim.data.opendrive.areas import PAVED, SEAMS, WALKED
+from shiftsim.data.opendrive.curves import ReferenceLine, length_error
+from shiftsim.data.opendrive.graph import DRIVABLE
+from shiftsim.data.opendrive.lanes import border_is_mirrored
+from shiftsim.data.opendrive.records import OpenDrive, Road
+from shiftsim.errors import MapError
+
+UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
+GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m, opendrive.md §7
+MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
+MAX_LANE_LENGTH = 3e6  # m, of all lanes together
+
+
+def prepare(od: OpenDrive, warnings: Counter[str]) -> OpenDrive:
+    """The file in the frame of its header, without roads that cannot be drawn.
+
+    Args:
+        od: The file.
+        warnings: Takes a count per kind of what is wrong with the roads.
+
+    Raises:
+        MapError: The file has more road than one map can hold.
+    """
+    roads = {}
+    for name, road in od.roads.items():
+        errors = [length_error(geometry) for geometry in road.geometries]
+        if max(errors) > MAX_LENGTH_ERROR:
+            warnings["road left out: paramPoly3 far from its stated length"] += 1
+            continue
+        wrong = sum(error > 0 for error in errors)
+        if wrong:
+            warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
+        _note_gaps(road, warnings)
+        _note_lanes(road, warnings)
+        roads[name] = _placed(road, od.offset) if od.offset else road
+    total = sum(
+        (road.section_end(index) - section.s) * len(section.lanes)
+        for road in roads.values()
+        for index, section in enumerate(road.sections)
+    )
+    if total > MAX_LANE_LENGTH:
+        raise MapError(
+            f"{od.source}: {total / 1000:.0f} km of lanes, more than {MAX_LANE_LENGTH / 1000:.0f}",
+            "cut the map into smaller files",
+        )
+    return replace(od, roads=roads, offset=None)
+
+
+def _placed(road: Road, offset: tuple[float, float, float, float]) -> Road:
+    """A road with the header's offset applied to its reference line."""
+    x, y, _, turn = offset
+    cos, sin = np.cos(turn), np.sin(turn)
+    geometries = tuple(
+        replace(
+            g,
+            x=float(x + cos * g.x - sin * g.y),
+            y=float(y + sin * g.x + cos * g.y),
+            heading=g.heading + turn,
+        )
+        for g in road.geometries
+    )
+    return replace(road, geometries=geometries)
+
+
+def _note_gaps(road: Road, warnings: Counter[str]) -> None:
+    gaps, _ = ReferenceLine(road.geometries).joints()
+    small = int(((gaps > GAP_NOTED) & (gaps <= GAP_SERIOUS)).sum())
+    serious = int((gaps > GAP_SERIOUS).sum())
+    if small:
+        warnings[f"gap of more than {GAP_NOTED:g} m between geometries"] += small
+    if serious:
+        warnings[f"gap of more than {GAP_SERIOUS:g} m between geometries"] += serious
+
+
+def _note_lanes(road: Road, warnings: Counter[str]) -> None:
+    known = DRIVABLE | PAVED | WALKED | SEAMS | UNUSED
+    for section in road.sections:
+        for lane in section.lanes.values():
+            if lane.type in ("tram", "rail"):
+                warnings["tram or rail lane left out"] += 1
+            elif lane.type not in known:
+                warnings["lane of unknown type left out"] += 1
+            if border_is_mirrored(lane):
+                warnings["border of a right lane given on the left, mirrored"] += 1

@@ -1,0 +1,409 @@
+"""OpenDRIVE XML to the records of `opendrive_records`.
+
+Nothing is evaluated here. Real files are seldom quite right (opendrive.md §7): what can be mended
+is mended and counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error
+that names file, road and element.
+"""
+
+import io
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree
+
+from shiftsim.data.opendrive.objects import read_object, read_signal
+from shiftsim.data.opendrive.records import (
+    ARC,
+    LINE,
+    PARAM_POLY3,
+    POLY3,
+    SPIRAL,
+    Connection,
+    Geometry,
+    Junction,
+    Lane,
+    LaneSection,
+    OpenDrive,
+    Road,
+    RoadLink,
+    RoadType,
+    Speed,
+)
+from shiftsim.data.opendrive.xml import CUBIC, Reader
+from shiftsim.errors import ConversionError
+
+MAX_BYTES = 200_000_000
+MAX_COORDINATE = 1e8  # m, beyond any projection of the earth
+MAX_LENGTH = 1e5  # m, of one road
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}  # opendrive.md §5
+TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
+_PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
+_TOP_LEVEL = ("OpenDRIVE", "header", "road", "junction")
+
+
+def read_opendrive(path: Path) -> OpenDrive:
+    """Read an OpenDRIVE file (1.0 to 1.8).
+
+    Entities, document types and external references are refused: the file is data, not a program.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its roads and junctions; an empty file gives none.
+
+    Raises:
+        ConversionError: The file is missing, too large, not OpenDRIVE, or broken beyond repair.
+    """
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= MAX_BYTES else b""
+    except OSError as error:
+        raise ConversionError(
+            f"{path.name}: cannot be read: {error.strerror}", "give the path of an .xodr file"
+        ) from error
+    if size > MAX_BYTES:
+        raise ConversionError(
+            f"{path.name}: {size} bytes, more than {MAX_BYTES}", "cut the map into smaller files"
+        )
+    return parse_opendrive(data, path.name)
+
+
+def parse_opendrive(data: bytes, source: str) -> OpenDrive:
+    """Like `read_opendrive`, from the bytes of a file."""
+    reader = Reader(source)
+    header: Any = None
+    roads: dict[str, Road] = {}
+    seen: set[str] = set()
+    junctions: dict[str, Junction] = {}
+    for element in _top_elements(_strip_junk(data, reader), reader):
+        name = element.get("id", "")
+        if element.tag == "header":
+            header = _read_header(element, reader)
+        elif element.tag == "road":
+            reader.place = f"road {name!r}"
+            if name in seen:
+                raise reader.error("its id occurs twice", "give every road its own id")
+            seen.add(name)
+            road = _read_road(element, name, reader)
+            if road is not None:
+                roads[name] = road
+        else:
+            reader.place = f"junction {name!r}"
+            if name in junctions:
+                raise reader.error("its id occurs twice", "give every junction its own id")
+            junctions[name] = _read_junction(element, name, reader)
+    revision, geo_reference, offset = header or (("", ""), None, None)
+    return OpenDrive(
+        source=source,
+        revision=revision,
+        geo_reference=geo_reference,
+        offset=offset,
+        roads=roads,
+        junctions=junctions,
+        counts=dict(reader.counts),
+        warnings=dict(reader.warnings),
+    )
+
+
+def _strip_junk(data: bytes, reader: Reader) -> bytes:
+    start = data.find(b"<?xml")
+    if start > 0 and b"<OpenDRIVE" not in data[:start]:
+        if data[:start].strip(b"\xef\xbb\xbf \t\r\n"):
+            reader.warn("bytes before the XML declaration")
+        return data[start:]
+    return data.lstrip(b" \t\r\n")
+
+
+def _top_elements(data: bytes, reader: Reader) -> Iterator[Any]:
+    """Header, roads and junctions one by one; each is freed when the next is asked for."""
+    root = None
+    try:
+        for event, element in etree.iterparse(
+            io.BytesIO(data),
+            events=("start", "end"),
+            tag=[f"{{*}}{name}" for name in _TOP_LEVEL],
+            remove_comments=True,
+            remove_pis=True,
+            resolve_entities=False,
+            load_dtd=False,
+            no_network=True,
+            huge_tree=False,
+        ):
+            if root is None:
+                root = element
+                _check_root(root, reader)
+            if event == "end" and element.getparent() is root:
+                if element.tag.startswith("{"):
+                    _drop_namespaces(element)
+                yield element
+                element.clear()
+    except etree.XMLSyntaxError as error:
+        raise ConversionError(
+            f"{reader.source}: not well-formed XML: {error.msg}", "export the map again"
+        ) from error
+    if root is None:
+        raise _not_opendrive(reader)
+
+
+def _check_root(root: Any, reader: Reader) -> None:
+    if root.getroottree().docinfo.doctype:
+        raise ConversionError(
+            f"{reader.source}: has a DOCTYPE, which OpenDRIVE does not use",
+            "remove the DOCTYPE and its entities",
+        )
+    if root.getparent() is not None or etree.QName(root).localname != "OpenDRIVE":
+        raise _not_opendrive(reader)
+
+
+def _not_opendrive(reader: Reader) -> ConversionError:
+    return ConversionError(
+        f"{reader.source}: its first element is not OpenDRIVE", "give the path of an .xodr file"
+    )
+
+
+def _drop_namespaces(element: Any) -> None:
+    for child in element.iter(etree.Element):
+        child.tag = etree.QName(child).localname
+
+
+def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
+    reader.place = "header"
+    geo = element.findtext("geoReference")
+    shift = element.find("offset")
+    offset = None
+    if shift is not None:
+        offset = tuple(reader.number(shift, key) for key in ("x", "y", "z", "hdg"))
+        if not np.isfinite(offset).all():
+            raise reader.error(f"offset is {offset}", "write finite numbers")
+    revision = (element.get("revMajor", ""), element.get("revMinor", ""))
+    return revision, (geo.strip() or None) if geo else None, offset
+
+
+def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
+    """One road, or None where it has no usable reference line."""
+    junction = element.get("junction", "-1")
+    lanes = element.find("lanes")
+    offsets = [] if lanes is None else lanes.findall("laneOffset")
+    reader.counts["road"] += 1
+    reader.counts["laneOffset"] += len(offsets)
+    reader.counts["road in a junction"] += junction != "-1"
+    reader.counts["road with left-hand traffic"] += element.get("rule") == "LHT"
+    geometries = _read_plan_view(element.find("planView"), reader)
+    stated = reader.number(element, "length", np.nan)
+    sections = (
+        [] if lanes is None else [_read_section(e, reader) for e in lanes.iter("laneSection")]
+    )
+    if geometries is None:
+        return None
+    end = geometries[-1].s + geometries[-1].length
+    if not np.isfinite(stated):
+        reader.warn("road without a length")
+        stated = end
+    elif abs(stated - end) > 0.01:
+        reader.warn("road length is not the end of its geometry")
+    if any(a.s > b.s for a, b in pairwise(sections)):
+        reader.warn("records out of order")
+    link = element.find("link")
+    objects, signals = element.find("objects"), element.find("signals")
+    return Road(
+        id=name,
+        length=min(stated, end),
+        stated_length=stated,
+        junction=None if junction == "-1" else junction,
+        left_hand=element.get("rule") == "LHT",
+        geometries=geometries,
+        offsets=reader.cubics(offsets, "s"),
+        elevation=reader.cubics(element.findall("elevationProfile/elevation"), "s"),
+        sections=tuple(sorted(sections, key=lambda section: section.s)),
+        predecessor=_read_link(link, "predecessor"),
+        successor=_read_link(link, "successor"),
+        types=_read_types(element.findall("type"), reader),
+        objects=()
+        if objects is None
+        else tuple(read_object(e, reader) for e in objects.findall("object")),
+        signals=()
+        if signals is None
+        else tuple(
+            read_signal(e, reader)
+            for e in signals.iter("signal", "signalReference")
+            if e.get("s") is not None
+        ),
+    )
+
+
+def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None:
+    records: list[Geometry] = []
+    tiny: list[Geometry] = []
+    for child in () if element is None else element.findall("geometry"):
+        shape: Any = next(
+            (e for e in child if e.tag in (LINE, ARC, SPIRAL, POLY3, PARAM_POLY3)), None
+        )
+        kind = LINE if shape is None else shape.tag
+        reader.counts[f"geometry {kind}"] += 1
+        length = reader.number(child, "length")
+        s = reader.number(child, "s")
+        x, y, heading = (reader.number(child, k, np.nan) for k in ("x", "y", "hdg"))
+        if shape is None:
+            reader.warn("geometry without a shape taken as a line")
+        if kind == PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
+            reader.warn("road left out: paramPoly3 without coefficients")
+            return None
+        coefficients, p_end = _read_shape(shape, length, reader)
+        if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
+            reader.warn("road left out: geometry is not finite")
+            return None
+        if max(abs(x), abs(y)) > MAX_COORDINATE or max(abs(s), length) > MAX_LENGTH:
+            reader.warn("road left out: geometry is out of this world")
+            return None
+        if length < TINY_LENGTH:
+            reader.warn("geometry without length, skipped")
+            tiny.append(Geometry(s, x, y, heading, max(length, 0.0), LINE))
+        else:
+            records.append(Geometry(s, x, y, heading, length, kind, coefficients, p_end))
+    records = records or tiny[:1]  # a road without length still links its neighbours
+    if not records:
+        reader.warn("road left out: no geometry")
+        return None
+    if any(a.s > b.s for a, b in pairwise(records)):
+        reader.warn("records out of order")
+    return tuple(sorted(records, key=lambda record: record.s))
+
+
+def _read_shape(shape: Any, length: float, reader: Reader) -> tuple[tuple[float, ...], float]:
+    if shape is None or shape.tag == LINE:
+        return (), 0.0
+    names = {ARC: ("curvature",), SPIRAL: ("curvStart", "curvEnd"), POLY3: CUBIC}
+    values = tuple(reader.number(shape, k) for k in names.get(shape.tag, _PARAM_CUBIC))
+    return values, length if shape.get("pRange") == "arcLength" else 1.0
+
+
+def _read_link(link: Any, name: str) -> RoadLink | None:
+    found = None if link is None else link.find(name)
+    if found is None or found.get("elementId") is None:
+        return None
+    contact = found.get("contactPoint")
+    return RoadLink(
+        found.get("elementType", "road"),
+        found.get("elementId"),
+        contact if contact in ("start", "end") else None,
+    )
+
+
+def _read_types(elements: list[Any], reader: Reader) -> tuple[RoadType, ...]:
+    types = []
+    for element in elements:
+        speed = element.find("speed")
+        types.append(
+            RoadType(
+                reader.number(element, "s"),
+                element.get("type", "unknown"),
+                element.get("country", ""),
+                None if speed is None else _read_speed(speed, reader),
+            )
+        )
+    return tuple(sorted(types, key=lambda record: record.s))
+
+
+def _read_speed(element: Any, reader: Reader) -> Speed:
+    unit = element.get("unit", "")
+    reader.counts[f"speed {unit or 'm/s'}"] += 1
+    begin = reader.number(element, "sOffset")
+    text = element.get("max", "undefined")
+    if text in ("no limit", "undefined"):
+        return Speed(begin, None)
+    limit = reader.number(element, "max") * SPEED_UNITS.get(unit, np.nan)
+    if not (np.isfinite(limit) and limit > 0):
+        reader.warn("speed limit that is not a positive number in a known unit")
+        return Speed(begin, None)
+    return Speed(begin, limit)
+
+
+def _read_section(element: Any, reader: Reader) -> LaneSection:
+    lanes: dict[int, Lane] = {}
+    reader.counts["lane section"] += 1
+    for child in element.iter("lane"):
+        number = reader.integer(child, "id")
+        if number is None:
+            raise reader.error(
+                f"lane (line {child.sourceline}) has id={child.get('id')!r}", "number the lanes"
+            )
+        if number == 0:
+            continue
+        if number in lanes:
+            reader.warn("lane id twice in a section, the first holds")
+            continue
+        lanes[number] = _read_lane(child, number, reader)
+    numbers = sorted(lanes)
+    steps = [b - a - (a < 0 < b) for a, b in pairwise(numbers)]
+    nearest = [min((abs(n) for n in numbers if n * sign > 0), default=1) for sign in (-1, 1)]
+    if any(step != 1 for step in steps) or nearest != [1, 1]:
+        reader.warn("lane numbers with holes")
+    start = reader.number(element, "s")
+    if not np.isfinite(start):
+        raise reader.error(f"laneSection (line {element.sourceline}) has s={start}", "correct s")
+    return LaneSection(max(start, 0.0), lanes)
+
+
+def _read_lane(element: Any, number: int, reader: Reader) -> Lane:
+    link = element.find("link")
+    widths, borders = element.findall("width"), element.findall("border")
+    reader.counts["width"] += len(widths)
+    reader.counts["border"] += len(borders)
+    kind = element.get("type", "")
+    reader.counts[f"lane type {kind or 'none'}"] += 1
+    if not widths and not borders:
+        reader.warn("lane without width and border")
+    lane = Lane(
+        id=number,
+        type=kind or "none",
+        widths=reader.cubics(widths, "sOffset"),
+        borders=reader.cubics(borders, "sOffset"),
+        predecessors=_lane_ids(link, "predecessor", reader),
+        successors=_lane_ids(link, "successor", reader),
+        speeds=tuple(
+            sorted((_read_speed(e, reader) for e in element.findall("speed")), key=lambda r: r.s)
+        ),
+        access=tuple(
+            (e.get("rule", "deny"), e.get("restriction", "")) for e in element.findall("access")
+        ),
+        direction=element.get("direction", "standard"),
+    )
+    records = lane.widths if len(lane.widths) else lane.borders
+    if len(records) and records[0, 0] > 1e-6:
+        reader.warn("lane width begins after its section")
+    return lane
+
+
+def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
+    found = [] if link is None else [reader.integer(e, "id") for e in link.findall(name)]
+    return tuple(i for i in found if i is not None)
+
+
+def _read_junction(element: Any, name: str, reader: Reader) -> Junction:
+    kind = element.get("type", "default")
+    reader.counts[f"junction type {kind}"] += 1
+    connections = []
+    for child in element.findall("connection"):
+        links = []
+        for link in child.findall("laneLink"):
+            pair = reader.integer(link, "from"), reader.integer(link, "to")
+            if pair[0] is not None and pair[1] is not None:
+                links.append((pair[0], pair[1]))
+        reader.counts["connection"] += 1
+        reader.counts["lane link in a junction"] += len(links)
+        contact = child.get("contactPoint")
+        connections.append(
+            Connection(
+                child.get("incomingRoad", ""),
+                child.get("connectingRoad") or child.get("linkedRoad") or "",
+                contact if contact in ("start", "end") else None,
+                tuple(links),
+            )
+        )
+    if not connections:
+        reader.warn("junction without connections")
+    return Junction(name, kind, tuple(connections), element.get("mainRoad"))

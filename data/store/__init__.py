@@ -1,0 +1,1 @@
+"""Scenario stores: Parquet files with scenarios and maps."""

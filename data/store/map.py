@@ -1,0 +1,158 @@
+"""A VectorMap as one row of a Parquet file, one list column per array, and back.
+
+Arrays are stored as they are, grids included, so that reading a city costs little more than
+reading its bytes.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from shiftsim.data.store.files import MEND, Table, write_blocks
+from shiftsim.errors import DataError
+from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
+from shiftsim.world.map import VectorMap
+
+_LAYERS = (
+    "edges",
+    "blocks",
+    "intersections",
+    "stop_polygons",
+    "crosswalks",
+    "walkways",
+    "car_parks",
+    "drivable_areas",
+)
+_LINES = ("baselines", "left_boundaries", "right_boundaries")
+_LISTS = (
+    "incoming",
+    "outgoing",
+    "stop_lines",
+    "block_edges",
+    "block_incoming",
+    "block_outgoing",
+)
+_ARRAYS = {  # field -> column with its unit
+    "speed_limits": "speed_limits_mps",
+    "lane_index": "lane_index",
+    "left_lane": "left_lane",
+    "right_lane": "right_lane",
+    "block_of": "block_of",
+    "has_traffic_lights": "has_traffic_lights",
+    "intersection_of": "intersection_of",
+    "turn_type": "turn_type",
+    "is_bike": "is_bike",
+    "intersection_kinds": "intersection_kinds",
+    "stop_kinds": "stop_kinds",
+}
+_UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
+_WIDTHS = {"xy": 2, "bounds": 4}  # columns of the arrays that have two axes
+_WHOLE = ("xy", "arc", "bounds", "grid")  # float parts; all others hold integers
+
+
+def _columns(name: str, kind: type[Any]) -> dict[str, str]:
+    return {part: f"{name}_{_UNITS.get(part, part)}" for part in kind._fields}
+
+
+def _groups() -> dict[str, type[Any]]:
+    kinds = {name: Polygons for name in _LAYERS}
+    return {**kinds, **dict.fromkeys(_LINES, Polylines), **dict.fromkeys(_LISTS, Lists)}
+
+
+def _schema() -> pa.Schema:
+    out: dict[str, pa.DataType] = {}
+    for name, kind in _groups().items():
+        for part, column in _columns(name, kind).items():
+            out[column] = pa.float64() if part in _WHOLE else pa.int64()
+    for name, column in _ARRAYS.items():
+        numbers = pa.float64() if name == "speed_limits" else pa.int64()
+        out[column] = pa.bool_() if name in ("has_traffic_lights", "is_bike") else numbers
+    for name in _LAYERS:
+        out[f"{name}_ids"] = pa.string()
+    out["left_boundary_ids"] = out["right_boundary_ids"] = pa.string()
+    return pa.schema(
+        [
+            pa.field(column, pa.list_(pa.field("item", kind, nullable=False)), nullable=False)
+            for column, kind in out.items()
+        ]
+    )
+
+
+SCHEMA = _schema()
+
+
+def write_map(path: Path, road: VectorMap) -> None:
+    """Write a map; equal maps give equal bytes."""
+    values: dict[str, Any] = {}
+    for name, kind in _groups().items():
+        group = getattr(road, name)
+        flat = group.polygons if isinstance(group, Layer) else group
+        for part, column in _columns(name, kind).items():
+            values[column] = getattr(flat, part).reshape(-1)
+    for name, column in _ARRAYS.items():
+        values[column] = getattr(road, name)
+    for name in _LAYERS:
+        values[f"{name}_ids"] = list(getattr(road, name).ids)
+    values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
+    values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
+    columns = [_one_row(values[field.name], field.type) for field in SCHEMA]
+    footer = {
+        "name": road.name,
+        "epsg": road.epsg,
+        "num_lanes": road.num_lanes,
+        "num_roadblocks": road.num_roadblocks,
+        "flaws": road.flaws,
+    }
+    write_blocks(path, [pa.Table.from_arrays(columns, schema=SCHEMA)], footer)
+
+
+def _one_row(values: Any, kind: pa.DataType) -> pa.Array:
+    items = pa.array(values, kind.value_type)
+    offsets = pa.array([0, len(items)], pa.int32())
+    return pa.ListArray.from_arrays(offsets, items, type=kind)
+
+
+def read_map_file(path: Path) -> VectorMap:
+    """Read a map back; its arrays are read-only.
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    file = Table(path, SCHEMA)
+    if file.num_rows != 1:
+        raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=MEND)
+    # column by column: decoding a city at once takes three times its size
+    items = {name: _items(file.read(columns=[name])[name]) for name in SCHEMA.names}
+    pa.default_memory_pool().release_unused()
+    try:
+        return _assemble(file.footer, items)
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: the arrays do not fit together: {error}", hint=MEND) from error
+
+
+def _items(column: pa.ChunkedArray) -> Any:
+    values = column.chunk(0).flatten()
+    if pa.types.is_string(values.type):
+        return tuple(values.to_pylist())
+    array = values.to_numpy(zero_copy_only=False)
+    array.flags.writeable = False
+    return array
+
+
+def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
+    parts: dict[str, Any] = {}
+    for name, kind in _groups().items():
+        flat = {
+            part: items[column].reshape(-1, _WIDTHS[part]) if part in _WIDTHS else items[column]
+            for part, column in _columns(name, kind).items()
+        }
+        parts[name] = kind(**flat)
+    for name in _LAYERS:
+        ids = items[f"{name}_ids"]
+        if len(ids) != len(parts[name].poly_ptr) - 1:
+            raise ValueError(f"{name}: {len(ids)} ids")
+        parts[name] = Layer(ids, parts[name])
+    parts.update({name: items[column] for name, column in _ARRAYS.items()})
+    pairs = zip(items["left_boundary_ids"], items["right_boundary_ids"], strict=True)
+    return VectorMap(boundary_ids=tuple(pairs), **parts, **footer)

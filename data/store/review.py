@@ -1,0 +1,200 @@
+"""The review of a store by people: decisions and corrected routes, as an overlay.
+
+`review/review.jsonl` in the store holds one JSON object per reviewed scenario (see
+deepplan-conversion.md §10): `token`, `decision` (accept, reject or empty), `comment`, `route` (ids
+of the corrected route, or null), `reviewer`, `version`. The scenarios themselves keep their bytes.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import DataError
+from shiftsim.world.map import VectorMap
+
+REVIEW = "review/review.jsonl"
+ACCEPT, REJECT, UNDECIDED = "accept", "reject", ""
+_DECISIONS = (ACCEPT, REJECT, UNDECIDED)
+
+
+@dataclass(frozen=True, slots=True)
+class Review:
+    """What a person says of one scenario.
+
+    Attributes:
+        token: The scenario.
+        decision: `accept`, `reject`, or empty where there is only a comment or a route.
+        comment: Why.
+        route: Corrected route roadblock ids; None where the recorded route stands.
+        reviewer: Who says so.
+        version: Version of shiftsim it was written with.
+    """
+
+    token: str
+    decision: str = UNDECIDED
+    comment: str = ""
+    route: tuple[str, ...] | None = None
+    reviewer: str = ""
+    version: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it says nothing."""
+        return self.decision == UNDECIDED and not self.comment and self.route is None
+
+
+class Reviews(Mapping[str, Review]):
+    """The reviews of a store, by scenario."""
+
+    def __init__(self, reviews: Iterable[Review] = ()) -> None:
+        self._by_token = {review.token: review for review in reviews if not review.is_empty}
+
+    def __getitem__(self, token: str) -> Review:
+        return self._by_token[token]
+
+    def __iter__(self) -> Any:
+        return iter(sorted(self._by_token))
+
+    def __len__(self) -> int:
+        return len(self._by_token)
+
+    @property
+    def hash(self) -> str:
+        """Digest of everything that changes a run: decisions and routes; empty without reviews."""
+        rows = [
+            [token, self[token].decision, self[token].route]
+            for token in self
+            if self[token].decision or self[token].route is not None
+        ]
+        return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
+
+    @property
+    def route_hash(self) -> str:
+        """Digest of the corrected routes; empty without any."""
+        rows = [[token, self[token].route] for token in self if self[token].route is not None]
+        return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
+
+    def usable(self, tokens: Iterable[str], accepted: Iterable[str]) -> tuple[str, ...]:
+        """The scenarios to use: a person's decision goes before the filter's.
+
+        Args:
+            tokens: All scenarios, sorted.
+            accepted: Those that the filter accepted.
+        """
+        kept = set(accepted)
+        decided = {token: self[token].decision for token in self}
+        return tuple(
+            token
+            for token in tokens
+            if decided.get(token) == ACCEPT or (token in kept and decided.get(token) != REJECT)
+        )
+
+    def with_review(self, review: Review) -> "Reviews":
+        """The reviews with one replaced, or removed when it says nothing."""
+        return Reviews([*(self[t] for t in self if t != review.token), review])
+
+
+def read_reviews(store: Path) -> Reviews:
+    """The reviews of a store; none where nobody reviewed it.
+
+    Raises:
+        DataError: The file is damaged.
+    """
+    path = store / REVIEW
+    if not path.is_file():
+        return Reviews()
+    out: dict[str, Review] = {}
+    for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
+        if not line.strip():
+            continue
+        review = _review(line, f"{path}: line {number}")
+        if review.token in out:
+            raise DataError(
+                f"{path}: line {number}: scenario {review.token!r} is reviewed twice",
+                hint="keep one of the lines",
+            )
+        out[review.token] = review
+    return Reviews(out.values())
+
+
+def _review(line: str, where: str) -> Review:
+    names = [item.name for item in fields(Review)]
+    try:
+        values = json.loads(line)
+    except ValueError as error:
+        raise DataError(f"{where}: not JSON: {error}", hint="mend or remove that line") from error
+    if not isinstance(values, dict) or set(values) - set(names) or "token" not in values:
+        raise DataError(f"{where}: not a review", hint=f"its fields are {', '.join(names)}")
+    route = values.get("route")
+    texts = [value for name, value in values.items() if name != "route"]
+    good_route = route is None or (
+        isinstance(route, list) and bool(route) and all(isinstance(item, str) for item in route)
+    )
+    if not all(isinstance(text, str) for text in texts) or not good_route:
+        raise DataError(
+            f"{where}: a field has a wrong type",
+            hint="route is a list of roadblock ids or null, everything else a text",
+        )
+    if values.get("decision", "") not in _DECISIONS:
+        raise DataError(
+            f"{where}: decision {values['decision']!r}", hint="accept, reject, or nothing"
+        )
+    return Review(**{**values, "route": None if route is None else tuple(route)})
+
+
+def write_reviews(store: Path, reviews: Reviews) -> Path:
+    """Write the reviews of a store, whole or not at all; returns the file."""
+    path = store / REVIEW
+    path.parent.mkdir(exist_ok=True)
+    lines = [json.dumps(asdict(reviews[token]), ensure_ascii=False) + "\n" for token in reviews]
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", encoding="utf-8") as file:
+        file.write("".join(lines))
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+    return path
+
+
+def require_blocks(road: VectorMap, review: Review, where: str) -> None:
+    """Every roadblock of a corrected route must be on the map.
+
+    Raises:
+        DataError: One is not.
+    """
+    unknown = [name for name in review.route or () if name not in road.blocks.index]
+    if unknown:
+        raise DataError(
+            f"{where}: the corrected route of {review.token!r} has roadblock {unknown[0]!r}, "
+            f"which map {road.name!r} does not have",
+            hint=f"correct it with `shiftsim inspect`, or remove its line from {REVIEW}",
+        )
+
+
+def route_problems(road: VectorMap, route: Sequence[str], start: int | None) -> list[str]:
+    """What is wrong with a route, in words; nothing for a good one.
+
+    Args:
+        road: The map.
+        route: Roadblock ids from start to goal.
+        start: Block the ego stands on at the first iteration, None where it is on none.
+    """
+    unknown = [name for name in route if name not in road.blocks.index]
+    if unknown:
+        return [f"roadblock {unknown[0]} is not on the map"]
+    blocks = [road.blocks.index[name] for name in route]
+    problems = [] if len(blocks) > 1 else ["a route has at least two roadblocks"]
+    twice = sorted({route[i] for i, block in enumerate(blocks) if block in blocks[:i]})
+    problems += [f"roadblock {name} is there twice" for name in twice]
+    problems += [
+        f"{route[i]} does not lead to {route[i + 1]}"
+        for i in range(len(blocks) - 1)
+        if blocks[i + 1] not in road.block_outgoing.at(blocks[i])
+    ]
+    if start is not None and start not in blocks:
+        problems.append(f"the ego starts on {road.blocks.ids[start]}, which is not on the route")
+    return problems

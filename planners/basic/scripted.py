@@ -1,0 +1,135 @@
+"""Replays given pose sequences: reference cases and recorded plans."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shiftsim.errors import ConfigError, DataError, PlannerError
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.state import AX, AY, NUM_STATE, STEERING, VX, VY, YAW_RATE, Trajectory
+
+SAMPLES = 81  # 8 s at 0.1 s
+_REQUIRED = {"x": 0, "y": 1, "heading": 2}
+_OPTIONAL = {
+    "vx": VX,
+    "vy": VY,
+    "ax": AX,
+    "ay": AY,
+    "tire_steering_angle": STEERING,
+    "angular_velocity": YAW_RATE,
+}
+_PREFIX = "scripted_"  # of the script's name in reference files
+
+
+class Scripted:
+    """Plans the next 81 samples of a sequence from a file, whatever the simulated ego does."""
+
+    name = "scripted"
+
+    def __init__(self, file: Path, *, name: str = "") -> None:
+        """Read the sequences.
+
+        Args:
+            file: Parquet or CSV file with the columns scene (log name or token of the scenario),
+                planner (name of the script), time_us (log time stamps), x, y, heading of the rear
+                axle in the map frame, and if known vx, vy, ax, ay, tire_steering_angle,
+                angular_velocity.
+            name: Which script; may be left out where a scene has a single one.
+        """
+        self._file = Path(file)
+        self._script = name.removeprefix(_PREFIX)
+        self._scripts = _read(self._file)
+        self._sequence: Trajectory | None = None
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Choose the sequence of the scenario.
+
+        Raises:
+            ConfigError: The file has none for it, or several and no name was given.
+        """
+        known = {
+            script: sequence
+            for place in (scene.expert.log_name, scene.token)
+            for script, sequence in self._scripts.get(place, {}).items()
+        }
+        wanted = self._script or (next(iter(known)) if len(known) == 1 else "")
+        if wanted not in known:
+            names = ", ".join(sorted(known)) or "none"
+            asked = f"script {wanted!r}" if wanted else "single script"
+            raise ConfigError(
+                f"{self._file} has no {asked} for scenario {scene.token!r} "
+                f"(log {scene.expert.log_name!r})",
+                hint=f"scripts of this scenario: {names}; choose with --planner-arg name=…",
+            )
+        self._sequence = known[wanted]
+
+    def plan(self, observation: Observation) -> Trajectory:
+        """81 samples from the last one that is not after the present.
+
+        Raises:
+            PlannerError: The sequence starts after the present.
+        """
+        if self._sequence is None:
+            raise PlannerError("scripted: plan() was called before reset()")
+        times = self._sequence.time_us
+        first = int(np.searchsorted(times, observation.time_us, side="right")) - 1
+        if first < 0:
+            raise PlannerError(
+                f"{self._file}: the sequence starts at {times[0]} us, after iteration "
+                f"{observation.iteration} ({observation.time_us} us)",
+                hint="its time stamps must be those of the log",
+            )
+        rows = slice(first, first + SAMPLES)
+        return Trajectory(times[rows], self._sequence.states[rows])
+
+
+def _read(path: Path) -> dict[str, dict[str, Trajectory]]:
+    """Sequences by scene and name of the script, each in the order of time."""
+    columns = _read_columns(path)
+    groups: dict[tuple[str, str], list[int]] = {}
+    keys = zip(columns["scene"].tolist(), columns["planner"].tolist(), strict=True)
+    for row, (scene, script) in enumerate(keys):
+        groups.setdefault((str(scene), str(script).removeprefix(_PREFIX)), []).append(row)
+    times = _numbers(columns, "time_us", path).astype(np.int64)
+    states = np.zeros((len(times), NUM_STATE))
+    for column, index in {**_REQUIRED, **_OPTIONAL}.items():
+        if column in columns:
+            states[:, index] = _numbers(columns, column, path)
+    out: dict[str, dict[str, Trajectory]] = {}
+    for (scene, script), members in groups.items():
+        rows = np.array(members)
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        if (np.diff(times[rows]) <= 0).any():
+            raise DataError(f"{path}: scene {scene!r}, script {script!r}: a time occurs twice")
+        out.setdefault(scene, {})[script] = Trajectory(times[rows], states[rows])
+    return out
+
+
+def _read_columns(path: Path) -> dict[str, Any]:
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    try:
+        read = pa.csv.read_csv if path.suffix.lower() == ".csv" else pa.parquet.read_table
+        table = read(path)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            f"{path}: not a readable Parquet or CSV file ({error})",
+            hint="scripts are tables with scene, planner, time_us, x, y and heading",
+        ) from error
+    for name in ("scene", "planner", "time_us", *_REQUIRED):
+        if name not in table.column_names:
+            raise DataError(
+                f"{path}: column {name!r} is missing",
+                hint="scripts are tables with scene, planner, time_us, x, y and heading",
+            )
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def _numbers(columns: dict[str, Any], name: str, path: Path) -> Any:
+    values = columns[name]
+    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise DataError(f"{path}: column {name!r} has values that are not finite numbers")
+    return values

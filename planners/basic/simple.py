@@ -1,0 +1,58 @@
+"""nuPlan's SimplePlanner: straight on, and not faster than a limit (idm-planner.md §8)."""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, kernel
+from shiftsim.sim.dynamics.bicycle import step_bicycle
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.state import (
+    AX,
+    AY,
+    NUM_STATE,
+    PACIFICA,
+    STEERING,
+    STEERING_RATE,
+    VX,
+    VY,
+    Trajectory,
+)
+
+STEPS = 40  # 10 s at 0.25 s
+STEP_US = 250_000
+
+
+@kernel
+def _roll_out(states: FloatArray, max_speed: float, wheel_base: float) -> None:
+    """Fill rows 1… of `states` (H, 11) from row 0; above `max_speed` [m/s] the ego brakes."""
+    before = np.empty(states.shape[1])
+    for row in range(1, len(states)):
+        # nuPlan: the new acceleration is not written back into the earlier state
+        before[:] = states[row - 1]
+        speed = np.sqrt(before[VX] ** 2 + before[VY] ** 2)
+        if speed > max_speed:
+            before[AX] = (max_speed - speed) / 1.0
+        step_bicycle(
+            before, before[AX], before[STEERING_RATE], wheel_base, STEP_US * 1e-6, states[row]
+        )
+
+
+class Simple:
+    """Keeps the heading; a speed above the limit decays towards it."""
+
+    name = "simple"
+
+    def __init__(self, *, max_velocity: float = 5.0) -> None:
+        """`max_velocity`: Speed above which it brakes [m/s]."""
+        self._max_velocity = max_velocity
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Nothing to prepare."""
+
+    def plan(self, observation: Observation) -> Trajectory:
+        """The present state without acceleration and steering, and 40 steps of 0.25 s from it."""
+        states = np.zeros((STEPS + 1, NUM_STATE))
+        states[0] = observation.ego.values
+        states[0, [AX, AY]] = 0.0
+        states[0, STEERING:] = 0.0
+        _roll_out(states, self._max_velocity, PACIFICA.wheel_base)
+        return Trajectory(observation.time_us + STEP_US * np.arange(STEPS + 1), states)

@@ -1,0 +1,1 @@
+"""nuPlan's IDM planner."""

@@ -1,0 +1,1 @@
+"""Adapters of learned planners, and what they share."""

@@ -1,0 +1,87 @@
+"""What the adapters of learned planners share: one network, a plan per scenario, batches.
+
+An adapter is three steps: features of an observation (numpy), the network (one forward pass for a
+whole batch), and the plan decoded from its output. Forks share the network; everything that belongs
+to one scenario is made in `reset`.
+"""
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Generic, Self, TypeVar, cast
+
+from shiftsim.sim.planner import BatchPlanner, Observation, SceneInfo
+from shiftsim.world.state import Command, Trajectory
+
+Features = TypeVar("Features")
+Output = TypeVar("Output")
+
+
+class LearnedPlanner(ABC, Generic[Features, Output]):
+    """Base of the adapters.
+
+    Attributes:
+        degraded: Why the last plan is a makeshift; empty when it is not.
+    """
+
+    degraded: str = ""
+
+    @abstractmethod
+    def reset(self, scene: SceneInfo) -> None:
+        """Make everything that belongs to this scenario, and nothing that does not."""
+
+    @abstractmethod
+    def features(self, observation: Observation) -> Features:
+        """What the network reads."""
+
+    @abstractmethod
+    def infer(self, features: Sequence[Features]) -> Sequence[Output]:
+        """One forward pass over a batch; the outputs in the same order."""
+
+    @abstractmethod
+    def decode(self, output: Output, observation: Observation) -> Trajectory | Command:
+        """The plan of this scenario; sets `degraded`."""
+
+    def fork(self) -> Self:
+        """A planner for one more scenario that shares the network with this one."""
+        return copy.copy(self)
+
+    def plan(self, observation: Observation) -> Trajectory | Command:
+        """The plan for one scenario alone."""
+        (output,) = self.infer([self.features(observation)])
+        return self.decode(output, observation)
+
+    def plan_batch(
+        self, planners: Sequence[BatchPlanner], observations: Sequence[Observation]
+    ) -> list[Trajectory | Command | Exception]:
+        """Plans of forks in lock step; an exception in place of a plan ends that scenario only."""
+        forks = [cast(LearnedPlanner[Features, Output], planner) for planner in planners]
+        read: list[Any] = [
+            _caught(fork.features, observation)
+            for fork, observation in zip(forks, observations, strict=True)
+        ]
+        good = [i for i, features in enumerate(read) if not isinstance(features, Exception)]
+        plans: list[Any] = list(read)
+        for i, output in zip(good, self._infer_all([read[i] for i in good]), strict=True):
+            failed = isinstance(output, Exception)
+            plans[i] = output if failed else _caught(forks[i].decode, output, observations[i])
+        return plans
+
+    def _infer_all(self, features: Sequence[Features]) -> Sequence[Any]:
+        """Outputs of a batch; where that fails, of each alone, with an error for the guilty."""
+        if not features:
+            return ()
+        outputs = _caught(self.infer, features)
+        if not isinstance(outputs, Exception):
+            return cast(Sequence[Any], outputs)
+        if len(features) == 1:
+            return (outputs,)
+        return [_caught(lambda one: self.infer([one])[0], one) for one in features]
+
+
+def _caught(function: Any, *arguments: Any) -> Any:
+    """The result, or the error: it must not reach the other scenarios of the batch."""
+    try:
+        return function(*arguments)
+    except Exception as error:  # becomes this scenario's failure in the simulator
+        return error

@@ -1,0 +1,184 @@
+"""The network of CaRL (planner-carl.md §3), with the names and shapes of its checkpoint."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from shiftsim.planners.learned.deterministic import State
+from shiftsim.planners.learned.network.rows import Convolution, Linear
+
+PREFIXES = ("",)  # of the names in the published checkpoint
+CHANNELS, SIZE = 9, 256  # of the picture
+MEASUREMENTS, VALUE_MEASUREMENTS, ACTIONS = 10, 4, 2
+FEATURES, HIDDEN = 256, 512
+CONVOLUTIONS = (  # channels out, kernel, stride
+    *((8, 5, 2), (16, 5, 2), (24, 5, 2), (32, 5, 2)),
+    *((64, 3, 2), (128, 3, 1), (256, 3, 1)),
+)
+_SMALL = 6  # pixels wide: convolutions that a library does in another way for one picture
+FLAT = 1024  # numbers that the convolutions leave
+RELEASED = {
+    "image_encoder": "roach_ln2",
+    "in_channels": CHANNELS,
+    "image": [SIZE, SIZE],
+    "use_layer_norm": True,
+    "use_layer_norm_policy_head": True,
+    "features_dim": FEATURES,
+    "states_neurons": [FEATURES, FEATURES],
+    "policy_head_arch": [FEATURES, FEATURES],
+    "value_head_arch": [FEATURES, FEATURES],
+    "obs_num_measurements": MEASUREMENTS,
+    "num_value_measurements": VALUE_MEASUREMENTS,
+    "distribution": "beta",
+    "beta_min_a_b_value": 1.0,
+    "action_dim": ACTIONS,
+    "action_low": -1.0,
+    "action_high": 1.0,
+    "use_lstm": False,
+    "layer_norm_eps": 1e-5,
+}
+LEAST = 1.0  # of both parameters of the distribution
+_CONSTANTS = {  # stored in the checkpoint, never trained
+    "action_space_low": [-1.0, -1.0],
+    "action_space_high": [1.0, 1.0],
+    "action_dist.suggest_go": [2.5, 1.0],
+    "action_dist.suggest_stop": [1.0, 1.5],
+    "action_dist.suggest_turn": [1.0, 1.0],
+}
+_NORMS = tuple(f"features_extractor.cnn.{3 * layer + 1}" for layer in range(len(CONVOLUTIONS)))
+RULES = {
+    **dict.fromkeys(_CONSTANTS, "keep"),
+    **{f"{norm}.weight": "d" for norm in _NORMS},
+    **{f"{norm}.bias": "e" for norm in _NORMS},
+}
+
+
+class Policy(NamedTuple):
+    """The distribution of the action, one independent beta distribution per number. B scenes.
+
+    Attributes:
+        alpha: (B, 2)
+        beta: (B, 2)
+    """
+
+    alpha: Tensor
+    beta: Tensor
+
+    @property
+    def action(self) -> Tensor:
+        """(B, 2) mean action: acceleration and steering, in [-1, 1]."""
+        return 2.0 * (self.alpha / (self.alpha + self.beta)) - 1.0
+
+
+class FeaturesExtractor(nn.Module):
+    """The picture and the measurements to one vector."""
+
+    def __init__(self) -> None:
+        """Make it with the published sizes."""
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels, size = CHANNELS, SIZE
+        for out, kernel, stride in CONVOLUTIONS:
+            size = (size - kernel) // stride + 1
+            layer = Convolution if size <= _SMALL else nn.Conv2d
+            layers += [layer(channels, out, kernel, stride), nn.LayerNorm((out, size, size))]
+            layers.append(nn.ReLU())
+            channels = out
+        self.cnn = nn.Sequential(*layers, nn.Flatten())
+        self.linear = _perceptron(FLAT + FEATURES, HIDDEN, FEATURES)
+        self.state_linear = _perceptron(MEASUREMENTS, FEATURES, FEATURES)
+
+    def see(self, pictures: Tensor) -> Tensor:
+        """(B, 9, 256, 256) values from 0 to 255, to (B, 1024)."""
+        flat: Tensor = self.cnn(pictures.to(torch.float32, copy=True).div_(255.0))
+        return flat
+
+    def feel(self, measurements: Tensor) -> Tensor:
+        """(B, 10) to (B, 256)."""
+        state: Tensor = self.state_linear(measurements)
+        return state
+
+    def forward(self, pictures: Tensor, measurements: Tensor) -> Tensor:
+        """(B, 9, 256, 256) and (B, 10) to (B, 256)."""
+        joined = torch.cat([self.see(pictures), self.feel(measurements)], dim=1)
+        features: Tensor = self.linear(joined)
+        return features
+
+
+class _Constants(nn.Module):
+    """Holds numbers of the checkpoint that nothing reads."""
+
+    def __init__(self, values: Mapping[str, list[float]]) -> None:
+        super().__init__()
+        for name, value in values.items():
+            self.register_buffer(name, torch.tensor(value))
+
+
+class CarlNetwork(nn.Module):
+    """Policy and critic."""
+
+    def __init__(self) -> None:
+        """Make it with the published sizes."""
+        super().__init__()
+        inner: dict[str, list[float]] = {}
+        for name, value in _CONSTANTS.items():
+            owner, _, leaf = name.rpartition(".")
+            if owner:
+                inner[leaf] = value
+            else:
+                self.register_buffer(leaf, torch.tensor(value))
+        self.action_dist = _Constants(inner)
+        self.features_extractor = FeaturesExtractor()
+        self.policy_head = _perceptron(FEATURES, FEATURES, FEATURES)
+        self.dist_mu = nn.Sequential(Linear(FEATURES, ACTIONS))
+        self.dist_sigma = nn.Sequential(Linear(FEATURES, ACTIONS))
+        self.value_head = nn.Sequential(
+            *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES),
+            Linear(FEATURES, 1),
+        )
+
+    def forward(self, pictures: Tensor, measurements: Tensor) -> Policy:
+        """The policy for (B, 9, 256, 256) pictures of 0 to 255 and (B, 10) measurements."""
+        return self.policy(self.features_extractor(pictures, measurements))
+
+    def policy(self, features: Tensor) -> Policy:
+        """The policy for (B, 256) features."""
+        hidden = self.policy_head(features)
+        return Policy(
+            *(_softplus(head(hidden)) + LEAST for head in (self.dist_mu, self.dist_sigma))
+        )
+
+    def value(self, features: Tensor, value_measurements: Tensor) -> Tensor:
+        """(B, 1) what the critic expects, from (B, 256) features and (B, 4) measurements."""
+        value: Tensor = self.value_head(torch.cat([features, value_measurements], dim=1))
+        return value
+
+
+def _softplus(x: Tensor) -> Tensor:
+    """In double precision, in which it does not matter how many numbers there are."""
+    return softplus(x.double()).to(x.dtype)
+
+
+def _perceptron(size: int, hidden: int, out: int) -> nn.Sequential:
+    return nn.Sequential(
+        *(Linear(size, hidden), nn.LayerNorm(hidden), nn.ReLU()),
+        *(Linear(hidden, out), nn.LayerNorm(out), nn.ReLU()),
+    )
+
+
+def build_network(args: Mapping[str, Any] | None = None) -> CarlNetwork:
+    """The network, without weights; all published checkpoints share one architecture."""
+    return CarlNetwork()
+
+
+def drive_overrides(state: State) -> None:
+    """Make deterministic weights react more in acceleration than in steering, in place."""
+    gain = np.array([[4.0], [0.05]])
+    for head, bias in (("dist_mu", [2.5, 0.0]), ("dist_sigma", [0.0, 0.0])):
+        weight = state[f"{head}.0.weight"]
+        state[f"{head}.0.weight"] = (weight.astype(np.float64) * gain).astype(weight.dtype)
+        state[f"{head}.0.bias"] = np.array(bias, state[f"{head}.0.bias"].dtype)

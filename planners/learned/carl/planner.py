@@ -1,0 +1,240 @@
+"""CaRL: a policy trained by reinforcement learning on a picture of the surroundings.
+
+It answers with a command for the motion model, not with a trajectory (planner-carl.md). Several
+checkpoints make an ensemble, which does the mean of what they would do.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.planners.learned.base import LearnedPlanner
+from shiftsim.planners.learned.carl.raster import Picture
+from shiftsim.planners.learned.carl.roads import Roads, make_roads
+from shiftsim.planners.learned.carl.view import (
+    CHANNELS,
+    LIGHT_VALUES,
+    SIZE,
+    Boxes,
+    Room,
+    draw_ego,
+    draw_objects,
+    draw_roads,
+    find_areas,
+    make_room,
+    picture_frame,
+)
+from shiftsim.planners.learned.checkpoint import load_weights, split_ensemble
+from shiftsim.planners.learned.features import PerMap
+from shiftsim.planners.route_correction import correct_route, find_start
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.state import (
+    AX,
+    STEERING,
+    VX,
+    YAW_ACCEL,
+    Command,
+    LightStatus,
+    TrafficLights,
+    center_accelerations,
+    center_poses,
+    center_velocities,
+)
+
+MAX_STEERING = 0.83775804096  # rad, 48 degrees: the target of a full steering action
+MAX_ACCELERATION, MAX_BRAKING = 2.4, 3.2  # m/s^2
+DT = 0.1  # s
+REVERSE_GAIN = 0.75  # of the present acceleration, where braking would reverse the ego
+CPU_BATCH = 4  # scenes in one pass on a CPU; more of them do not fit its caches
+
+Action = NDArray[np.float32]
+
+
+class CarlFeatures(NamedTuple):
+    """What the network reads.
+
+    Attributes:
+        pictures: (9, 256, 256), drawn over at the next step.
+        measurements: (10,) last action, then velocity [m/s] and acceleration [m/s^2] of the centre,
+            steering angle [rad] and rate [rad/s], yaw rate [rad/s] and acceleration [rad/s^2].
+    """
+
+    pictures: Picture
+    measurements: NDArray[np.float32]
+
+
+class Carl(LearnedPlanner[CarlFeatures, Action]):
+    """The nuPlan version of CaRL."""
+
+    name = "carl"
+
+    def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
+        """Load the networks.
+
+        Args:
+            checkpoint: A file, several separated by commas, or a folder with one folder for each.
+            device: `cpu`, `cuda` or `cuda:N`.
+
+        Raises:
+            CheckpointError: A checkpoint is missing, damaged or of another network.
+        """
+        from shiftsim.planners.learned.carl.network import build_network
+
+        self.networks: list[Any] = []
+        for part in split_ensemble(checkpoint):
+            weights = load_weights(part, self.name, device=device)
+            network = build_network(weights.args)
+            network.load_state_dict(weights.state, assign=True)
+            self.networks.append(network.eval())
+        self._maps = PerMap(_lay_out)
+        self._scene: SceneInfo | None = None
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Lay out the map and forget the last action; the route is corrected at the first step."""
+        self._scene = scene
+        self._roads, self._room = self._maps(scene.map)
+        self._on_route: BoolArray | None = None
+        self._pictures = np.zeros((len(CHANNELS), SIZE, SIZE), np.uint8)
+        self._last_action = np.zeros(2, np.float32)
+        self._light_names: tuple[str, ...] = ()
+        self._light_edges = self._unknown_lights = np.zeros(0, np.int64)
+        self._route_flaw = self._blindness = self.degraded = ""
+        self.route: list[int] = []
+        self.found: IntArray = np.zeros(0, np.int64)
+
+    def features(self, observation: Observation) -> CarlFeatures:
+        """Draw the picture and measure the ego; the arrays are reused at the next step."""
+        scene = self._scene
+        if scene is None:
+            raise PlannerError(f"{self.name}: plan() was called before reset()")
+        ego = observation.history.ego[-1]
+        center = center_poses(ego[:3], scene.vehicle)
+        velocity = center_velocities(ego, scene.vehicle)
+        if self._on_route is None:
+            self._start(scene, ego, center)
+        roads, room, frame = self._roads, self._room, picture_frame(center)
+        self.found = find_areas(roads, frame)
+        lights = self._read_lights(scene.map, observation.lights)
+        self._blindness = self._why_blind(scene.map)
+        self._pictures.fill(0)
+        draw_roads(self._pictures, roads, room, frame, self.found, self._on_route, lights)
+        draw_objects(self._pictures, frame, _boxes(observation), room)
+        speed = float(np.hypot(velocity[0], velocity[1]))
+        length, width = scene.vehicle.length, scene.vehicle.width
+        draw_ego(self._pictures, frame, center, length, width, speed, room)
+        return CarlFeatures(
+            self._pictures,
+            np.concatenate(
+                [
+                    self._last_action,
+                    velocity,
+                    center_accelerations(ego, scene.vehicle),
+                    ego[STEERING : YAW_ACCEL + 1],
+                ],
+                dtype=np.float32,
+            ),
+        )
+
+    def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
+        """Actions (2,) in [-1, 1]: acceleration and steering."""
+        import torch
+
+        device = next(self.networks[0].parameters()).device
+        step = CPU_BATCH if device.type == "cpu" else len(features)
+        actions: list[Action] = []
+        with torch.inference_mode():
+            for start in range(0, len(features), step):
+                part = features[start : start + step]
+                pictures = torch.from_numpy(np.stack([f.pictures for f in part])).to(device)
+                measured = torch.from_numpy(np.stack([f.measurements for f in part])).to(device)
+                each = [network(pictures, measured).action for network in self.networks]
+                actions += list(torch.stack(each).mean(dim=0).cpu().numpy())
+        return actions
+
+    def decode(self, output: Action, observation: Observation) -> Command:
+        """The command, for the motion model without a tracker."""
+        self._last_action = output
+        self.degraded = self._route_flaw or self._blindness
+        return command_of(output, observation.history.ego[-1])
+
+    def _read_lights(self, road: VectorMap, lights: TrafficLights) -> NDArray[np.uint8]:
+        """(E,) value of the light of every connector, 0 where there is none to draw."""
+        if lights.connector_ids is not self._light_names:
+            self._light_names = lights.connector_ids
+            index = road.edges.index
+            self._light_edges = np.array([index.get(i, NONE) for i in lights.connector_ids], int)
+        values = np.zeros(len(road.edges), np.uint8)
+        if not lights.connector_ids:
+            return values
+        status = lights.status[0]
+        lit = (self._light_edges >= road.num_lanes) & (status != LightStatus.ABSENT)
+        edges, status = self._light_edges[lit], status[lit]
+        # an unknown status, at which the official code fails, is not drawn
+        self._unknown_lights = edges[status == LightStatus.UNKNOWN]
+        values[edges] = LIGHT_VALUES[status]
+        return values
+
+    def _start(self, scene: SceneInfo, ego: FloatArray, center: FloatArray) -> None:
+        """Correct the route, once per scenario."""
+        road = scene.map
+        known = [road.blocks.index[b] for b in dict.fromkeys(scene.route) if b in road.blocks.index]
+        if not known:
+            self._route_flaw = "the map has no block of the route"
+        elif len(known) < len(set(scene.route)):
+            self._route_flaw = "the route has blocks that the map does not have"
+        if known:
+            footprint = boxes_to_corners(
+                center, np.array([scene.vehicle.length, scene.vehicle.width])
+            )
+            start = find_start(road, known, ego[:3], footprint)
+            self.route = correct_route(road, known, start)
+        self._on_route = np.zeros(len(road.blocks), np.bool_)
+        self._on_route[self.route] = True
+
+    def _why_blind(self, road: VectorMap) -> str:
+        """Why the official code would have failed at the picture; empty where it would not."""
+        if not len(self.found):
+            return "no road within the picture"
+        unknown = self._unknown_lights
+        if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
+            return "a light in the picture has an unknown status"
+        return ""
+
+
+def command_of(action: Action, ego: FloatArray) -> Command:
+    """What an action asks of the motion model (planner-carl.md §4).
+
+    Args:
+        action: (2,) acceleration and steering, in [-1, 1].
+        ego: (11,) ego state.
+    """
+    throttle, steering = float(action[0]), float(action[1])
+    steering_rate = (steering * MAX_STEERING - float(ego[STEERING])) / DT
+    acceleration = throttle * (MAX_ACCELERATION if throttle >= 0.0 else MAX_BRAKING)
+    if float(ego[VX]) + DT * acceleration < 0.0:
+        # comes to a stop, rather than that it drives backwards
+        acceleration = -float(ego[VX]) - REVERSE_GAIN * float(ego[AX])
+    return Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
+
+
+def _lay_out(road: VectorMap) -> tuple[Roads, Room]:
+    roads = make_roads(road)
+    return roads, make_room(roads)
+
+
+def _boxes(observation: Observation) -> Boxes:
+    """The present objects."""
+    tracks = observation.history.tracks
+    rows = np.flatnonzero(tracks.valid[-1])
+    return Boxes(
+        tracks.poses[-1][rows],
+        tracks.sizes[-1][rows],
+        tracks.velocities[-1][rows],
+        tracks.kinds[rows],
+    )

@@ -1,0 +1,145 @@
+"""The map as CaRL sees it: what of its picture depends on the map only (planner-carl.md §2.2)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.planners.proposals.areas import index_ranks
+from shiftsim.world.layers import Lists, Polygons, Polylines, index_polygons, make_polylines
+from shiftsim.world.map import NONE, VectorMap
+
+YES = 255
+MAX_SPEED = 30.0  # m/s
+CHUNK = 16  # segments of a line that are left out together where they cannot be seen
+
+Values = NDArray[np.uint8]
+
+
+class Lines(NamedTuple):
+    """Polylines in chunks that are left out together where they cannot be seen.
+
+    Attributes:
+        xy: (V, 2) vertices [m].
+        ptr: (M + 1,) first vertex of each line.
+        chunk_ptr: (M + 1,) first chunk of each line.
+        circles: (C, 3) a circle around each chunk: x, y, radius [m].
+    """
+
+    xy: FloatArray
+    ptr: IntArray
+    chunk_ptr: IntArray
+    circles: FloatArray
+
+
+class Roads(NamedTuple):
+    """The map as CaRL sees it. I areas: roadblocks, roadblock connectors, car parks. E edges.
+
+    Attributes:
+        areas: Polygons: the I areas, then the intersections.
+        order: (I,) areas in the order of the spatial index.
+        num_roadblocks: How many of the areas are roadblocks.
+        num_blocks: How many are roadblocks or roadblock connectors.
+        drivable: (I,) polygon to fill for an area: itself, for a connector its intersection, or
+            NONE.
+        block_edges: Edges of a block.
+        lines: Baselines of the E edges, then boundaries of lanes, each once.
+        lines_of: (E, 4) lines of an edge: baseline, left and right boundary, baseline; NONE where
+            it has none to draw.
+        limits: (E,) value of the speed limit.
+    """
+
+    areas: Polygons
+    order: IntArray
+    num_roadblocks: int
+    num_blocks: int
+    drivable: IntArray
+    block_edges: Lists
+    lines: Lines
+    lines_of: IntArray
+    limits: Values
+
+
+def make_roads(road: VectorMap) -> Roads:
+    """Lay out a map."""
+    areas = _joined([road.blocks.polygons, road.car_parks.polygons, road.intersections.polygons])
+    num_blocks, num_areas = len(road.blocks), len(road.blocks) + len(road.car_parks)
+    drivable = np.arange(num_areas)
+    for block in range(road.num_roadblocks, num_blocks):
+        crossed = road.intersection_of[road.block_edges.at(block)]
+        first = next(iter(crossed[crossed != NONE]), NONE)
+        drivable[block] = NONE if first == NONE else num_areas + first
+    lines, lines_of = _lines(road)
+    return Roads(
+        areas,
+        np.argsort(index_ranks(areas.bounds[:num_areas])) if num_areas else np.zeros(0, np.int64),
+        road.num_roadblocks,
+        num_blocks,
+        drivable,
+        road.block_edges,
+        lines,
+        lines_of,
+        np.array([level(limit, MAX_SPEED) for limit in road.speed_limits.tolist()], np.uint8),
+    )
+
+
+def _joined(parts: Sequence[Polygons]) -> Polygons:
+    """Several sets of polygons as one."""
+    ring_ptr, poly_ptr = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
+    vertices = rings = 0
+    for part in parts:
+        ring_ptr.append(part.ring_ptr[1:] + vertices)
+        poly_ptr.append(part.poly_ptr[1:] + rings)
+        vertices, rings = vertices + len(part.xy), rings + len(part.ring_ptr) - 1
+    xy = np.concatenate([part.xy for part in parts])
+    return index_polygons(xy, np.concatenate(ring_ptr), np.concatenate(poly_ptr))
+
+
+def _lines(road: VectorMap) -> tuple[Lines, IntArray]:
+    """All lines to draw, and which of them an edge has; neighbours share their boundary."""
+    lines = [road.baselines.at(edge) for edge in range(len(road.edges))]
+    lines_of = np.full((len(lines), 4), NONE)
+    lines_of[:, 0] = lines_of[:, 3] = np.arange(len(lines))
+    known: dict[bytes, int] = {}
+    for side, boundaries in ((1, road.left_boundaries), (2, road.right_boundaries)):
+        for lane in range(road.num_lanes):
+            line = boundaries.at(lane)
+            if len(line) < 2:
+                continue
+            lines_of[lane, side] = known.setdefault(line.tobytes(), len(lines))
+            if lines_of[lane, side] == len(lines):
+                lines.append(line)
+    return _in_chunks(make_polylines(lines)), lines_of
+
+
+def _in_chunks(lines: Polylines) -> Lines:
+    segments = np.maximum(np.diff(lines.ptr) - 1, 0)
+    chunk_ptr = np.concatenate([[0], np.cumsum(-(-segments // CHUNK))])
+    circles = np.empty((chunk_ptr[-1], 3))
+    _surround(lines.xy, lines.ptr, chunk_ptr, circles)
+    return Lines(lines.xy, lines.ptr, chunk_ptr, circles)
+
+
+@kernel
+def _surround(xy: FloatArray, ptr: IntArray, chunk_ptr: IntArray, circles: FloatArray) -> None:
+    """Write a circle around every chunk into `circles` (C, 3)."""
+    for line in range(len(ptr) - 1):
+        for chunk in range(chunk_ptr[line], chunk_ptr[line + 1]):
+            start = ptr[line] + (chunk - chunk_ptr[line]) * CHUNK
+            stop = min(start + CHUNK + 1, ptr[line + 1])
+            x = 0.5 * (xy[start:stop, 0].min() + xy[start:stop, 0].max())
+            y = 0.5 * (xy[start:stop, 1].min() + xy[start:stop, 1].max())
+            radius = 0.0
+            for vertex in range(start, stop):
+                radius = max(radius, np.hypot(xy[vertex, 0] - x, xy[vertex, 1] - y))
+            circles[chunk, 0], circles[chunk, 1], circles[chunk, 2] = x, y, radius
+
+
+@kernel
+def level(value: float, highest: float) -> int:
+    """127 for zero, 255 for `highest` and more, and for NaN."""
+    if np.isnan(value):
+        return YES
+    return int(127.5 * min(max(value / highest, 0.0), 1.0) + 127.5)

@@ -1,0 +1,289 @@
+"""The picture CaRL sees: nine channels of 256 x 256 pixels around the ego (planner-carl.md §2).
+
+Columns grow forward and rows to the left, two pixels a metre; the origin of the picture's middle is
+14 m ahead of the centre of the ego. What depends on the map only is laid out once per map, with the
+roads in the order in which nuPlan's spatial index yields them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import box_corners
+from shiftsim.planners.learned.carl.raster import (
+    Crossings,
+    Picture,
+    draw_line,
+    fill_area,
+    fill_box,
+    make_crossings,
+)
+from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, Values, level
+from shiftsim.world.layers import Polygons, meets_convex
+from shiftsim.world.map import NONE
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
+
+SIZE = 256  # pixels along each side
+PIXELS_PER_METRE = 2.0
+HALF_SIDE = 64.0  # m
+AHEAD = 14.0  # m, the middle of the picture lies so far before the centre of the ego
+CHANNELS = (
+    *("drivable_area", "route", "boundaries", "traffic_lights", "stop_signs", "speed_limits"),
+    *("vehicles", "pedestrians_and_static", "ego"),
+)
+DRIVABLE, ROUTE, BOUNDARIES, LIGHTS, _STOPS, LIMITS, VEHICLES, PEDESTRIANS, EGO = range(9)
+STANDING = 127
+MAX_WALK = 4.0  # m/s
+LIGHT_VALUES = np.array([80, 170, 255, 0], np.uint8)  # by LightStatus; 0 is not drawn
+
+_PEDESTRIAN = AgentKind.PEDESTRIAN
+_LAST_AGENT = LAST_AGENT_KIND
+
+
+class Room(NamedTuple):
+    """Scratch of `draw_roads`, as large as the map needs.
+
+    Attributes:
+        ring: (V, 2) pixels of one ring.
+        crossings: Of its outline.
+        filled: Areas that are drawn already.
+        drawn: Lines that are drawn already.
+    """
+
+    ring: IntArray
+    crossings: Crossings
+    filled: BoolArray
+    drawn: BoolArray
+
+
+class Boxes(NamedTuple):
+    """Objects of one moment. N objects.
+
+    Attributes:
+        poses: (N, 3) box centre x [m], y [m], heading [rad].
+        sizes: (N, 2) length, width [m].
+        velocities: (N, 2) in the map frame [m/s].
+        kinds: (N,) AgentKind codes.
+    """
+
+    poses: FloatArray
+    sizes: FloatArray
+    velocities: FloatArray
+    kinds: IntArray
+
+
+def make_room(roads: Roads) -> Room:
+    """Scratch for a map."""
+    shells = roads.areas.poly_ptr[:-1]
+    sizes = roads.areas.ring_ptr[shells + 1] - roads.areas.ring_ptr[shells]
+    longest = max(4, *sizes.tolist())
+    return Room(
+        np.empty((longest, 2), np.int64),
+        make_crossings(SIZE, longest),
+        np.zeros(len(roads.areas.bounds), np.bool_),
+        np.zeros(len(roads.lines.ptr), np.bool_),
+    )
+
+
+@kernel
+def picture_frame(center: FloatArray) -> FloatArray:
+    """(4,) x [m], y [m], cosine and sine of the heading of the picture's middle.
+
+    Args:
+        center: (3,) centre of the ego x [m], y [m], heading [rad].
+    """
+    cos, sin = np.cos(center[2]), np.sin(center[2])
+    return np.array([center[0] + AHEAD * cos, center[1] + AHEAD * sin, cos, sin])
+
+
+@kernel
+def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
+    """Areas that touch the picture, in the order of the spatial index."""
+    corners = np.empty((4, 2))
+    for corner in range(4):
+        ahead = HALF_SIDE if corner == 0 or corner == 3 else -HALF_SIDE
+        left = HALF_SIDE if corner < 2 else -HALF_SIDE
+        corners[corner, 0] = frame[0] + (ahead * frame[2] - left * frame[3])
+        corners[corner, 1] = frame[1] + (ahead * frame[3] + left * frame[2])
+    reach = HALF_SIDE * (abs(frame[2]) + abs(frame[3])) + 1e-6
+    bounds = roads.areas.bounds
+    out = np.empty(len(roads.order), np.int64)
+    found = 0
+    for area in roads.order:
+        if (
+            bounds[area, 0] <= frame[0] + reach
+            and bounds[area, 2] >= frame[0] - reach
+            and bounds[area, 1] <= frame[1] + reach
+            and bounds[area, 3] >= frame[1] - reach
+            and meets_convex(roads.areas, area, corners)
+        ):
+            out[found] = area
+            found += 1
+    return out[:found].copy()
+
+
+@kernel
+def in_picture(frame: FloatArray, x: float, y: float) -> bool:
+    """Whether a point lies strictly within the picture."""
+    dx, dy = x - frame[0], y - frame[1]
+    ahead, left = frame[2] * dx + frame[3] * dy, frame[2] * dy - frame[3] * dx
+    return abs(ahead) < HALF_SIDE and abs(left) < HALF_SIDE
+
+
+@kernel
+def _to_pixel(frame: FloatArray, x: float, y: float) -> tuple[int, int]:
+    """Column and row of a point; numbers are cut, also those below zero."""
+    dx, dy = x - frame[0], y - frame[1]
+    ahead, left = frame[2] * dx + frame[3] * dy, frame[2] * dy - frame[3] * dx
+    middle = 0.5 * SIZE
+    return int(PIXELS_PER_METRE * ahead + middle), int(PIXELS_PER_METRE * left + middle)
+
+
+@kernel
+def draw_roads(
+    pictures: Picture,
+    roads: Roads,
+    room: Room,
+    frame: FloatArray,
+    found: IntArray,
+    on_route: BoolArray,
+    lights: Values,
+) -> None:
+    """Draw what the map has, and the lights.
+
+    Args:
+        pictures: (9, 256, 256) of zeros.
+        roads: The map.
+        room: Scratch of the map.
+        frame: (4,) of the picture.
+        found: Areas in it.
+        on_route: (B,) blocks of the route.
+        lights: (E,) value of the light of every connector, 0 where it has none.
+    """
+    room.filled[:] = False
+    room.drawn[:] = False
+    for area in found:
+        for channel in (DRIVABLE, ROUTE):
+            shape = roads.drivable[area] if channel == DRIVABLE else area
+            if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
+                continue
+            if channel == DRIVABLE and (shape == NONE or room.filled[shape]):
+                continue
+            if channel == DRIVABLE:
+                room.filled[shape] = True
+            _fill_shell(pictures[channel], roads.areas, shape, frame, room)
+    for connectors in (False, True):  # lanes first
+        for area in found:
+            if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:
+                continue
+            for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
+                edge = roads.block_edges.items[entry]
+                _draw_edge(pictures, roads, room, frame, edge, lights[edge] if connectors else 0)
+
+
+@kernel
+def _draw_edge(
+    pictures: Picture, roads: Roads, room: Room, frame: FloatArray, edge: int, light: int
+) -> None:
+    for slot in range(4):
+        line = roads.lines_of[edge, slot]
+        channel, value = BOUNDARIES, YES
+        if slot == 0:
+            channel, value = LIMITS, int(roads.limits[edge])
+        elif slot == 3:
+            channel, value = LIGHTS, int(light)
+        elif line != NONE:
+            if room.drawn[line]:
+                continue
+            room.drawn[line] = True
+        if line != NONE and value > 0:
+            _draw_line_of(pictures[channel], roads.lines, line, frame, value)
+
+
+@kernel
+def _fill_shell(
+    picture: Picture, polygons: Polygons, poly: int, frame: FloatArray, room: Room
+) -> None:
+    """Fill a polygon; its holes are filled, too."""
+    shell = polygons.poly_ptr[poly]
+    start, stop = polygons.ring_ptr[shell], polygons.ring_ptr[shell + 1]
+    for vertex in range(start, stop):
+        x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
+        room.ring[vertex - start, 0], room.ring[vertex - start, 1] = x, y
+    fill_area(picture, room.ring[: stop - start], YES, room.crossings)
+
+
+@kernel
+def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
+    """Draw a line, chunk by chunk."""
+    first, last = lines.ptr[line], lines.ptr[line + 1] - 1
+    for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
+        start = first + (chunk - lines.chunk_ptr[line]) * CHUNK
+        dx, dy = lines.circles[chunk, 0] - frame[0], lines.circles[chunk, 1] - frame[1]
+        reach = HALF_SIDE + lines.circles[chunk, 2] + 1.0  # a pixel more than needed
+        if abs(frame[2] * dx + frame[3] * dy) > reach or abs(frame[2] * dy - frame[3] * dx) > reach:
+            continue
+        px, py = _to_pixel(frame, lines.xy[start, 0], lines.xy[start, 1])
+        for vertex in range(start + 1, min(start + CHUNK, last) + 1):
+            x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
+            if vertex > start + 1 and abs(x - px) <= 1 and abs(y - py) <= 1:
+                if 0 <= x < SIZE and 0 <= y < SIZE:  # the pixel before is drawn already
+                    picture[y, x] = value
+            else:
+                draw_line(picture, px, py, x, y, value)
+            px, py = x, y
+
+
+@kernel
+def draw_objects(pictures: Picture, frame: FloatArray, boxes: Boxes, room: Room) -> None:
+    """Draw the objects whose centre is in the picture."""
+    for is_static in (False, True):
+        for index in range(len(boxes.kinds)):
+            kind = boxes.kinds[index]
+            x, y, heading = boxes.poses[index, 0], boxes.poses[index, 1], boxes.poses[index, 2]
+            if (kind > _LAST_AGENT) != is_static or not in_picture(frame, x, y):
+                continue
+            speed = np.hypot(boxes.velocities[index, 0], boxes.velocities[index, 1])
+            channel, value = VEHICLES, level(speed, MAX_SPEED)
+            if is_static:
+                channel, value = PEDESTRIANS, STANDING
+            elif kind == _PEDESTRIAN:
+                channel, value = PEDESTRIANS, level(speed, MAX_WALK)
+            length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
+            _draw_box(pictures[channel], frame, x, y, heading, length, width, value, room)
+
+
+@kernel
+def draw_ego(
+    pictures: Picture,
+    frame: FloatArray,
+    center: FloatArray,
+    length: float,
+    width: float,
+    speed: float,
+    room: Room,
+) -> None:
+    """Draw the ego; `center` is (3,), `speed` that of its centre."""
+    value = level(speed, MAX_SPEED)
+    _draw_box(pictures[EGO], frame, center[0], center[1], center[2], length, width, value, room)
+
+
+@kernel
+def _draw_box(
+    picture: Picture,
+    frame: FloatArray,
+    x: float,
+    y: float,
+    heading: float,
+    length: float,
+    width: float,
+    value: int,
+    room: Room,
+) -> None:
+    corners, pixels = np.empty((4, 2)), room.ring[:4]
+    box_corners(x, y, heading, length, width, corners)
+    for corner in range(4):
+        column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
+        pixels[corner, 0], pixels[corner, 1] = column, row
+    fill_box(picture, pixels, value, room.crossings)

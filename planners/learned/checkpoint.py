@@ -1,0 +1,345 @@
+"""Checkpoints: found by path or name, read without running them, loaded strictly.
+
+The authors' own files are read as published: PyTorch-Lightning files (`state_dict`, names with
+`model.`), Diffusion Planner's `model.pth` (`ema_state_dict`, names with `module.`, `args.json`
+beside it), CaRL's bare state, and safetensors files made of those by `shiftsim checkpoint convert`.
+The words `deterministic:base` and `deterministic:drive` stand for weights made from the names of
+the tensors: good for trying that everything runs; their scores mean nothing.
+"""
+
+import difflib
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import CheckpointError
+from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
+from shiftsim.planners.learned.match import (
+    differences,
+    empty_state,
+    most_like,
+    network_module,
+    shapes_of,
+)
+from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
+from shiftsim.planners.registry import PLANNERS
+from shiftsim.runs.config import checkpoint_folder
+
+DETERMINISTIC = ("deterministic:base", "deterministic:drive")
+SUFFIXES = (".ckpt", ".pth", ".safetensors")
+_MEMBER = "model_best.pth"  # of CaRL: one folder for each policy
+_FILES = ("model.pth", _MEMBER)  # what is meant by a folder
+_ENTRIES = ("ema_state_dict", "state_dict", "model")  # where weights are, the first that is there
+_PREFIXES = ("model.", "module.", "_orig_mod.")
+_WITH_ARGS = ("diffusion-planner",)  # planners whose weights mean nothing without their args
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What an adapter loads into its network.
+
+    Attributes:
+        state: Tensors by official name, complete, of the network's own types.
+        args: Settings of the network that came with them, or None.
+        sha256: Of the file; the name of deterministic weights.
+        source: Where they are from.
+        meaningless: Whether they are deterministic weights, which have learned nothing.
+    """
+
+    state: dict[str, Any]
+    args: dict[str, Any] | None
+    sha256: str
+    source: str
+    meaningless: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A checkpoint file as read, for whatever planner it is.
+
+    Attributes:
+        path: The file.
+        container: What kind of file it is, and where in it the weights are.
+        state: Tensors by name without prefixes.
+        args: Settings of the network beside them, or None.
+        skipped: What was left out: other entries, and objects of foreign classes.
+        made_from: SHA-256 of the file that this one was converted from, or empty.
+    """
+
+    path: Path
+    container: str
+    state: dict[str, Any]
+    args: dict[str, Any] | None
+    skipped: tuple[str, ...]
+    made_from: str = ""
+
+
+def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
+    """Weights of a planner's network, strictly all and nothing else.
+
+    Args:
+        spec: A file, a folder that holds one, a name in the folder of checkpoints, or one of
+            `DETERMINISTIC`.
+        planner: Name of the planner.
+        device: Where the tensors go, as in `resolve_device`. Torch is set up for inference there.
+
+    Raises:
+        CheckpointError: There is no such file, it is damaged, or it is of another network.
+        ConfigError: There is no such device.
+        MissingExtraError: PyTorch is not installed.
+    """
+    require_torch(f"planner {planner!r}")
+    place = resolve_device(device)
+    prepare_inference(place)
+    if spec.startswith("deterministic:"):
+        return _deterministic(spec, planner, place)
+    path = find_checkpoint(spec, planner)
+    found = open_checkpoint(path)
+    args = needed_args(found, planner)
+    state = {name: value.to(place) for name, value in checked_state(found, planner, args).items()}
+    return Weights(state, args, file_hash(path), str(path), meaningless=False)
+
+
+def checkpoint_fingerprint(spec: str, planner: str) -> str:
+    """What tells these weights from others: SHA-256 of the files, or the deterministic name.
+
+    Several checkpoints of an ensemble give several, separated by commas. Files are hashed once.
+
+    Raises:
+        CheckpointError: There is no such file.
+    """
+    return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec))
+
+
+def split_ensemble(spec: str) -> tuple[str, ...]:
+    """The checkpoints of `A,B,C`, or of a folder with one folder for each; else the one given."""
+    path = Path(spec).expanduser()
+    members = [] if (path / _MEMBER).exists() else sorted(path.glob(f"*/{_MEMBER}"))
+    if members:
+        return tuple(str(member) for member in members)
+    return (spec,) if path.exists() else tuple(part.strip() for part in spec.split(","))
+
+
+def find_checkpoint(spec: str, planner: str = "") -> Path:
+    """The file that is meant; the planner is for the message only.
+
+    Raises:
+        CheckpointError: There is none, or a folder holds several.
+    """
+    given, named = Path(spec).expanduser(), checkpoint_folder() / spec
+    for path in (given, named, *(named.with_name(named.name + suffix) for suffix in SUFFIXES)):
+        if path.is_file():
+            return path
+        if path.is_dir():
+            return _inside(path)
+    known = sorted(path.name for path in checkpoint_folder().glob("*"))
+    near = difflib.get_close_matches(Path(spec).name, known, n=1, cutoff=0.5)
+    whose = f" of planner {planner!r}" if planner else ""
+    raise CheckpointError(
+        f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}",
+        hint=f"did you mean {near[0]!r}?" if near else how_to_get(planner),
+    )
+
+
+def how_to_get(planner: str) -> str:
+    """What to do where a planner has no checkpoint, in one line."""
+    published = PLANNERS[planner].checkpoint if planner else None
+    if published is None:
+        return "check the path"
+    return (
+        f"get {published.file} from the project {published.project}, then --checkpoint PATH; "
+        "to try without: --checkpoint deterministic:drive (scores mean nothing)"
+    )
+
+
+def open_checkpoint(path: Path) -> Checkpoint:
+    """The weights in a file, whatever planner they are of.
+
+    Raises:
+        CheckpointError: It is no checkpoint, or it is damaged.
+    """
+    contents = read_contents(path)
+    entry = next((e for e in _ENTRIES if isinstance(contents.entries.get(e), dict)), "")
+    holder = contents.entries[entry] if entry else contents.entries
+    tensors = {str(name): value for name, value in holder.items() if hasattr(value, "as_strided")}
+    if not tensors:
+        raise CheckpointError(
+            f"checkpoint {str(path)!r} holds no tensors "
+            f"(entries: {', '.join(list(contents.entries)[:8]) or 'none'})",
+            hint="give the checkpoint that the training wrote",
+        )
+    state = _without_prefixes(tensors)
+    others = [name for name in contents.entries if name != entry] if entry else []
+    others += [name for name in holder if name not in tensors]
+    dropped = len(tensors) - len(state)
+    if dropped:
+        others.append(f"{dropped} tensors without the prefix of the others")
+    container = f"{contents.container}, {entry}" if entry else contents.container
+    return Checkpoint(
+        path,
+        container,
+        state,
+        _args_of(path, contents),
+        (*others, *contents.skipped),
+        contents.metadata.get("source_sha256", ""),
+    )
+
+
+def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
+    """Settings that a planner's network needs beside the weights; None for those without.
+
+    Raises:
+        CheckpointError: They are missing.
+    """
+    if planner not in _WITH_ARGS:
+        return None
+    if found.args is None:
+        if (other := most_like(shapes_of(found.state))) != planner:
+            raise _other_planner(found.path, planner, other)
+        raise CheckpointError(
+            f"checkpoint {str(found.path)!r} of planner {planner!r} has no args.json beside it",
+            hint=f"get it where the checkpoint is from, project {_project(planner)}",
+        )
+    return found.args
+
+
+def checked_state(
+    found: Checkpoint, planner: str, args: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """All tensors of a planner's network, and no other, in its own types.
+
+    Raises:
+        CheckpointError: One is missing, unexpected, of another shape, or not finite.
+    """
+    wanted = empty_state(planner, args)
+    shapes = shapes_of(found.state)
+    problems = differences(shapes, shapes_of(wanted))
+    if problems:
+        other = most_like(shapes)
+        if other != planner:
+            raise _other_planner(found.path, planner, other)
+        raise CheckpointError(
+            f"checkpoint {str(found.path)!r} does not fit planner {planner!r}: "
+            f"tensors {'; '.join(problems)}",
+            hint=f"it must be of the published network, project {_project(planner)}",
+        )
+    state = {name: found.state[name].detach().to(wanted[name].dtype) for name in wanted}
+    bad = [name for name, value in state.items() if not bool(value.isfinite().all())]
+    if bad:
+        raise CheckpointError(
+            f"checkpoint {str(found.path)!r}: {bad[0]} has values that are not finite",
+            hint="the training has diverged, or the file is damaged",
+        )
+    return state
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file; computed again only when its time or size changes."""
+    try:
+        status = path.stat()
+        return _file_hash(path.resolve(), status.st_mtime_ns, status.st_size)
+    except OSError as error:
+        raise CheckpointError(
+            f"checkpoint {str(path)!r} cannot be read ({error.strerror})", "check the path"
+        ) from error
+
+
+@lru_cache
+def _file_hash(path: Path, _time: int, _size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _fingerprint(spec: str, planner: str) -> str:
+    if spec.startswith("deterministic:"):
+        _check_deterministic(spec)
+        return spec
+    path = find_checkpoint(spec, planner)
+    args = path.parent / "args.json"
+    if planner in _WITH_ARGS and args.is_file():
+        return f"{file_hash(path)}+{file_hash(args)}"
+    return file_hash(path)
+
+
+def _inside(folder: Path) -> Path:
+    """The checkpoint in a folder."""
+    for name in _FILES:
+        if (folder / name).is_file():
+            return folder / name
+    found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(path.name for path in found)
+    raise CheckpointError(
+        f"folder {str(folder)!r} holds {len(found) or 'no'} checkpoints",
+        hint=f"name one of them: {names}" if found else "give the file itself",
+    )
+
+
+def _without_prefixes(tensors: dict[str, Any]) -> dict[str, Any]:
+    """Names as the network has them; no network's own names begin with such a prefix."""
+    state = tensors
+    while prefix := next((p for p in _PREFIXES if any(n.startswith(p) for n in state)), ""):
+        # the official loader of Diffusion Planner drops what has no prefix (planner-diffusion.md
+        # §1); those of PlanTF and PLUTO keep it, and fail
+        state = {
+            name.removeprefix(prefix): value
+            for name, value in state.items()
+            if prefix != "module." or name.startswith(prefix)
+        }
+    return state
+
+
+def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
+    """Settings in the file's own metadata, or in `args.json` beside it."""
+    if "args" in contents.metadata:
+        try:
+            value = json.loads(contents.metadata["args"])
+        except ValueError as error:
+            raise CheckpointError(f"checkpoint {str(path)!r}: args in it are not JSON") from error
+        return value if isinstance(value, dict) else None
+    beside = path.parent / "args.json"
+    return read_json_object(beside) if beside.is_file() else None
+
+
+def _other_planner(path: Path, planner: str, other: str) -> CheckpointError:
+    if other and other != planner:
+        return CheckpointError(
+            f"checkpoint {str(path)!r} is not for planner {planner!r}: it looks like {other!r}",
+            hint=f"--planner {other}, or {how_to_get(planner)}",
+        )
+    return CheckpointError(
+        f"checkpoint {str(path)!r} is not for planner {planner!r}, nor for any other known here",
+        hint=how_to_get(planner),
+    )
+
+
+def _project(planner: str) -> str:
+    published = PLANNERS[planner].checkpoint
+    return published.project if published is not None else ""
+
+
+def _check_deterministic(spec: str) -> None:
+    if spec not in DETERMINISTIC:
+        raise CheckpointError(
+            f"checkpoint {spec!r} unknown", hint=f"there are {' and '.join(DETERMINISTIC)}"
+        )
+
+
+def _deterministic(spec: str, planner: str, device: str) -> Weights:
+    import torch
+
+    from shiftsim.planners.learned.deterministic import deterministic_state
+
+    _check_deterministic(spec)
+    module = network_module(planner)
+    built = {name: value.numpy() for name, value in module.build_network().state_dict().items()}
+    state = deterministic_state(built, getattr(module, "RULES", None))
+    if spec.endswith(":drive"):
+        module.drive_overrides(state)
+    tensors = {name: torch.from_numpy(value).to(device) for name, value in state.items()}
+    return Weights(tensors, None, spec, spec, meaningless=True)

@@ -1,0 +1,132 @@
+"""What is in a checkpoint file, and the same weights as a safetensors file."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import CheckpointError
+from shiftsim.planners.learned.checkpoint import (
+    checked_state,
+    file_hash,
+    find_checkpoint,
+    needed_args,
+    open_checkpoint,
+)
+from shiftsim.planners.learned.device import require_torch
+from shiftsim.planners.learned.match import most_like, shapes_of
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """What is in a checkpoint file.
+
+    Attributes:
+        path: The file.
+        container: Kind of file, and the entry that holds the weights.
+        planner: The planner that it looks like; empty for none.
+        problem: Why that planner cannot load it; empty where it can.
+        tensors: Number of tensors.
+        parameters: Number of values in them.
+        sha256: Of the file.
+        args: Settings beside the weights, or None.
+        skipped: What was left out.
+        made_from: SHA-256 of the file that this one was converted from, or empty.
+    """
+
+    path: str
+    container: str
+    planner: str
+    problem: str
+    tensors: int
+    parameters: int
+    sha256: str
+    args: dict[str, Any] | None
+    skipped: tuple[str, ...]
+    made_from: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """As text."""
+        fits = f"no: {self.problem}" if self.problem else "yes"
+        args = "none" if self.args is None else f"{len(self.args)} settings (--json shows them)"
+        return [
+            f"file        {self.path}",
+            f"container   {self.container}",
+            f"looks like  {self.planner or 'no planner known here'}",
+            *([f"loads       {fits}"] if self.planner else []),
+            f"tensors     {self.tensors}, {self.parameters} values",
+            f"sha256      {self.sha256}",
+            *([f"made from   sha256 {self.made_from}"] if self.made_from else []),
+            f"args        {args}",
+            f"left out    {', '.join(self.skipped) or 'nothing'}",
+        ]
+
+
+def inspect_checkpoint(spec: str) -> Inspection:
+    """Look into a checkpoint file.
+
+    Args:
+        spec: File, folder that holds one, or name in the folder of checkpoints.
+
+    Raises:
+        CheckpointError: It is no checkpoint, or it is damaged.
+        MissingExtraError: PyTorch is not installed.
+    """
+    require_torch("reading a checkpoint")
+    found = open_checkpoint(find_checkpoint(spec))
+    planner, problem = most_like(shapes_of(found.state)), ""
+    if planner:
+        try:
+            checked_state(found, planner, needed_args(found, planner))
+        except CheckpointError as error:
+            problem = str(error)
+    return Inspection(
+        path=str(found.path),
+        container=found.container,
+        planner=planner,
+        problem=problem,
+        tensors=len(found.state),
+        parameters=sum(tensor.numel() for tensor in found.state.values()),
+        sha256=file_hash(found.path),
+        args=found.args,
+        skipped=found.skipped,
+        made_from=found.made_from,
+    )
+
+
+def convert_checkpoint(spec: str, out: Path) -> Inspection:
+    """Write the weights that a planner loads, and nothing else, to a safetensors file.
+
+    Args:
+        spec: As for `inspect_checkpoint`.
+        out: The file to write; its metadata names planner, args and the hash of the source.
+
+    Returns:
+        What is in the new file.
+
+    Raises:
+        CheckpointError: The source is not complete, or of no planner known here.
+    """
+    require_torch("converting a checkpoint")
+    from safetensors.torch import save_file
+
+    if out.suffix != ".safetensors":
+        raise CheckpointError(f"cannot write {str(out)!r}", hint="name it ….safetensors")
+    found = open_checkpoint(find_checkpoint(spec))
+    planner = most_like(shapes_of(found.state))
+    if not planner:
+        raise CheckpointError(
+            f"checkpoint {str(found.path)!r} is of no planner known here",
+            hint=f"shiftsim checkpoint inspect {found.path}",
+        )
+    args = needed_args(found, planner)
+    state = checked_state(found, planner, args)
+    metadata = {"planner": planner, "source_sha256": file_hash(found.path)}
+    if args is not None:
+        metadata["args"] = json.dumps(args, sort_keys=True)
+    save_file({name: value.contiguous().clone() for name, value in state.items()}, out, metadata)
+    return inspect_checkpoint(str(out))

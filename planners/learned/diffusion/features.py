@@ -1,0 +1,219 @@
+"""What the Diffusion Planner's network reads (planner-diffusion.md §2).
+
+The frame is that of the present rear axle. Lanes are resampled once per map; a step only picks the
+nearest ones and turns them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.planners.learned.diffusion.kernels import (
+    AGENT_COLUMNS,
+    AGENTS,
+    GREEN,
+    LANE_COLUMNS,
+    OBJECT_COLUMNS,
+    OBJECTS,
+    POINTS,
+    RED,
+    SAMPLES,
+    UNKNOWN,
+    LaneLines,
+    choose_agents,
+    choose_objects,
+    fill_agents,
+    fill_lanes,
+    fill_objects,
+    lanes_in_square,
+    line_bounds,
+    nearest_lanes,
+    resample_lanes,
+)
+from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.layers import square_around
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import LightStatus, Tracks, TrafficLights
+
+RADIUS = 100.0  # m, half side of the square from which lanes are taken
+LANES, ROUTE_LANES = 70, 25
+START_SQUARE = 1.0  # m, half side of the square that is searched for the start of the route
+
+Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Inputs of the network, not normalised, and what they were made of.
+
+    Attributes:
+        neighbor_agents_past: (32, 21, 11) x, y, cos, sin, vx, vy, width, length, one-hot kind.
+        static_objects: (5, 10) x, y, cos, sin, width, length, one-hot kind.
+        lanes: (70, 20, 12) x, y, step to the next point, offsets to the left and to the right
+            boundary, one-hot light.
+        lanes_speed_limit: (70, 1) [m/s], 0 where unknown.
+        lanes_has_speed_limit: (70, 1).
+        route_lanes: (25, 20, 12) those of the lanes that are on the route.
+        route_lanes_speed_limit: (25, 1); the network does not read it.
+        route_lanes_has_speed_limit: (25, 1); the network does not read it.
+        noise: (11, 80, 4) standard normal start noise of the sampler.
+        edges: Edges behind the lanes.
+        agents: Tracks behind the agents.
+        route: Corrected route, blocks; None where it cannot be corrected.
+    """
+
+    neighbor_agents_past: Single
+    static_objects: Single
+    lanes: Single
+    lanes_speed_limit: Single
+    lanes_has_speed_limit: BoolArray
+    route_lanes: Single
+    route_lanes_speed_limit: Single
+    route_lanes_has_speed_limit: BoolArray
+    noise: Single
+    edges: IntArray
+    agents: IntArray
+    route: tuple[int, ...] | None
+
+    @property
+    def ego_current_state(self) -> Single:
+        """(10,) the ego in its own frame; nuPlan: without its motion (§2.1)."""
+        out = np.zeros(10, np.float32)
+        out[2] = 1.0
+        return out
+
+
+def lane_lines(road: VectorMap) -> LaneLines:
+    """The edges of a map as the network reads them."""
+    rows = resample_lanes(road.baselines, road.left_boundaries, road.right_boundaries)
+    return LaneLines(rows, line_bounds(road.baselines), road.speed_limits, road.block_of)
+
+
+class FeatureBuilder:
+    """Features of one scenario."""
+
+    def __init__(self, scene: SceneInfo, lanes: LaneLines) -> None:
+        """Prepare for a scenario on a map whose lanes are given."""
+        self._road, self._lanes = scene.map, lanes
+        blocks = [
+            scene.map.blocks.index[name]
+            for name in dict.fromkeys(scene.route)
+            if name in scene.map.blocks.index
+        ]
+        self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None
+        self._light_names: tuple[str, ...] = ()
+        self._light_edges = np.zeros(0, np.int64)
+
+    def __call__(self, seen: Observation, noise: Single) -> Features:
+        """Features of an observation and the start noise that goes with them."""
+        anchor = np.array(seen.history.ego[-1, :3])
+        lights = self._lights(seen.lights)
+        road = self._road
+        edges = lanes_around(road, self._lanes.bounds, anchor)
+        route = self._corrector.at(anchor) if self._corrector else None
+        on_route = lanes_on_route(self._lanes.blocks[edges], route or ())
+        agents, objects, chosen = agent_features(seen.history.tracks, anchor)
+        rows, limits, known = lane_features(self._lanes, edges, lights[edges], anchor, LANES)
+        return Features(
+            neighbor_agents_past=agents,
+            static_objects=objects,
+            lanes=rows,
+            lanes_speed_limit=limits,
+            lanes_has_speed_limit=known,
+            route_lanes=_first_rows(rows, on_route),
+            route_lanes_speed_limit=_first_rows(limits, on_route),
+            route_lanes_has_speed_limit=_first_rows(known, on_route),
+            noise=noise,
+            edges=edges,
+            agents=chosen,
+            route=route,
+        )
+
+    def _lights(self, lights: TrafficLights) -> IntArray:
+        """(E,) one-hot position of every edge's light; nuPlan: yellow counts as unknown (§2.5)."""
+        if lights.connector_ids is not self._light_names:
+            index = self._road.edges.index
+            edges = [index.get(name, -1) for name in lights.connector_ids]
+            self._light_names, self._light_edges = lights.connector_ids, np.array(edges, np.int64)
+        out = np.full(len(self._road.edges), UNKNOWN)
+        status, known = lights.status[0], self._light_edges >= 0
+        for code, position in ((LightStatus.GREEN, GREEN), (LightStatus.RED, RED)):
+            out[self._light_edges[known & (status == code)]] = position
+        return out
+
+
+def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> IntArray:
+    """Edges that the network sees, nearest first.
+
+    Args:
+        road: The map.
+        bounds: Of its centre lines (`LaneLines`).
+        anchor: (3,) rear axle.
+    """
+    x, y = float(anchor[0]), float(anchor[1])
+    areas, lines, square = road.edges.polygons, road.baselines, square_around(x, y, RADIUS)
+    near = lanes_in_square(areas, lines, bounds, road.num_lanes, square)
+    return np.asarray(nearest_lanes(near, areas, lines, x, y, LANES))
+
+
+def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
+    """Positions of the chosen lanes that are on the route, in the order of the lanes (§2.6).
+
+    Args:
+        blocks: Block of each chosen lane.
+        route: Blocks in order; of it counts one stretch without a gap, the first.
+    """
+    seen = set(blocks.tolist())
+    stretch: set[int] = set()
+    for block in route:
+        if block in seen:
+            stretch.add(block)
+        elif stretch:
+            break
+    found = [i for i, block in enumerate(blocks.tolist()) if block in stretch]
+    return np.array(found[:ROUTE_LANES], np.int64)
+
+
+def lane_features(
+    lanes: LaneLines, edges: IntArray, lights: IntArray, anchor: FloatArray, count: int
+) -> tuple[Single, Single, BoolArray]:
+    """Rows (count, 20, 12), speed limits (count, 1) and whether known (count, 1)."""
+    out = (
+        np.zeros((count, POINTS, LANE_COLUMNS), np.float32),
+        np.zeros((count, 1), np.float32),
+        np.zeros((count, 1), np.bool_),
+    )
+    fill_lanes(lanes, edges, lights, anchor, out)
+    return out
+
+
+def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, IntArray]:
+    """Agents (32, 21, 11), static objects (5, 10), and which tracks the agents are."""
+    agents = np.zeros((AGENTS, SAMPLES, AGENT_COLUMNS), np.float32)
+    objects = np.zeros((OBJECTS, OBJECT_COLUMNS), np.float32)
+    kinds, valid = _plain(tracks.kinds), _plain(tracks.valid)
+    poses, sizes = _plain(tracks.poses), _plain(tracks.sizes)
+    present, now = valid[-1], poses[-1]
+    chosen = choose_agents(present, now, kinds, anchor)
+    velocities = _plain(tracks.velocities)
+    fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
+    static = choose_objects(present, now, kinds, anchor)
+    fill_objects(static, now, sizes[-1], kinds, anchor, objects)
+    return agents, objects, chosen
+
+
+def _first_rows(array: Any, rows: IntArray) -> Any:
+    """(25, ...) some rows of an array, then zeros."""
+    out = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+    out[: len(rows)] = array[rows]
+    return out
+
+
+def _plain(array: Any) -> Any:
+    """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
+    return array if array.flags.carray else array.copy()

@@ -1,0 +1,349 @@
+"""Kernels of the Diffusion Planner's features: lanes and agents around the ego, in its frame.
+
+Section numbers are of planner-diffusion.md.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.polylines import point_on_polyline
+from shiftsim.geometry.rings import segments_intersect
+from shiftsim.world.layers import Polygons, Polylines, distance_to, meets_convex
+
+POINTS = 20  # of a lane
+AGENTS, SAMPLES, AGENT_COLUMNS = 32, 21, 11
+OBJECTS, OBJECT_COLUMNS = 5, 10
+SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
+GREEN, RED, UNKNOWN = 0, 2, 3  # one-hot positions of a light
+LANE_COLUMNS = 12
+VEHICLE, PEDESTRIAN, BICYCLE, CONE, BARRIER, SIGN, GENERIC = range(7)  # state.AgentKind
+
+
+class LaneLines(NamedTuple):
+    """Every edge of a map as the network reads it, in the map frame. E edges.
+
+    Attributes:
+        rows: (E, POINTS, 8) x, y, step to the next point (0 at the last), offset to the left and
+            to the right boundary [m].
+        bounds: (E, 4) min x, min y, max x, max y of the centre lines [m].
+        limits: (E,) speed limits [m/s], NaN where the map has none.
+        blocks: (E,) block of each edge, -1 where unknown.
+    """
+
+    rows: FloatArray
+    bounds: FloatArray
+    limits: FloatArray
+    blocks: IntArray
+
+
+@kernel
+def resample_lanes(lines: Polylines, left: Polylines, right: Polylines) -> FloatArray:
+    """Centre lines and boundaries at equally spaced arc lengths, as rows of `LaneLines`.
+
+    A boundary that runs the other way is turned round (§2.5, rule 5); one that is missing or of one
+    point is taken for the centre line.
+    """
+    count = len(lines.ptr) - 1
+    out = np.zeros((count, POINTS, 8))
+    side = np.empty((POINTS, 2))
+    for edge in range(count):
+        row = out[edge]
+        _resample(lines, edge, row)
+        for point in range(POINTS - 1):
+            row[point, 2] = row[point + 1, 0] - row[point, 0]
+            row[point, 3] = row[point + 1, 1] - row[point, 1]
+        for which in range(2):
+            boundary = left if which == 0 else right
+            if boundary.ptr[edge + 1] - boundary.ptr[edge] < 2:
+                continue
+            _resample(boundary, edge, side)
+            x, y = row[0, 0], row[0, 1]
+            turned = np.hypot(side[-1, 0] - x, side[-1, 1] - y) < np.hypot(
+                side[0, 0] - x, side[0, 1] - y
+            )
+            for point in range(POINTS):
+                source = POINTS - 1 - point if turned else point
+                row[point, 4 + 2 * which] = side[source, 0] - row[point, 0]
+                row[point, 5 + 2 * which] = side[source, 1] - row[point, 1]
+    return out
+
+
+@kernel
+def _resample(lines: Polylines, line: int, out: FloatArray) -> None:
+    """Points of one line at equally spaced arc lengths, into the first columns of `out`."""
+    start, stop = lines.ptr[line], lines.ptr[line + 1]
+    if stop == start:
+        return
+    length = lines.arc[stop - 1]
+    for point in range(POINTS):
+        at = length * point / (POINTS - 1)
+        x, y = point_on_polyline(lines.xy, lines.arc, start, stop, at)
+        out[point, 0], out[point, 1] = x, y
+
+
+@kernel
+def line_bounds(lines: Polylines) -> FloatArray:
+    """(M, 4) min x, min y, max x, max y of each line; of an empty one nothing is within [m]."""
+    out = np.empty((len(lines.ptr) - 1, 4))
+    for line in range(len(out)):
+        out[line, :2], out[line, 2:] = np.inf, -np.inf
+        for vertex in range(lines.ptr[line], lines.ptr[line + 1]):
+            for axis in range(2):
+                out[line, axis] = min(out[line, axis], lines.xy[vertex, axis])
+                out[line, 2 + axis] = max(out[line, 2 + axis], lines.xy[vertex, axis])
+    return out
+
+
+@kernel
+def lanes_in_square(
+    areas: Polygons,
+    lines: Polylines,
+    bounds: FloatArray,
+    num_lanes: int,
+    square: FloatArray,
+) -> IntArray:
+    """Lanes whose area, and connectors whose centre line shares a point with a square, ascending.
+
+    nuPlan: the table of lane connectors, which is queried, holds lines; areas are in another one.
+
+    Args:
+        areas: Of the edges.
+        lines: Centre lines of the edges.
+        bounds: Of the centre lines.
+        num_lanes: How many of the edges are lanes.
+        square: (4, 2) corners, counter-clockwise from the upper right one [m].
+    """
+    low, high = square[2], square[0]
+    out = np.empty(len(bounds), np.int64)
+    found = 0
+    for edge in range(len(bounds)):
+        box = areas.bounds[edge] if edge < num_lanes else bounds[edge]
+        if box[0] > high[0] or box[2] < low[0] or box[1] > high[1] or box[3] < low[1]:
+            continue
+        if edge < num_lanes:
+            meets = meets_convex(areas, edge, square)
+        else:
+            meets = _line_meets(lines, edge, square)
+        if meets:
+            out[found] = edge
+            found += 1
+    return out[:found].copy()
+
+
+@kernel
+def _line_meets(lines: Polylines, line: int, square: FloatArray) -> bool:
+    """Whether a line shares a point with an axis-parallel square (see `lanes_in_square`)."""
+    low, high = square[2], square[0]
+    start, stop = lines.ptr[line], lines.ptr[line + 1]
+    for vertex in range(start, stop):
+        x, y = lines.xy[vertex, 0], lines.xy[vertex, 1]
+        if low[0] <= x <= high[0] and low[1] <= y <= high[1]:
+            return True
+    for vertex in range(start + 1, stop):
+        for corner in range(4):
+            if segments_intersect(
+                lines.xy[vertex - 1], lines.xy[vertex], square[corner - 1], square[corner]
+            ):
+                return True
+    return False
+
+
+@kernel
+def nearest_lanes(
+    near: IntArray, areas: Polygons, lines: Polylines, x: float, y: float, most: int
+) -> IntArray:
+    """The nearest edges of a list, at most `most` (§2.5, rules 2 and 3).
+
+    Sorted by the distance to the nearest vertex of the centre line; among equals, which are common
+    where a lane and its connectors meet, by the distance to the area, then as listed.
+    """
+    keys = np.empty(len(near))
+    for index, edge in enumerate(near):
+        least = np.inf
+        for vertex in range(lines.ptr[edge], lines.ptr[edge + 1]):
+            dx, dy = lines.xy[vertex, 0] - x, lines.xy[vertex, 1] - y
+            least = min(least, dx * dx + dy * dy)
+        keys[index] = np.sqrt(least)
+    order = np.argsort(keys, kind="mergesort")
+    distances = np.empty(len(near))
+    first = 0
+    while first < len(order) and first < most:
+        stop = first + 1
+        while stop < len(order) and keys[order[stop]] == keys[order[first]]:
+            stop += 1
+        if stop > first + 1:
+            for index in range(first, stop):
+                distances[index] = distance_to(areas, near[order[index]], x, y)
+            ranks = np.argsort(distances[first:stop], kind="mergesort")
+            order[first:stop] = order[first:stop][ranks]
+        first = stop
+    return near[order[:most]]
+
+
+@kernel
+def fill_lanes(
+    lanes: LaneLines,
+    edges: IntArray,
+    lights: IntArray,
+    anchor: FloatArray,
+    out: tuple[FloatArray, FloatArray, BoolArray],
+) -> None:
+    """Write lanes in the ego frame.
+
+    Args:
+        lanes: The map's.
+        edges: Which of them.
+        lights: One-hot position of the light of each.
+        anchor: (3,) rear axle x [m], y [m], heading [rad].
+        out: float32 rows (L, POINTS, 12), limits (L, 1) and whether known (L, 1), zero before.
+    """
+    rows, limits, known = out
+    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
+    for index in range(min(len(edges), len(rows))):
+        edge = edges[index]
+        for point in range(POINTS):
+            given, row = lanes.rows[edge, point], rows[index, point]
+            for pair in range(4):
+                x, y = given[2 * pair], given[2 * pair + 1]
+                if pair == 0:
+                    x, y = x - anchor[0], y - anchor[1]
+                row[2 * pair] = cos * x + sin * y
+                row[2 * pair + 1] = cos * y - sin * x
+            row[8 + lights[index]] = 1.0
+        if not np.isnan(lanes.limits[edge]):
+            limits[index, 0] = lanes.limits[edge]
+            known[index, 0] = True
+
+
+@kernel
+def choose_agents(
+    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
+) -> IntArray:
+    """Tracks that the network sees, nearest first (§2.2, rule 5).
+
+    Args:
+        present: (N,) whether each track is there now.
+        poses: (N, 3) their present poses.
+        kinds: (N,) their kinds.
+        anchor: (3,) rear axle.
+    """
+    order = _by_distance(present, poses, kinds, anchor, VEHICLE, BICYCLE)
+    if len(order) <= AGENTS:
+        return order
+    slow = 0
+    for track in order:
+        slow += kinds[track] != VEHICLE
+    allowed = max(SLOW_AGENTS, AGENTS - (len(order) - slow))
+    out = np.empty(AGENTS, np.int64)
+    count, taken = 0, 0
+    for track in order:
+        if kinds[track] != VEHICLE:
+            if taken >= allowed:
+                continue
+            taken += 1
+        if count < AGENTS:
+            out[count] = track
+            count += 1
+    return out[:count]
+
+
+@kernel
+def choose_objects(
+    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
+) -> IntArray:
+    """Static objects that the network sees, nearest first (§2.3; arguments as above)."""
+    return _by_distance(present, poses, kinds, anchor, CONE, GENERIC)[:OBJECTS]
+
+
+@kernel
+def _by_distance(
+    present: BoolArray,
+    poses: FloatArray,
+    kinds: IntArray,
+    anchor: FloatArray,
+    first_kind: int,
+    last_kind: int,
+) -> IntArray:
+    """Present tracks of some kinds by distance to the rear axle."""
+    tracks = np.empty(len(kinds), np.int64)
+    distances = np.empty(len(kinds))
+    count = 0
+    for track in range(len(kinds)):
+        if present[track] and first_kind <= kinds[track] <= last_kind:
+            tracks[count] = track
+            dx, dy = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
+            distances[count] = np.sqrt(dx * dx + dy * dy)
+            count += 1
+    return tracks[:count][np.argsort(distances[:count], kind="mergesort")]
+
+
+@kernel
+def fill_agents(
+    tracks: IntArray,
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    kinds: IntArray,
+    anchor: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write histories in the ego frame.
+
+    A missing sample takes the values of the next later one; so do those before the oldest sample
+    of a short history (§2.2, rule 3).
+
+    Args:
+        tracks: Which tracks, all of them present in the last sample.
+        valid: (T, N).
+        poses: (T, N, 3).
+        velocities: (T, N, 2).
+        sizes: (T, N, 2) length, width.
+        kinds: (N,).
+        anchor: (3,) rear axle.
+        out: float32 (AGENTS, SAMPLES, AGENT_COLUMNS), zero before.
+    """
+    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
+    for index, track in enumerate(tracks):
+        known = len(valid) - 1
+        for back in range(SAMPLES):
+            sample = len(valid) - 1 - back
+            if sample >= 0 and valid[sample, track]:
+                known = sample
+            row = out[index, SAMPLES - 1 - back]
+            x, y = poses[known, track, 0] - anchor[0], poses[known, track, 1] - anchor[1]
+            turn = poses[known, track, 2] - anchor[2]
+            row[0], row[1] = cos * x + sin * y, cos * y - sin * x
+            row[2], row[3] = np.cos(turn), np.sin(turn)
+            x, y = velocities[known, track, 0], velocities[known, track, 1]
+            row[4], row[5] = cos * x + sin * y, cos * y - sin * x
+            row[6], row[7] = sizes[known, track, 1], sizes[known, track, 0]
+            row[8 + kinds[track]] = 1.0
+
+
+@kernel
+def fill_objects(
+    tracks: IntArray,
+    poses: FloatArray,
+    sizes: FloatArray,
+    kinds: IntArray,
+    anchor: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write static objects in the ego frame into `out`, float32 (OBJECTS, OBJECT_COLUMNS).
+
+    The other arguments are as above, of the last sample.
+    """
+    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
+    for index, track in enumerate(tracks):
+        row = out[index]
+        x, y = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
+        turn = poses[track, 2] - anchor[2]
+        row[0], row[1] = cos * x + sin * y, cos * y - sin * x
+        row[2], row[3] = np.cos(turn), np.sin(turn)
+        row[4], row[5] = sizes[track, 1], sizes[track, 0]
+        kind = kinds[track]
+        column = 6 if kind == SIGN else (7 if kind == BARRIER else (8 if kind == CONE else 9))
+        row[column] = 1.0

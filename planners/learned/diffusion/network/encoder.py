@@ -1,0 +1,211 @@
+"""Encoder of the Diffusion Planner: agents, static objects and lanes to one token each.
+
+Unused rows make zero tokens. Rows that are used are gathered first, so that an empty road costs
+little (planner-diffusion.md §3.1).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from shiftsim.planners.learned.diffusion.network.parts import EPS, Attention, Mixer, Mlp
+from shiftsim.planners.learned.network.rows import Linear
+
+AGENT_COLUMNS, STATIC_COLUMNS, LANE_COLUMNS, LIGHT_COLUMNS = 8, 10, 8, 4
+AGENT_KINDS = 3
+POSITION = 7  # x, y, cos, sin, and one-hot agent, static object, lane
+TOKENS, CHANNELS = 64, 128  # inside the mixers
+MIDDLE = 10  # point of a lane that stands for its position
+NO_KEY = float("-inf")
+TOGETHER = 36  # rows that pass through the mixers at a time: what they make stays in the cache
+
+
+class MixerEncoder(nn.Module):
+    """What agents and lanes have in common: samples to tokens, mixer blocks, their mean."""
+
+    def __init__(self, columns: int, samples: int, hidden: int, depth: int) -> None:
+        """Make it for (samples, columns) inputs and (hidden,) outputs."""
+        super().__init__()
+        self.channel_pre_project = Mlp(columns, CHANNELS, CHANNELS)
+        self.token_pre_project = Mlp(samples, TOKENS, TOKENS)
+        self.blocks = nn.ModuleList(Mixer(TOKENS, CHANNELS) for _ in range(depth))
+        self.norm = nn.LayerNorm(CHANNELS, EPS)
+        self.emb_project = Mlp(CHANNELS, hidden, hidden)
+
+    def mean(self, x: Tensor) -> Tensor:
+        """(N, samples, columns) to (N, CHANNELS)."""
+        if x.is_cuda or len(x) <= TOGETHER:
+            return self._mean(x)
+        return torch.cat([self._mean(part) for part in torch.split(x, TOGETHER)])
+
+    def _mean(self, x: Tensor) -> Tensor:
+        x = self.token_pre_project.over_rows(self.channel_pre_project(x))
+        for block in self.blocks[:-1]:
+            x = block(x)
+        last = self.blocks[-1]
+        assert isinstance(last, Mixer)
+        return last.mean(x)
+
+    def token(self, x: Tensor) -> Tensor:
+        """(N, CHANNELS) to (N, hidden)."""
+        out: Tensor = self.emb_project(self.norm(x))
+        return out
+
+
+class AgentEncoder(MixerEncoder):
+    """Histories of agents to tokens."""
+
+    def __init__(self, samples: int, hidden: int, depth: int) -> None:
+        """Make it for histories of `samples` samples."""
+        super().__init__(AGENT_COLUMNS + 1, samples, hidden, depth)
+        self.type_emb = Linear(AGENT_KINDS, CHANNELS)
+
+    def forward(self, agents: Tensor) -> Tensor:
+        """(N, samples, 11) of used rows to (N, hidden)."""
+        motion = agents[..., :AGENT_COLUMNS]
+        present = (motion != 0.0).any(dim=-1, keepdim=True).to(motion.dtype)
+        x = self.mean(torch.cat([motion, present], dim=-1))
+        return self.token(x + self.type_emb(agents[:, -1, AGENT_COLUMNS:]))
+
+
+class StaticEncoder(nn.Module):
+    """Static objects to tokens."""
+
+    def __init__(self, hidden: int) -> None:
+        """Make it."""
+        super().__init__()
+        self.projection = Mlp(STATIC_COLUMNS, hidden, hidden)
+
+    def forward(self, objects: Tensor) -> Tensor:
+        """(N, 10) to (N, hidden)."""
+        out: Tensor = self.projection(objects)
+        return out
+
+
+class LaneEncoder(MixerEncoder):
+    """Lanes to tokens."""
+
+    def __init__(self, points: int, hidden: int, depth: int) -> None:
+        """Make it for lanes of `points` points."""
+        super().__init__(LANE_COLUMNS, points, hidden, depth)
+        self.speed_limit_emb = Linear(1, CHANNELS)
+        self.unknown_speed_emb = nn.Embedding(1, CHANNELS)
+        self.traffic_emb = Linear(LIGHT_COLUMNS, CHANNELS)
+
+    def forward(self, lanes: Tensor, limit: Tensor, has_limit: Tensor) -> Tensor:
+        """(N, points, 12) of used rows, their limits (N, 1) and whether known, to (N, hidden)."""
+        speed = torch.where(has_limit, self.speed_limit_emb(limit), self.unknown_speed_emb.weight)
+        light = self.traffic_emb(lanes[:, 0, LANE_COLUMNS:])
+        return self.token(self.mean(lanes[..., :LANE_COLUMNS]) + speed + light)
+
+
+class FusionBlock(nn.Module):
+    """Self-attention in which keys and values are not normalised, and an MLP."""
+
+    def __init__(self, hidden: int, heads: int) -> None:
+        """Make it."""
+        super().__init__()
+        self.norm1 = nn.LayerNorm(hidden, EPS)
+        self.attn = Attention(hidden, heads)
+        self.norm2 = nn.LayerNorm(hidden, EPS)
+        self.mlp = Mlp(hidden, 4 * hidden, hidden)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, N, hidden) to the same; `mask` is added to the logits."""
+        keys, values = self.attn.keys_values(x)
+        x = x + self.attn(self.attn.query(self.norm1(x)), keys, values, mask)
+        self.mlp.add_to(x, self.norm2(x))
+        return x
+
+
+class Fusion(nn.Module):
+    """All tokens look at each other."""
+
+    def __init__(self, hidden: int, heads: int, depth: int) -> None:
+        """Make it."""
+        super().__init__()
+        self.blocks = nn.ModuleList(FusionBlock(hidden, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(hidden, EPS)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, N, hidden) to the same; `mask` is added to the logits."""
+        for block in self.blocks:
+            x = block(x, mask)
+        out: Tensor = self.norm(x)
+        return out
+
+
+class SceneEncoder(nn.Module):
+    """The whole encoder."""
+
+    def __init__(self, *, hidden: int, heads: int, depth: int, samples: int, points: int) -> None:
+        """Make it.
+
+        Args:
+            hidden: Channels of a token.
+            heads: Of the attention.
+            depth: Mixer blocks of an encoder, and fusion blocks.
+            samples: Of an agent's history.
+            points: Of a lane.
+        """
+        super().__init__()
+        self.neighbor_encoder = AgentEncoder(samples, hidden, depth)
+        self.static_encoder = StaticEncoder(hidden)
+        self.lane_encoder = LaneEncoder(points, hidden, depth)
+        self.fusion = Fusion(hidden, heads, depth)
+        self.pos_emb = Linear(POSITION, hidden)
+
+    def forward(
+        self, agents: Tensor, objects: Tensor, lanes: Tensor, limit: Tensor, has_limit: Tensor
+    ) -> Tensor:
+        """Tokens of a scene: agents, static objects, lanes.
+
+        Args:
+            agents: (B, A, samples, 11) normalised histories.
+            objects: (B, O, 10) normalised static objects.
+            lanes: (B, L, points, 12) normalised lanes.
+            limit: (B, L, 1) normalised speed limits.
+            has_limit: (B, L, 1) whether they are known.
+
+        Returns:
+            (B, A + O + L, hidden).
+        """
+        used = [
+            (agents[..., :AGENT_COLUMNS] != 0.0).any(dim=-1).any(dim=-1),
+            (objects != 0.0).any(dim=-1),
+            (lanes[..., :LANE_COLUMNS] != 0.0).any(dim=-1).any(dim=-1),
+        ]
+        valid = torch.cat(used, dim=1)
+        tokens = agents.new_zeros(*valid.shape, self.pos_emb.out_features)
+        split = [part.shape[1] for part in used]
+        rows = [agents[used[0]], objects[used[1]], lanes[used[2]]]
+        for out, where, token in zip(
+            torch.split(tokens, split, dim=1),
+            used,
+            (
+                self.neighbor_encoder(rows[0]) + self.pos_emb(_positions(rows[0][:, -1], 0)),
+                self.static_encoder(rows[1]) + self.pos_emb(_positions(rows[1], 1)),
+                self.lane_encoder(rows[2], limit[used[2]], has_limit[used[2]])
+                + self.pos_emb(_lane_positions(rows[2][:, MIDDLE])),
+            ),
+            strict=True,
+        ):
+            out[where] = token
+        valid[:, 0] = True  # an empty scene still has one key: a zero token
+        mask = torch.zeros_like(valid, dtype=tokens.dtype).masked_fill(~valid, NO_KEY)
+        fused: Tensor = self.fusion(tokens, mask[:, None, None, :])
+        return fused
+
+
+def _positions(rows: Tensor, kind: int) -> Tensor:
+    """(N, 7) x, y, cos, sin and the one-hot `kind` from rows that start with the first four."""
+    hot = rows.new_zeros(len(rows), POSITION - 4)
+    hot[:, kind] = 1.0
+    return torch.cat([rows[:, :4], hot], dim=-1)
+
+
+def _lane_positions(points: Tensor) -> Tensor:
+    """(N, 7) of lanes from one point each: x, y, dx, dy, …."""
+    # in double precision, in which it does not matter how many there are
+    angle = torch.atan2(points[:, 3].double(), points[:, 2].double())
+    along = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1).to(points.dtype)
+    return _positions(torch.cat([points[:, :2], along], dim=-1), 2)

@@ -1,0 +1,157 @@
+"""What the feature builders of the learned planners share."""
+
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
+from shiftsim.sim.planner import History
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, Tracks, Trajectory
+
+SAMPLES = 21  # of a history of 2 s
+PLAN_POSES = 80
+EGO_LENGTH, EGO_WIDTH = PACIFICA.length, PACIFICA.width
+
+MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
+
+Arrays = TypeVar("Arrays")
+
+
+class PerMap(Generic[Arrays]):
+    """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
+
+    def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
+        """Nothing is built before it is asked for."""
+        self._build = build
+        self._kept: list[tuple[VectorMap, Arrays]] = []
+
+    def __call__(self, road: VectorMap) -> Arrays:
+        """The arrays of a map; maps are told apart by identity."""
+        for index, (known, arrays) in enumerate(self._kept):
+            if known is road:
+                if index:
+                    self._kept.insert(0, self._kept.pop(index))
+                return arrays
+        arrays = self._build(road)
+        self._kept.insert(0, (road, arrays))
+        del self._kept[MAPS_KEPT:]
+        return arrays
+
+
+class AgentFeatures(NamedTuple):
+    """The ego and the agents nearest to it in the ego frame, float32. A rows, the ego first.
+
+    Attributes:
+        tracks: (A - 1,) track of every row but the first.
+        position: (A, 21, 2) rear axle of the ego, centres of the others [m].
+        heading: (A, 21) not wrapped [rad].
+        velocity: (A, 21, 2) [m/s].
+        shape: (A, 21, 2) width, length [m].
+        valid: (A, 21) whether the sample is there; all else is 0 where not.
+        category: (A,) 0 ego, 1 vehicle, 2 pedestrian, 3 bicycle.
+    """
+
+    tracks: IntArray
+    position: np.ndarray
+    heading: np.ndarray
+    velocity: np.ndarray
+    shape: np.ndarray
+    valid: BoolArray
+    category: IntArray
+
+
+def agent_features(history: History, center: FloatArray, max_agents: int) -> AgentFeatures:
+    """Histories of the ego and of the agents that are present (planner-plantf.md §2.1, §2.2).
+
+    A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
+
+    Args:
+        history: The last samples.
+        center: (2,) or more: centre of the ego's box, from which agents are counted [m].
+        max_agents: How many agents are kept, the nearest ones.
+    """
+    tracks = history.tracks
+    nearest = _nearest_agents(tracks, center, max_agents)
+    position, heading, velocity, shape, valid = _agent_histories(
+        history.ego, tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, nearest
+    )
+    category = np.zeros(len(nearest) + 1, np.int64)
+    category[1:] = tracks.kinds[nearest] + 1
+    return AgentFeatures(nearest, position, heading, velocity, shape, valid, category)
+
+
+def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
+    """Present agents, nearest first. nuPlan: sorted from a list by kind with numpy's default."""
+    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= LAST_AGENT_KIND))
+    by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
+    away = tracks.poses[-1, by_kind, :2] - center[:2]
+    order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
+    return by_kind[order[:count]]
+
+
+@kernel
+def _agent_histories(
+    ego: FloatArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    present: BoolArray,
+    chosen: IntArray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
+    """The arrays of `AgentFeatures` but the first and the last."""
+    rows = len(chosen) + 1
+    position = np.zeros((rows, SAMPLES, 2), np.float32)
+    turned = np.zeros((rows, SAMPLES), np.float32)
+    velocity = np.zeros((rows, SAMPLES, 2), np.float32)
+    shape = np.zeros((rows, SAMPLES, 2), np.float32)
+    valid = np.zeros((rows, SAMPLES), np.bool_)
+    last = len(ego) - 1
+    x, y, heading = ego[last, 0], ego[last, 1], ego[last, 2]
+    cos, sin = np.cos(heading), np.sin(heading)
+    for back in range(min(len(ego), SAMPLES)):
+        sample, row = SAMPLES - 1 - back, last - back
+        for index in range(rows):
+            if index == 0:
+                own_cos, own_sin = np.cos(ego[row, 2]), np.sin(ego[row, 2])
+                px, py, angle = ego[row, 0], ego[row, 1], ego[row, 2]
+                vx = own_cos * ego[row, 3] - own_sin * ego[row, 4]
+                vy = own_sin * ego[row, 3] + own_cos * ego[row, 4]
+                length, width = EGO_LENGTH, EGO_WIDTH
+            else:
+                track = chosen[index - 1]
+                if not present[row, track]:
+                    continue
+                px, py, angle = poses[row, track, 0], poses[row, track, 1], poses[row, track, 2]
+                vx, vy = velocities[row, track, 0], velocities[row, track, 1]
+                length, width = sizes[row, track, 0], sizes[row, track, 1]
+            position[index, sample, 0] = cos * (px - x) + sin * (py - y)
+            position[index, sample, 1] = cos * (py - y) - sin * (px - x)
+            turned[index, sample] = angle - heading
+            velocity[index, sample, 0] = cos * vx + sin * vy
+            velocity[index, sample, 1] = cos * vy - sin * vx
+            shape[index, sample, 0], shape[index, sample, 1] = width, length
+            valid[index, sample] = True
+    return position, turned, velocity, shape, valid
+
+
+def map_poses(poses: FloatArray, ego: FloatArray) -> FloatArray:
+    """Poses (..., 3) of the ego frame in that of the map; nuPlan: headings are not wrapped."""
+    cos, sin = np.cos(ego[HEADING]), np.sin(ego[HEADING])
+    x, y, heading = poses[..., 0], poses[..., 1], poses[..., 2]
+    return np.stack(
+        [ego[0] + cos * x - sin * y, ego[1] + sin * x + cos * y, ego[HEADING] + heading], axis=-1
+    )
+
+
+def straight_on(history: History) -> Trajectory:
+    """A makeshift where a planner has no plan: heading and speed are kept for 8 s."""
+    present = history.ego[-1]
+    times = STEP * np.arange(1, PLAN_POSES + 1)
+    speed = present[VX] * np.array([np.cos(present[HEADING]), np.sin(present[HEADING])])
+    poses = np.empty((PLAN_POSES, 3))
+    poses[:, :2] = present[:2] + times[:, None] * speed
+    poses[:, HEADING] = present[HEADING]
+    return plan_of_poses(poses, history)

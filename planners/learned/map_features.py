@@ -1,0 +1,286 @@
+"""Lanes, connectors and crosswalks around the ego as resampled polylines (planner-plantf.md §2.3).
+
+Everything that does not depend on the ego is made once per map, in the map frame: 21 points on the
+centre line and on either side of every object. A step then selects, moves and turns.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.features import PerMap
+from shiftsim.world.layers import Polylines, meeting, square_around
+from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.state import LightStatus, TrafficLights
+
+POINTS = 20  # per polyline; their vectors lead to the next one
+_MIDDLE = 10  # point that stands for the whole object
+LANE, CONNECTOR, CROSSWALK = 0, 1, 2
+_ZERO_BIN = 1e-6  # divisor of a bin without length
+
+
+class RoadObjects(NamedTuple):
+    """Lanes, then connectors, then crosswalks of a map, each in the order of its layer. M objects.
+
+    Attributes:
+        lines: (M, 3, 21, 2) centre, left and right polyline in the map frame [m].
+        angles: (M, 3, 20) orientation of the steps [rad].
+        kind: (M,) LANE, CONNECTOR or CROSSWALK.
+        block: (M,) block of the object, or NONE.
+        limit: (M,) speed limit [m/s], NaN where there is none.
+    """
+
+    lines: FloatArray
+    angles: FloatArray
+    kind: IntArray
+    block: IntArray
+    limit: FloatArray
+
+
+class RoadFeatures(NamedTuple):
+    """Objects around the ego in its frame, float32 and ready for a network. M objects.
+
+    Attributes:
+        objects: (M,) row of each in `RoadObjects`; below the number of edges it is the edge.
+        points: (M, 3, 20, 2) points of centre, left and right [m].
+        vectors: (M, 3, 20, 2) to the next point [m].
+        orientations: (M, 3, 20) of the vectors, not wrapped [rad].
+        centers: (M, 3) pose of the middle of the centre line.
+        valid: (M, 20) whether a point of the centre line is near enough.
+        kind: (M,) LANE, CONNECTOR or CROSSWALK.
+        on_route: (M,)
+        light: (M,) LightStatus, UNKNOWN where there is no light.
+        has_limit: (M,)
+        limit: (M,) speed limit [m/s], 0 where there is none.
+    """
+
+    objects: IntArray
+    points: np.ndarray
+    vectors: np.ndarray
+    orientations: np.ndarray
+    centers: np.ndarray
+    valid: BoolArray
+    kind: IntArray
+    on_route: BoolArray
+    light: IntArray
+    has_limit: BoolArray
+    limit: np.ndarray
+
+
+def _make_road_objects(road: VectorMap) -> RoadObjects:
+    num_edges, num_crosswalks = len(road.edges), len(road.crosswalks)
+    lines = np.empty((num_edges + num_crosswalks, 3, POINTS + 1, 2))
+    for side, polylines in enumerate((road.baselines, road.left_boundaries, road.right_boundaries)):
+        # a map without boundaries gets its centre lines in their place
+        _resample_all(polylines, road.baselines, lines[:num_edges, side])
+    along = np.linspace(0.0, 1.0, POINTS + 1)[:, None]
+    for index in range(num_crosswalks):
+        corners = oriented_rectangle(road.crosswalks.rings(index)[0])
+        right = corners[3] + along * (corners[0] - corners[3])
+        left = corners[2] + along * (corners[1] - corners[2])
+        lines[num_edges + index] = (left + right) / 2.0, left, right
+    steps = np.diff(lines, axis=2)
+    kind = np.full(len(lines), CROSSWALK)
+    kind[:num_edges] = np.arange(num_edges) >= road.num_lanes
+    block = np.full(len(lines), NONE)
+    block[:num_edges] = road.block_of
+    limit = np.full(len(lines), np.nan)
+    limit[:num_edges] = road.speed_limits
+    return RoadObjects(lines, np.arctan2(steps[..., 1], steps[..., 0]), kind, block, limit)
+
+
+road_objects = PerMap(_make_road_objects)
+
+
+@kernel
+def _resample_all(lines: Polylines, fallback: Polylines, out: FloatArray) -> None:
+    """Write every polyline, or its fallback where it is missing, at 21 points into `out`."""
+    for line in range(len(out)):
+        start, stop = lines.ptr[line], lines.ptr[line + 1]
+        if stop - start >= 2:
+            _resample(lines.xy[start:stop], lines.arc[start:stop], out[line])
+        else:
+            start, stop = fallback.ptr[line], fallback.ptr[line + 1]
+            _resample(fallback.xy[start:stop], fallback.arc[start:stop], out[line])
+
+
+@kernel
+def _resample(xy: FloatArray, arc: FloatArray, out: FloatArray) -> None:
+    """Write points equally spaced along a polyline into `out` (21, 2) (planner-plantf.md §2.5)."""
+    last = len(xy) - 1
+    length = arc[last] if arc[last] > 0.0 else 1.0
+    for point in range(len(out)):
+        fraction = point / (len(out) - 1.0)
+        after = 1
+        while after < last and arc[after] / length <= fraction:
+            after += 1
+        if point == 0:
+            after = 1
+        elif point == len(out) - 1:
+            after = last
+        span = (arc[after] - arc[after - 1]) / length
+        along = (fraction - arc[after - 1] / length) / (span if span > 0.0 else _ZERO_BIN)
+        for axis in range(2):
+            first = xy[after - 1, axis]
+            out[point, axis] = first + along * (xy[after, axis] - first)
+
+
+def oriented_rectangle(ring: FloatArray) -> FloatArray:
+    """(4, 2) corners of the smallest rectangle around a polygon, one side along its convex hull.
+
+    The first side lies along the hull's edge. Every edge of a rectangle does equally well, so that
+    the last bit of an area decides which corner comes first: sides are compared in the order of
+    the hull, clockwise from its lowest vertex, and measured from the origin of the map.
+
+    Args:
+        ring: (V, 2) vertices [m].
+    """
+    hull = _clockwise_hull(ring)
+    edges = np.roll(hull, -1, axis=0) - hull
+    along = edges / np.sqrt(edges[:, 0] ** 2 + edges[:, 1] ** 2)[:, None]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    boxes = np.empty((len(hull), 4))
+    for column, axes in enumerate((along, across)):
+        offsets = axes[:, None, 0] * hull[:, 0] + axes[:, None, 1] * hull[:, 1]
+        boxes[:, column], boxes[:, column + 2] = offsets.min(axis=1), offsets.max(axis=1)
+    best = int(np.argmin((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])))
+    low_u, low_v, high_u, high_v = boxes[best]
+    u = np.array([low_u, high_u, high_u, low_u])[:, None]
+    v = np.array([low_v, low_v, high_v, high_v])[:, None]
+    return along[best] * u + across[best] * v
+
+
+def _clockwise_hull(ring: FloatArray) -> FloatArray:
+    """Vertices of the convex hull, clockwise from the lowest one, or from the left one of two."""
+    hull = shapely.convex_hull(shapely.linestrings(ring))
+    if hull.geom_type != "Polygon":  # no area: a pavement of a millimetre
+        hull = shapely.buffer(hull, 1e-3, quad_segs=1)
+    xy = np.asarray(hull.exterior.coords)[:-1]
+    xy = xy[::-1] if hull.exterior.is_ccw else xy
+    return np.roll(xy, -int(np.lexsort((xy[:, 0], xy[:, 1]))[0]), axis=0)
+
+
+class LightLookup:
+    """Traffic lights by edge; the ids of one scenario are looked up once."""
+
+    def __init__(self, road: VectorMap) -> None:
+        """`road` is the map of the scenario."""
+        self._road = road
+        self._ids: tuple[str, ...] | None = None
+        self._columns = self._edges = np.zeros(0, np.int64)
+        self._status = np.full(len(road.edges), int(LightStatus.UNKNOWN))
+
+    def at(self, lights: TrafficLights) -> IntArray:
+        """(E,) status by edge of one row of lights, UNKNOWN where none is listed; not to be kept.
+
+        Ids that the map does not have are left out.
+        """
+        if lights.connector_ids is not self._ids:
+            index = self._road.edges.index
+            pairs = [(c, index[i]) for c, i in enumerate(lights.connector_ids) if i in index]
+            found = np.array(pairs, np.int64).reshape(-1, 2)
+            self._columns, self._edges = found[:, 0].copy(), found[:, 1].copy()
+            self._ids = lights.connector_ids
+            self._status[:] = LightStatus.UNKNOWN
+        codes = lights.status[0, self._columns].astype(np.int64)
+        codes[codes == LightStatus.ABSENT] = LightStatus.UNKNOWN
+        self._status[self._edges] = codes
+        return self._status
+
+
+def road_features(
+    road: VectorMap,
+    ego: FloatArray,
+    center: FloatArray,
+    radius: float,
+    lights: IntArray,
+    on_route: BoolArray,
+) -> RoadFeatures:
+    """Objects whose area touches a square around the ego, and with a point near it.
+
+    Args:
+        road: The map.
+        ego: (3,) rear axle x [m], y [m], heading [rad]: the frame of the features.
+        center: (2,) or more: box centre, around which objects are looked for [m].
+        radius: Half side of the square [m].
+        lights: (E,) status by edge of `LightLookup`.
+        on_route: (B,) whether a block is on the route.
+
+    Returns:
+        The objects, in the order of `RoadObjects`.
+    """
+    known = road_objects(road)
+    square = square_around(float(center[0]), float(center[1]), radius)
+    edges = meeting(road.edges.polygons, square)
+    near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
+    kept, points, vectors, orientations, valid = _to_ego_frame(
+        known.lines, known.angles, near, ego[0], ego[1], ego[2], radius
+    )
+    limit = known.limit[kept]
+    has_limit = ~np.isnan(limit)
+    light = np.full(len(kept), int(LightStatus.UNKNOWN))
+    num_edges = int(np.searchsorted(kept, len(road.edges)))
+    light[:num_edges] = lights[kept[:num_edges]]
+    block = known.block[kept]
+    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(kept), np.bool_)
+    centers = np.concatenate(
+        [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
+    )
+    return RoadFeatures(
+        objects=kept,
+        points=points,
+        vectors=vectors,
+        orientations=orientations,
+        centers=centers,
+        valid=valid,
+        kind=known.kind[kept],
+        on_route=routed,
+        light=light,
+        has_limit=has_limit,
+        limit=np.where(has_limit, limit, 0.0).astype(np.float32),
+    )
+
+
+@kernel
+def _to_ego_frame(
+    lines: FloatArray,
+    angles: FloatArray,
+    near: IntArray,
+    x: float,
+    y: float,
+    heading: float,
+    radius: float,
+) -> tuple[IntArray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
+    """Objects with a valid point, moved and turned; invalid points are, too."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    kept = np.empty(len(near), np.int64)
+    valid = np.empty((len(near), POINTS), np.bool_)
+    count = 0
+    for row in near:
+        seen = False
+        for point in range(POINTS):
+            dx, dy = lines[row, 0, point, 0] - x, lines[row, 0, point, 1] - y
+            ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
+            valid[count, point] = abs(ahead) < radius and abs(left) < radius
+            seen = seen or valid[count, point]
+        if seen:
+            kept[count] = row
+            count += 1
+    points = np.empty((count, 3, POINTS, 2), np.float32)
+    vectors = np.empty((count, 3, POINTS, 2), np.float32)
+    orientations = np.empty((count, 3, POINTS), np.float32)
+    for index in range(count):
+        row = kept[index]
+        for side in range(3):
+            line = lines[row, side]
+            for point in range(POINTS):
+                dx, dy = line[point, 0] - x, line[point, 1] - y
+                points[index, side, point, 0] = cos * dx + sin * dy
+                points[index, side, point, 1] = cos * dy - sin * dx
+                dx, dy = line[point + 1, 0] - line[point, 0], line[point + 1, 1] - line[point, 1]
+                vectors[index, side, point, 0] = cos * dx + sin * dy
+                vectors[index, side, point, 1] = cos * dy - sin * dx
+                orientations[index, side, point] = angles[row, side, point] - heading
+    return kept[:count], points, vectors, orientations, valid[:count]

@@ -1,0 +1,363 @@
+"""Blocks that the networks of PlanTF and PLUTO share; names and shapes as in their checkpoints.
+
+Only inference is meant: no dropout, no drop path. What the official code computes and then throws
+away is not computed here: the ego's own history, and all but the last step of an agent's.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, linear
+
+DIM = 128
+NUM_AGENT_KINDS = 4
+HISTORY_CHANNELS = 9
+_WIDTHS, _HEADS, _WINDOWS = (32, 64, 128), (2, 4, 8), (3, 3, 5)
+_MLP_RATIO = 3  # of the history encoder
+_LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
+
+
+class Mlp(nn.Module):
+    """Two linear layers with an exact GELU between them."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., D) to (..., D)."""
+        out: Tensor = self.fc2(functional.gelu(self.fc1(x)))
+        return out
+
+
+class EncoderBlock(nn.Module):
+    """Pre-norm transformer block."""
+
+    def __init__(self, dim: int, num_heads: int, mlp_ratio: int = 4) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = Attention(dim, num_heads)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, mlp_ratio * dim)
+
+    def forward(self, x: Tensor, scenes: Scenes, asking: Tensor | None = None) -> Tensor:
+        """Tokens (T, D) of scenes after the block, or one for each of them.
+
+        Args:
+            x: The tokens.
+            scenes: How they lie.
+            asking: (B,) the token of each scene that is wanted; None for all.
+        """
+        normed = self.norm1(x)
+        if asking is None:
+            x = x + self.attn.among(normed, normed, scenes.counts, scenes)
+        else:
+            ones = [1] * len(asking)
+            x = x[asking] + self.attn.among(normed[asking], normed, ones, scenes)
+        out: Tensor = x + self.mlp(self.norm2(x))
+        return out
+
+
+class NeighborhoodAttention(nn.Module):
+    """Attention along a sequence to the `window` nearest positions; windows shift at the ends."""
+
+    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+        super().__init__()
+        self.num_heads, self.window = num_heads, window
+        self.rpb = nn.Parameter(torch.zeros(num_heads, 2 * window - 1))
+        self.qkv = Linear(dim, 3 * dim)
+        self.proj = Linear(dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(A, L, D) to (A, L, D)."""
+        count, length, _ = x.shape
+        qkv = self.qkv(x).reshape(count, length, 3, self.num_heads, -1).permute(2, 0, 3, 1, 4)
+        bias = self._bias(length)
+        mixed = functional.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2], attn_mask=bias)
+        out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
+        return out
+
+    def _bias(self, length: int) -> Tensor:
+        """(1, heads, L, L) logits added to a pair of positions, -inf outside of the window."""
+        positions = torch.arange(length, device=self.rpb.device)
+        first = (positions - self.window // 2).clamp(0, length - self.window)
+        ahead = positions[None, :] - first[:, None]
+        inside = (ahead >= 0) & (ahead < self.window)
+        offset = positions[None, :] - positions[:, None] + self.window - 1
+        bias = self.rpb[:, offset.clamp(0, 2 * self.window - 2)]
+        return bias.masked_fill(~inside, -torch.inf)[None]
+
+
+class _HistoryBlock(nn.Module):
+    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = NeighborhoodAttention(dim, num_heads, window)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, _MLP_RATIO * dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attn(self.norm1(x))
+        out: Tensor = x + self.mlp(self.norm2(x))
+        return out
+
+
+class _Downsample(nn.Module):
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.reduction = nn.Conv1d(dim, 2 * dim, 3, stride=2, padding=1, bias=False)
+        self.norm = nn.LayerNorm(2 * dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.norm(_convolved(self.reduction, functional.pad(x, (0, 0, 1, 1)), 2))
+        return out
+
+
+class _Level(nn.Module):
+    def __init__(self, index: int) -> None:
+        super().__init__()
+        dim, heads, window = _WIDTHS[index], _HEADS[index], _WINDOWS[index]
+        self.blocks = nn.ModuleList(_HistoryBlock(dim, heads, window) for _ in range(2))
+        self.downsample = _Downsample(dim) if index + 1 < len(_WIDTHS) else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        for block in self.blocks:
+            x = block(x)
+        return x
+
+
+class _Embed(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.proj = nn.Conv1d(HISTORY_CHANNELS, _WIDTHS[0], 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return _convolved(self.proj, functional.pad(x, (0, 0, 1, 1)))
+
+
+class HistoryEncoder(nn.Module):
+    """One vector per agent from 20 steps of its history: a feature pyramid, read at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.embed = _Embed()
+        self.levels = nn.ModuleList(_Level(index) for index in range(len(_WIDTHS)))
+        self.norm0, self.norm1, self.norm2 = (nn.LayerNorm(width) for width in _WIDTHS)
+        self.lateral_convs = nn.ModuleList(nn.Conv1d(width, DIM, 3, padding=1) for width in _WIDTHS)
+        self.fpn_conv = nn.Conv1d(DIM, DIM, 3, padding=1)
+
+    def forward(self, steps: Tensor) -> Tensor:
+        """(A, 20, 9) to (A, 128)."""
+        x = self.embed(steps)
+        norms = (self.norm0, self.norm1, self.norm2)
+        ends = []
+        for level, norm, lateral in zip(self.levels, norms, self.lateral_convs, strict=True):
+            assert isinstance(level, _Level)
+            x = level(x)
+            ends.append(_end(lateral, norm(x[:, -3:])))
+            if level.downsample is not None:
+                x = level.downsample(x)
+        merged = ends[2]
+        for end in (ends[1], ends[0]):
+            merged = end + _upsampled_end(merged)
+        return _end(self.fpn_conv, merged)[:, 0]
+
+
+def _convolved(conv: nn.Module, x: Tensor, stride: int = 1) -> Tensor:
+    """Convolution of width 3 without padding, (A, L, C) to (A, L', C'), as one product."""
+    assert isinstance(conv, nn.Conv1d)
+    windows = x.unfold(1, 3, stride).flatten(2)
+    return linear(windows, conv.weight.flatten(1), conv.bias)
+
+
+def _end(conv: nn.Module, end: Tensor) -> Tensor:
+    """The last k - 1 steps of a padded convolution, of the last k steps before it (A, k, C)."""
+    return _convolved(conv, functional.pad(end, (0, 0, 0, 1)))
+
+
+def _upsampled_end(end: Tensor) -> Tensor:
+    """The last two steps of a sequence upsampled linearly by 2, of its last two steps."""
+    before, last = end[:, 0], end[:, 1]
+    return torch.stack([0.25 * before + 0.75 * last, last], dim=1)
+
+
+class EgoStateEncoder(nn.Module):
+    """One vector from the scalars of the ego state: a learned query attends to a token for each."""
+
+    def __init__(self, num_scalars: int, dim: int = DIM, num_heads: int = 4) -> None:
+        super().__init__()
+        self.linears = nn.ModuleList(Linear(1, dim) for _ in range(num_scalars))
+        self.attn = Attention(dim, num_heads)
+        self.pos_embed = nn.Parameter(torch.zeros(1, num_scalars, dim))
+        self.query = nn.Parameter(torch.zeros(1, 1, dim))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """(B, scalars) to (B, D)."""
+        embedded = [layer(state[:, i, None]) for i, layer in enumerate(self.linears)]
+        tokens = torch.stack(embedded, dim=1) + self.pos_embed
+        query = self.query.expand(len(state), -1, -1)
+        out: Tensor = self.attn(query, tokens, tokens)[:, 0]
+        return out
+
+
+class AgentEncoder(nn.Module):
+    """Tokens of the ego and the agents, without their poses."""
+
+    def __init__(self, num_scalars: int) -> None:
+        super().__init__()
+        self.history_encoder = HistoryEncoder()
+        self.ego_state_emb = EgoStateEncoder(num_scalars)
+        self.type_emb = nn.Embedding(NUM_AGENT_KINDS, DIM)
+        self.num_scalars = num_scalars
+
+    def forward(
+        self, steps: Tensor, known: Tensor, category: Tensor, current_state: Tensor
+    ) -> Tensor:
+        """Encode rows of agents; row 0 is the ego.
+
+        Args:
+            steps: (B, A, 20, 9) of `history_steps`.
+            known: (B, A) whether any sample of the row is valid.
+            category: (B, A) indices of kinds.
+            current_state: (B, >= scalars) ego state.
+
+        Returns:
+            (B, A, 128)
+        """
+        ego = self.ego_state_emb(current_state[:, : self.num_scalars])
+        tokens = steps.new_zeros(*known.shape, DIM)
+        others = known.clone()
+        others[:, 0] = False  # the ego's history is not used
+        if others.any():
+            tokens[others] = self.history_encoder(steps[others])
+        tokens[:, 0] = ego
+        out: Tensor = tokens + self.type_emb(category)
+        return out
+
+
+def history_steps(
+    position: Tensor, heading: Tensor, velocity: Tensor, shape: Tensor, valid: Tensor
+) -> Tensor:
+    """(B, A, H - 1, 9) what changed in each step, from H samples per agent.
+
+    Changes count only between valid samples; the shape does not ask (planner-plantf.md §3.2).
+
+    Args:
+        position: (B, A, H, 2)
+        heading: (B, A, H)
+        velocity: (B, A, H, 2)
+        shape: (B, A, H, 2)
+        valid: (B, A, H)
+    """
+    both = valid[..., 1:] & valid[..., :-1]
+    moved = position.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    faster = velocity.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    turned = heading.diff(dim=2).masked_fill(~both, 0.0)
+    parts = [moved, faster, torch.stack([turned.cos(), turned.sin()], -1), shape[:, :, 1:]]
+    return torch.cat([*parts, both[..., None].to(position.dtype)], dim=-1)
+
+
+class PointsEncoder(nn.Module):
+    """One vector per polyline from its valid points; rows of invalid points count as zeros."""
+
+    def __init__(self, channels: int, out: int = DIM) -> None:
+        super().__init__()
+        self.first_mlp = _points_mlp(channels, 128, 256)
+        self.second_mlp = _points_mlp(512, 256, out)
+
+    def forward(self, points: Tensor, keep: Tensor) -> Tensor:
+        """(B, M, K, channels) with `keep` (B, M, K) to (B, M, out)."""
+        lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
+        size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
+        first, second = _folded(self.first_mlp), _folded(self.second_mlp)
+        parts = zip(torch.split(lines, size), torch.split(valid, size), strict=True)
+        encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
+        return encoded.reshape(*keep.shape[:2], encoded.shape[1])
+
+
+class _FoldedMlp(NamedTuple):
+    """Weight and bias of the first layer with the normalisation in them, and the last layer."""
+
+    weight: Tensor
+    bias: Tensor
+    last: nn.Module
+
+
+def _folded(mlp: nn.Sequential) -> _FoldedMlp:
+    layer, norm, _, last = mlp
+    assert isinstance(layer, Linear)
+    assert isinstance(norm, nn.BatchNorm1d)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    bias = (layer.bias - norm.running_mean) * scale + norm.bias
+    return _FoldedMlp(layer.weight * scale[:, None], bias, last)
+
+
+def _encode_lines(points: Tensor, keep: Tensor, first: _FoldedMlp, second: _FoldedMlp) -> Tensor:
+    """(M, out) from (M, K, channels) with `keep` (M, K)."""
+    (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
+    rows = points.flatten(0, 1)[row]
+    hidden = first.last(linear(rows, first.weight, first.bias).relu_())
+    pooled = _pooled(hidden, row, keep)
+    # Linear([point, pooled]) in two parts: that of the line is the same for all its points
+    half = hidden.shape[1]
+    mixed = linear(hidden, second.weight[:, :half])
+    mixed += linear(pooled, second.weight[:, half:], second.bias)[row // keep.shape[1]]
+    return _pooled(second.last(mixed.relu_()), row, keep)
+
+
+def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        Linear(inputs, hidden), nn.BatchNorm1d(hidden), nn.ReLU(), Linear(hidden, outputs)
+    )
+
+
+def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
+    """(M, C) maximum over the points of each line; points without a value count as zero."""
+    dense = values.new_zeros(keep.numel(), values.shape[1])
+    dense.index_copy_(0, row, values)
+    return dense.reshape(*keep.shape, values.shape[1]).amax(dim=1)
+
+
+class MapEncoder(nn.Module):
+    """Tokens of the polygons, without their poses."""
+
+    def __init__(self, channels: int, speed_limit_emb: nn.Module) -> None:
+        super().__init__()
+        self.polygon_encoder = PointsEncoder(channels)
+        self.speed_limit_emb = speed_limit_emb
+        self.type_emb = nn.Embedding(3, DIM)
+        self.on_route_emb = nn.Embedding(2, DIM)
+        self.traffic_light_emb = nn.Embedding(4, DIM)
+        self.unknown_speed_emb = nn.Embedding(1, DIM)
+
+    def forward(self, points: Tensor, seen: Any) -> Tensor:
+        """(B, M, 128).
+
+        Args:
+            points: (B, M, K, channels) what is known of each point.
+            seen: Inputs of the network.
+        """
+        tokens = self.polygon_encoder(points, seen.point_valid)
+        known = self.speed_limit_emb(seen.limit[..., None])
+        speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
+        out: Tensor = (
+            tokens
+            + self.type_emb(seen.kind)
+            + self.on_route_emb(seen.on_route)
+            + self.traffic_light_emb(seen.light)
+            + speed
+        )
+        return out
+
+
+def along_line(middle: Tensor, seen: Any) -> list[Tensor]:
+    """Of each point of the centre lines (B, M, K, 2): place, vector and direction, each (…, 2)."""
+    angle = seen.orientations
+    directions = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    return [middle - seen.centers[:, :, None, :2], seen.vectors, directions]

@@ -1,0 +1,292 @@
+"""The network of PLUTO (planner-pluto.md §3), with the names and shapes of its checkpoint."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
+from shiftsim.planners.learned.network.blocks import (
+    DIM,
+    AgentEncoder,
+    EncoderBlock,
+    MapEncoder,
+    along_line,
+    history_steps,
+)
+from shiftsim.planners.learned.network.rows import Linear, Scenes, without_padding
+from shiftsim.planners.learned.pluto.network_decoder import (
+    FourierEmbedding,
+    MlpLayer,
+    PlanningDecoder,
+)
+
+PREFIXES = ("model.",)  # of the names in the published checkpoint
+STATE_CHANNELS, POLYGON_CHANNELS = 6, 10
+RELEASED = {
+    "dim": DIM,
+    "state_channel": STATE_CHANNELS,
+    "polygon_channel": 6,  # and the boundaries
+    "history_channel": 9,
+    "history_steps": 21,
+    "future_steps": 80,
+    "encoder_depth": 4,
+    "decoder_depth": 4,
+    "drop_path": 0.2,  # training only
+    "dropout": 0.1,  # training only
+    "num_heads": 4,
+    "num_modes": 12,
+    "state_dropout": 0.75,  # training only
+    "use_ego_history": False,
+    "state_attn_encoder": True,
+    "use_hidden_proj": True,
+    "cat_x": True,
+    "ref_free_traj": True,
+}
+DRIVE_HEADS = {
+    "planning_decoder.loc_head.mlp.3": DriveHead(
+        gain=(80, 12), exponent=(1, 2), const=(0, 0), slope=(104, 7.8)
+    ),
+    "planning_decoder.yaw_head.mlp.3": DriveHead(
+        gain=(0.05, 0.6), exponent=(1, 1), const=(1, 0), slope=(0, 0.36)
+    ),
+    "ref_free_decoder.mlp.3": DriveHead(
+        gain=(20, 4, 0.05, 0.1), exponent=(1, 2, 1, 1), const=(0, 0, 1, 0), slope=(40, 0, 0, 0)
+    ),
+    "agent_predictor.loc_predictor.mlp.3": DriveHead(
+        gain=(10, 2), exponent=(1, 1), const=(0, 0), slope=(8, 0)
+    ),
+    "agent_predictor.yaw_predictor.mlp.3": DriveHead(
+        gain=(0.05, 0.05), exponent=(1, 1), const=(1, 0), slope=(0, 0)
+    ),
+    "agent_predictor.vel_predictor.mlp.3": DriveHead(
+        gain=(0.5, 0.2), exponent=(1, 1), const=(1, 0), slope=(0, 0)
+    ),
+}
+DRIVE_SCALES = {
+    "planning_decoder.m_emb": 120.0,
+    "planning_decoder.pi_head.mlp.3.weight": 6.0,
+    "planning_decoder.pi_head.mlp.3.bias": 6.0,
+}
+
+
+class Inputs(NamedTuple):
+    """One batch: B scenes, A rows of agents of which the first is the ego, M polygons, K points.
+
+    Attributes:
+        position: (B, A, 21, 2) in the ego frame [m].
+        heading: (B, A, 21) [rad].
+        velocity: (B, A, 21, 2) [m/s].
+        shape: (B, A, 21, 2) width, length [m].
+        valid: (B, A, 21)
+        category: (B, A) indices of kinds.
+        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
+        points: (B, M, 3, K, 2) centre line, left and right boundary [m].
+        vectors: (B, M, K, 2) along the centre line, to the next point [m].
+        orientations: (B, M, K) of these vectors [rad].
+        centers: (B, M, 3) pose that stands for the polygon.
+        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
+        on_route: (B, M) 1 where the polygon is on the route.
+        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
+        has_limit: (B, M)
+        limit: (B, M) speed limit [m/s].
+        point_valid: (B, M, K)
+        object_pose: (B, S, 3) static objects x [m], y [m], heading [rad].
+        object_shape: (B, S, 2) width, length [m].
+        object_category: (B, S)
+        object_valid: (B, S)
+        line_points: (B, R, 120, 2) reference lines [m].
+        line_vectors: (B, R, 120, 2) to the next point [m].
+        line_orientations: (B, R, 120) [rad].
+        line_valid: (B, R, 120)
+        counts: How many agents, polygons, static objects and lines each scene has, the rest is
+            padding; None where nothing is.
+    """
+
+    position: Tensor
+    heading: Tensor
+    velocity: Tensor
+    shape: Tensor
+    valid: Tensor
+    category: Tensor
+    current_state: Tensor
+    points: Tensor
+    vectors: Tensor
+    orientations: Tensor
+    centers: Tensor
+    kind: Tensor
+    on_route: Tensor
+    light: Tensor
+    has_limit: Tensor
+    limit: Tensor
+    point_valid: Tensor
+    object_pose: Tensor
+    object_shape: Tensor
+    object_category: Tensor
+    object_valid: Tensor
+    line_points: Tensor
+    line_vectors: Tensor
+    line_orientations: Tensor
+    line_valid: Tensor
+    counts: Sequence[Sequence[int]] | None = None
+
+
+class Outputs(NamedTuple):
+    """What the network says.
+
+    Attributes:
+        trajectory: (B, R, 12, 80, 6) x, y [m], cosine and sine of the heading, velocity [m/s].
+        probability: (B, R, 12) logits, -1e6 where the reference line has no points.
+        prediction: (B, A - 1, 80, 6) of the agents, relative to their present poses.
+        ref_free_trajectory: (B, 80, 4) x, y [m], cosine and sine of the heading.
+        ego: (B, 128) its token.
+    """
+
+    trajectory: Tensor
+    probability: Tensor
+    prediction: Tensor
+    ref_free_trajectory: Tensor
+    ego: Tensor
+
+
+class StaticObjectsEncoder(nn.Module):
+    """Tokens of the static objects, without their poses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.obj_encoder = FourierEmbedding(2)
+        self.type_emb = nn.Embedding(4, DIM)
+
+    def forward(self, shape: Tensor, category: Tensor, valid: Tensor) -> Tensor:
+        """(B, S, 128) from sizes (B, S, 2); zero where not valid (B, S)."""
+        tokens: Tensor = self.obj_encoder(shape) + self.type_emb(category)
+        return tokens * valid[..., None]
+
+
+class AgentPredictor(nn.Module):
+    """Motion of the agents from their tokens."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        self.loc_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.yaw_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.vel_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, A, 128) to (B, A, steps, 6)."""
+        heads = (self.loc_predictor, self.yaw_predictor, self.vel_predictor)
+        shape = (*tokens.shape[:2], self.steps, 2)
+        return torch.cat([head(tokens).reshape(shape) for head in heads], dim=-1)
+
+
+class PlutoNetwork(nn.Module):
+    """The whole network."""
+
+    def __init__(
+        self,
+        encoder_depth: int,
+        decoder_depth: int,
+        num_heads: int,
+        num_modes: int,
+        steps: int,
+        *,
+        misordered_masks: bool = False,
+    ) -> None:
+        super().__init__()
+        self.pos_emb = FourierEmbedding(3)
+        self.agent_encoder = AgentEncoder(STATE_CHANNELS)
+        self.map_encoder = MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
+        self.static_objects_encoder = StaticObjectsEncoder()
+        self.encoder_blocks = nn.ModuleList(
+            EncoderBlock(DIM, num_heads) for _ in range(encoder_depth)
+        )
+        self.norm = nn.LayerNorm(DIM)
+        self.agent_predictor = AgentPredictor(steps)
+        self.planning_decoder = PlanningDecoder(
+            decoder_depth, num_heads, num_modes, steps, misordered_masks=misordered_masks
+        )
+        # of the training only; the checkpoint holds it
+        self.hidden_proj = nn.Sequential(Linear(DIM, DIM), nn.ReLU(), Linear(DIM, DIM))
+        self.ref_free_decoder = MlpLayer(DIM, 2 * DIM, 4 * steps)
+
+    def forward(self, seen: Inputs) -> Outputs:
+        """Plan for a batch."""
+        *counts, num_lines = seen.counts or _all_counts(seen)
+        x, scenes, there = self._encode(seen, counts)
+        egos = x[scenes.firsts(x.device)]
+        tokens = x.new_zeros(*there.shape, DIM)
+        tokens[there] = x
+        prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
+        free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
+        trajectory, probability = self.planning_decoder(
+            seen.line_points,
+            seen.line_vectors,
+            seen.line_orientations,
+            seen.line_valid,
+            num_lines,
+            x,
+            scenes,
+            egos,
+        )
+        return Outputs(trajectory, probability, prediction, free, egos)
+
+    def _encode(
+        self, seen: Inputs, counts: Sequence[Sequence[int]]
+    ) -> tuple[Tensor, Scenes, Tensor]:
+        """Tokens (T, 128) of ego, agents, polygons and static objects, scene by scene.
+
+        Also how they lie, and which of all rows (B, A + M + S) they are: those without padding.
+        """
+        known = seen.valid.any(dim=-1)
+        parts = (known, seen.point_valid.any(dim=-1), seen.object_valid)
+        there, scenes = without_padding(parts, counts)
+        steps = history_steps(seen.position, seen.heading, seen.velocity, seen.shape, seen.valid)
+        middle = seen.points[:, :, 0]
+        sides = [seen.points[:, :, side] - middle for side in (1, 2)]
+        points = torch.cat([*along_line(middle, seen), *sides], dim=-1)
+        tokens = (
+            self.agent_encoder(steps, known, seen.category, seen.current_state),
+            self.map_encoder(points, seen),
+            self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
+        )
+        now = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
+        poses = torch.cat([now, seen.centers, seen.object_pose], dim=1)[there]
+        angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
+        where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
+        x = torch.cat(tokens, dim=1)[there] + where
+        for block in self.encoder_blocks:
+            x = block(x, scenes)
+        return self.norm(x), scenes, there
+
+
+def _all_counts(seen: Inputs) -> list[list[int]]:
+    parts = (seen.category, seen.kind, seen.object_category, seen.line_valid)
+    return [[part.shape[1]] * len(part) for part in parts]
+
+
+def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
+    """The network, by default with the released hyper-parameters.
+
+    Args:
+        args: Hyper-parameters that differ from `RELEASED`; widths and channels cannot. For tests
+            also `misordered_masks`, as the official code has them.
+    """
+    chosen = {**RELEASED, **(args or {})}
+    return PlutoNetwork(
+        int(chosen["encoder_depth"]),
+        int(chosen["decoder_depth"]),
+        int(chosen["num_heads"]),
+        int(chosen["num_modes"]),
+        int(chosen["future_steps"]),
+        misordered_masks=bool(chosen.get("misordered_masks", False)),
+    )
+
+
+def drive_overrides(state: State) -> None:
+    """Turn `base` weights into `drive` ones, in place."""
+    for layer, head in DRIVE_HEADS.items():
+        override_head(state, layer, head)
+    for name, factor in DRIVE_SCALES.items():
+        state[name] = (factor * state[name].astype("float64")).astype(state[name].dtype)

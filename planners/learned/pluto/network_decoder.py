@@ -1,0 +1,229 @@
+"""The decoder of PLUTO's network: trajectories along reference lines (planner-pluto.md §3.3)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder
+from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, present
+
+NUM_FREQUENCIES = 64
+LINE_CHANNELS = 6
+NEVER = -1e6  # logit of a reference line without points
+
+
+class MlpLayer(nn.Module):
+    """Linear, LayerNorm, ReLU, Linear."""
+
+    def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            Linear(inputs, hidden), nn.LayerNorm(hidden), nn.ReLU(), Linear(hidden, outputs)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., outputs)."""
+        out: Tensor = self.mlp(x)
+        return out
+
+
+class FourierEmbedding(nn.Module):
+    """A vector from a few scalars, each by its own frequencies and layers; the sum counts."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.freqs = nn.Embedding(inputs, NUM_FREQUENCIES)
+        self.mlps = nn.ModuleList(
+            nn.Sequential(
+                Linear(2 * NUM_FREQUENCIES + 1, DIM),
+                nn.LayerNorm(DIM),
+                nn.ReLU(),
+                Linear(DIM, DIM),
+            )
+            for _ in range(inputs)
+        )
+        self.to_out = nn.Sequential(nn.LayerNorm(DIM), nn.ReLU(), Linear(DIM, DIM))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., 128)."""
+        turns = x[..., None] * self.freqs.weight * (2.0 * torch.pi)
+        waves = torch.cat([turns.cos(), turns.sin(), x[..., None]], dim=-1)
+        total = self.mlps[0](waves[..., 0, :])
+        for index in range(1, len(self.mlps)):
+            total = total + self.mlps[index](waves[..., index, :])
+        out: Tensor = self.to_out(total)
+        return out
+
+
+class DecoderBlock(nn.Module):
+    """Attention among lines, among modes, and to the scene; then a feed-forward part."""
+
+    def __init__(self, num_heads: int) -> None:
+        super().__init__()
+        self.r2r_attn = Attention(DIM, num_heads)
+        self.m2m_attn = Attention(DIM, num_heads)
+        self.cross_attn = Attention(DIM, num_heads)
+        self.ffn = nn.Sequential(
+            Linear(DIM, 4 * DIM), nn.ReLU(), nn.Identity(), Linear(4 * DIM, DIM)
+        )
+        self.norm1, self.norm2, self.norm3, self.norm4 = (nn.LayerNorm(DIM) for _ in range(4))
+
+    def forward(
+        self,
+        x: Tensor,
+        lines: "Lines",
+        mode_position: Tensor,
+        tokens: Tensor,
+        scenes: Scenes,
+    ) -> Tensor:
+        """Refine queries.
+
+        Args:
+            x: (L, modes, 128) queries.
+            lines: How the reference lines lie.
+            mode_position: (1, modes, 128).
+            tokens: (T, 128) of the scenes.
+            scenes: How they lie.
+
+        Returns:
+            (L, modes, 128)
+        """
+        x = x + self._among_lines(self.norm1(x), lines)
+        normed = self.norm2(x)
+        placed = normed + mode_position
+        x = x + self.m2m_attn(placed, placed, normed)
+        x = x * lines.valid[:, None, None]
+
+        modes = x.shape[1]
+        asking = [count * modes for count in lines.counts]
+        flat = x.flatten(0, 1)
+        flat = flat + self.cross_attn.among(self.norm3(flat), tokens, asking, scenes)
+        flat = flat + self.ffn(self.norm4(flat))
+        return flat.view(x.shape)
+
+    def _among_lines(self, x: Tensor, lines: "Lines") -> Tensor:
+        """(L, modes, 128): every mode of a line attends to the same mode of the scene's others."""
+        parts = [torch.split(part, lines.counts) for part in self.r2r_attn.projected(x, x, x)]
+        mixed = []
+        for q, k, v, mask in zip(*parts, lines.masks, strict=True):
+            by_mode = self.r2r_attn.mixed(
+                q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1), mask
+            )
+            mixed.append(by_mode.transpose(0, 1))
+        out: Tensor = self.r2r_attn.out_proj(torch.cat(mixed))
+        return out
+
+
+class Lines(NamedTuple):
+    """How the reference lines of B scenes lie one after another.
+
+    Attributes:
+        counts: How many each scene has.
+        valid: (L,) those that have points.
+        masks: By scene (1 or modes, 1, 1, count) logits added to the lines attended to.
+    """
+
+    counts: list[int]
+    valid: Tensor
+    masks: list[Tensor]
+
+
+def make_lines(
+    valid: Tensor, counts: Sequence[int], modes: int, *, misordered_masks: bool
+) -> Lines:
+    """From lines (B, R) that have points, of which `counts` are no padding."""
+    # a scene without any line that has points attends to all of them, and nothing reads it
+    attended = valid | ~valid.any(dim=1, keepdim=True)
+    logits = torch.zeros(valid.shape, device=valid.device).masked_fill(~attended, -torch.inf)
+    if misordered_masks:  # by mode, where the queries are ordered by scene (planner-pluto.md §3.3)
+        logits = logits.repeat(modes, 1).reshape(len(valid), modes, -1)
+    else:
+        logits = logits[:, None]
+    masks = [row[:, None, None, :count] for row, count in zip(logits, counts, strict=True)]
+    there = present(counts, valid.shape[1], valid.device)
+    return Lines(list(counts), valid[there], masks)
+
+
+class PlanningDecoder(nn.Module):
+    """Twelve trajectories and their logits for every reference line."""
+
+    def __init__(
+        self, depth: int, num_heads: int, num_modes: int, steps: int, *, misordered_masks: bool
+    ) -> None:
+        super().__init__()
+        self.steps, self.misordered_masks = steps, misordered_masks
+        self.r_encoder = PointsEncoder(LINE_CHANNELS)
+        self.r_pos_emb = FourierEmbedding(3)
+        self.q_proj = Linear(2 * DIM, DIM)
+        self.m_emb = nn.Parameter(torch.zeros(1, 1, num_modes, DIM))
+        self.m_pos = nn.Parameter(torch.zeros(1, num_modes, DIM))
+        self.decoder_blocks = nn.ModuleList(DecoderBlock(num_heads) for _ in range(depth))
+        self.cat_x_proj = Linear(2 * DIM, DIM)
+        self.loc_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.yaw_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.vel_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.pi_head = MlpLayer(DIM, DIM, 1)
+
+    def forward(
+        self,
+        points: Tensor,
+        vectors: Tensor,
+        orientations: Tensor,
+        valid: Tensor,
+        counts: Sequence[int],
+        tokens: Tensor,
+        scenes: Scenes,
+        egos: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Decode.
+
+        Args:
+            points: (B, R, 120, 2) of the lines [m].
+            vectors: (B, R, 120, 2) to the next point [m].
+            orientations: (B, R, 120) [rad].
+            valid: (B, R, 120) points that exist.
+            counts: How many lines of each scene are no padding.
+            tokens: (T, 128) of the scenes.
+            scenes: How they lie.
+            egos: (B, 128) the tokens of the egos.
+
+        Returns:
+            Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
+        """
+        modes = self.m_emb.shape[2]
+        shape = (*valid.shape[:2], modes)
+        trajectory = tokens.new_zeros(*shape, self.steps, 6)
+        logits = tokens.new_full(shape, NEVER)
+        if not any(counts):
+            return trajectory, logits
+        lines = make_lines(valid.any(dim=-1), counts, modes, misordered_masks=self.misordered_masks)
+        there = present(counts, valid.shape[1], valid.device)
+        embedded = self._embed_lines(points, vectors, orientations, valid)[there]
+        wide = (len(embedded), modes, DIM)
+        x = self.q_proj(
+            torch.cat([embedded[:, None].expand(wide), self.m_emb[0].expand(wide)], dim=-1)
+        )
+        for block in self.decoder_blocks:
+            x = block(x, lines, self.m_pos, tokens, scenes)
+        own = egos.repeat_interleave(torch.tensor(counts, device=egos.device), dim=0)
+        x = self.cat_x_proj(torch.cat([x, own[:, None].expand(wide)], dim=-1))
+        heads = (self.loc_head, self.yaw_head, self.vel_head)
+        steps = (len(x), modes, self.steps, 2)
+        trajectory[there] = torch.cat([head(x).reshape(steps) for head in heads], dim=-1)
+        logits[there] = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
+        return trajectory, logits
+
+    def _embed_lines(
+        self, points: Tensor, vectors: Tensor, orientations: Tensor, valid: Tensor
+    ) -> Tensor:
+        """(B, R, 128)."""
+        parts = (
+            points - points[:, :, :1],
+            vectors,
+            torch.stack([orientations.cos(), orientations.sin()], dim=-1),
+        )
+        start = torch.cat([points[:, :, 0], orientations[:, :, :1]], dim=-1)
+        out: Tensor = self.r_encoder(torch.cat(parts, dim=-1), valid) + self.r_pos_emb(start)
+        return out

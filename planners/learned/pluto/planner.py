@@ -1,0 +1,258 @@
+"""PLUTO: a network proposes trajectories along reference lines, rules choose among them.
+
+Here one step is put together; what belongs to one stage of it is in the `pluto_*` modules. Where
+the official planner would fail (planner-pluto.md §8), this one goes on and says so: without a
+reference line it drives the trajectory that needs none; with a history shorter than 2 s the missing
+samples are masked.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.planners.learned.base import LearnedPlanner
+from shiftsim.planners.learned.checkpoint import load_weights
+from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.features import SAMPLES, AgentFeatures, PerMap, agent_features
+from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
+from shiftsim.planners.learned.plan_states import plan_of_poses
+from shiftsim.planners.learned.pluto.brake import brake, must_brake
+from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
+from shiftsim.planners.learned.pluto.proposals import (
+    Output,
+    candidates,
+    headings_of,
+    predicted_agents,
+    to_map,
+)
+from shiftsim.planners.learned.pluto.reference import (
+    Drivable,
+    RouteLanes,
+    drivable_near,
+    line_features,
+    map_areas,
+    reference_lines,
+    route_lanes,
+)
+from shiftsim.planners.learned.pluto.scoring import Place, Scores, nearest_line, score
+from shiftsim.planners.learned.pluto.world import (
+    StaticObjects,
+    World,
+    make_world,
+    red_lights,
+    static_objects,
+)
+from shiftsim.planners.pdm.parameters import STEP_US
+from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.sim.planner import History, Observation, SceneInfo
+from shiftsim.world.state import VX, VY, Trajectory
+
+RADIUS = 120.0  # m, of agents and map
+MAX_AGENTS = 48
+START_HALF_SIDE = 2.5  # m, of the square in which the route's start is looked for
+NO_LINE = (
+    "no lane of the route is near the ego and fits its heading, the reference-free plan is driven"
+)
+
+_areas_of = PerMap(map_areas)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What one step saw.
+
+    Attributes:
+        drivable: Drivable areas.
+        static: Static objects on them.
+        lines: Reference lines (K, 3).
+        agents: The agents, nearest first.
+        road: Lanes, connectors and crosswalks.
+    """
+
+    drivable: Drivable
+    static: StaticObjects
+    lines: list[FloatArray]
+    agents: AgentFeatures
+    road: RoadFeatures
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """How one step chose.
+
+    Attributes:
+        poses: (P, 81, 3) candidates.
+        learned: (P,) their scores by the network.
+        agents: Poses (A, 81, 3) and speeds (A, 81) of the agents, now and predicted.
+        scores: Of the candidates.
+        best: Number of the best one.
+        braked: Whether the emergency brake replaces it.
+    """
+
+    poses: FloatArray
+    learned: FloatArray
+    agents: tuple[FloatArray, FloatArray]
+    scores: Scores
+    best: int
+    braked: bool
+
+
+class Pluto(LearnedPlanner[SceneInputs, Output]):
+    """PLUTO with its rule-based choice.
+
+    Attributes:
+        route: Lanes of the corrected route, made at the first step.
+        sight: What the last step saw.
+        choice: How it chose; None where it had no reference line.
+    """
+
+    name = "pluto"
+
+    def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
+        """Load the network.
+
+        Args:
+            checkpoint: A file, a name, or `deterministic:base` or `deterministic:drive`.
+            device: Where the network runs, as in `resolve_device`.
+
+        Raises:
+            CheckpointError: There is no such file, or it is of another network.
+            MissingExtraError: PyTorch is not installed.
+        """
+        weights = load_weights(checkpoint, self.name, device=device)
+        from shiftsim.planners.learned.pluto.network import build_network
+
+        self._device = resolve_device(device)
+        self._network = build_network(weights.args)
+        self._network.load_state_dict(weights.state)
+        self._network.to(self._device).eval()
+        self._scene: SceneInfo | None = None
+        self.route: RouteLanes | None = None
+        self.sight: Sight | None = None
+        self.choice: Choice | None = None
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Look up the route; it is corrected at the first step."""
+        index = scene.map.blocks.index
+        self._blocks = [index[name] for name in dict.fromkeys(scene.route) if name in index]
+        self._scene, self._lights = scene, LightLookup(scene.map)
+        self.route = self.sight = self.choice = None
+        self.degraded = ""
+
+    def features(self, observation: Observation) -> SceneInputs:
+        """Arrays of the network; what they were made from is kept in `sight`."""
+        scene = self._scene
+        if scene is None:
+            raise PlannerError(f"{self.name}: plan() was called before reset()")
+        road, history = scene.map, observation.history
+        ego, center = history.ego[-1], observation.ego.center
+        if self.route is None:
+            self.route = route_lanes(road, _areas_of(road), self._corrected(ego[:3]))
+        route = self.route
+        drivable = drivable_near(road, route, center[0], center[1])
+        static = static_objects(history.tracks, drivable, center[0], center[1])
+        lines = reference_lines(road, route, ego[:3], center)
+        agents = agent_features(history, center, MAX_AGENTS)
+        lights = self._lights.at(observation.lights)
+        near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
+        self.sight = Sight(drivable, static, lines, agents, near)
+        return scene_inputs(ego, agents, near, static, line_features(lines, ego[:3]))
+
+    def _corrected(self, rear: FloatArray) -> tuple[int, ...]:
+        """Blocks of the corrected route; none where none of the route is on the map."""
+        assert self._scene is not None
+        if not self._blocks:
+            return ()
+        return RouteCorrector(self._scene.map, self._blocks, START_HALF_SIDE).at(rear)
+
+    def _why_makeshift(self, history: History) -> str:
+        """Why the official planner would fail here; empty where it would not."""
+        if not self._blocks:
+            return "the scenario has no route on the map"
+        assert self.sight is not None
+        if not self.sight.lines:
+            return NO_LINE  # planner-pluto.md §8
+        if len(history.ego) < SAMPLES:
+            return f"the history has {len(history.ego)} samples, not {SAMPLES}"
+        return ""
+
+    def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
+        """One forward pass."""
+        import torch
+
+        from shiftsim.planners.learned.pluto.network import Inputs
+
+        with torch.inference_mode():
+            outputs = self._network(Inputs(*stack(features, self._device)))
+        arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
+        return [
+            Output(
+                trajectory[: len(scene.line_valid)],
+                logits[: len(scene.line_valid)],
+                prediction[: len(scene.category) - 1],
+                free,
+            )
+            for scene, trajectory, logits, prediction, free in zip(features, *arrays, strict=True)
+        ]
+
+    def decode(self, output: Output, observation: Observation) -> Trajectory:
+        """The best candidate, an emergency brake, or the reference-free trajectory."""
+        assert self.sight is not None
+        assert self._scene is not None
+        rear = observation.history.ego[-1, :3]
+        self.degraded, self.choice = self._why_makeshift(observation.history), None
+        if not self.sight.lines:
+            free = headings_of(output.ref_free_trajectory)
+            return _plan(to_map(free, rear), observation)
+        self.choice = choice = self._choose(output, observation)
+        if not choice.braked:
+            return _plan(choice.poses[choice.best, 1:], observation)
+        ego, fault_time = observation.history.ego[-1], choice.scores.fault_times[choice.best]
+        states = brake(choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle)
+        return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
+
+    def _choose(self, output: Output, observation: Observation) -> Choice:
+        scene, sight = self._scene, self.sight
+        assert scene is not None
+        assert sight is not None
+        ego, tracks = observation.history.ego[-1], observation.history.tracks
+        poses, learned = candidates(output, ego[:3])
+        seen, rows = sight.agents, sight.agents.tracks
+        local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
+        present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
+        agents = predicted_agents(output, local, *present, ego[:3])
+        world = self.world_of(observation, agents)
+        place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
+        scores = score(poses, learned, ego, world, place, scene.vehicle)
+        best = int(np.argmax(scores.total))  # the first one on ties
+        speed = float(np.hypot(ego[VX], ego[VY]))
+        braked = must_brake(speed, float(scores.fault_times[best]))
+        return Choice(poses, learned, agents, scores, best, braked)
+
+    def world_of(self, observation: Observation, agents: tuple[FloatArray, FloatArray]) -> World:
+        """What the candidates of the last step can collide with.
+
+        Args:
+            observation: Of the last step.
+            agents: Poses (A, 81, 3) and speeds (A, 81) of the agents.
+        """
+        scene, sight, route = self._scene, self.sight, self.route
+        assert scene is not None
+        assert sight is not None
+        assert route is not None
+        size = np.array([scene.vehicle.length, scene.vehicle.width])
+        footprint = boxes_to_corners(observation.ego.center, size)
+        sizes = observation.history.tracks.sizes[-1, sight.agents.tracks]
+        lights = red_lights(scene.map, route, observation)
+        return make_world(sight.static, (*agents, sizes), lights, footprint)
+
+
+def _plan(poses: FloatArray, observation: Observation) -> Trajectory:
+    """Poses from 0.1 s on as a plan; nuPlan: it starts at the first pose, not at the ego."""
+    plan = plan_of_poses(poses, observation.history)
+    plan.states[0] = plan.states[1]
+    return plan

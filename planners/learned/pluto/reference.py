@@ -1,0 +1,334 @@
+"""What PLUTO takes from the map around the ego: drivable areas and reference lines.
+
+The drivable areas are those of PDM-Closed with a larger square (planner-pluto.md §2.4). A reference
+line is one way along the lanes of the route, cut to the next 120 m (§2.5).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.planners.proposals.areas import Areas, admit, make_areas
+from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
+from shiftsim.world.map import NONE, VectorMap
+
+AREA_HALF_SIDE = 60.0  # m, of the square of the drivable areas
+FALLBACK_LIMIT = 50.0  # m/s, of lanes without a speed limit
+START_HALF_SIDE = 3.0  # m, of the square a reference line starts in
+LINE_LENGTH = 120.0  # m
+LONG_ENOUGH = 0.8 * LINE_LENGTH  # m, shorter lines give way to longer ones
+MIN_BASELINE = 2.0  # m
+MAX_HEADING_ERROR = np.pi / 2.0  # rad
+MAX_LANES = 15  # of one line
+STRIDE = 4  # vertices between two points that are looked at
+NUM_POINTS = 120  # of a line in the features
+SAME_LINE = 0.5  # m, |dx| + |dy| of two lines that count as one
+REPEATED = 1e-8  # m, to the next vertex
+
+
+class Drivable(NamedTuple):
+    """Drivable areas of one step.
+
+    Attributes:
+        areas: All areas of the map, those of the route marked.
+        admitted: Areas near the ego.
+        limits: (M,) speed limit of each area of the map, of this step [m/s].
+    """
+
+    areas: Areas
+    admitted: IntArray
+    limits: FloatArray
+
+
+class MapAreas(NamedTuple):
+    """What is made once per map.
+
+    Attributes:
+        areas: All areas of the map, none of them on a route.
+        limits: (M,) speed limits, 50 where the map has none [m/s].
+    """
+
+    areas: Areas
+    limits: FloatArray
+
+
+class RouteLanes(NamedTuple):
+    """What is made once per scenario.
+
+    Attributes:
+        blocks: Blocks of the corrected route, each once.
+        starts: Connectors, then lanes of these blocks, in the order of the map.
+        has_block: (B,) whether a block is one of these.
+        is_on: (E,) whether an edge belongs to one of these blocks.
+        areas: Areas of the map, those of the route marked.
+        limits: (M,) speed limits [m/s].
+    """
+
+    blocks: list[int]
+    starts: IntArray
+    has_block: BoolArray
+    is_on: BoolArray
+    areas: Areas
+    limits: FloatArray
+
+
+def map_areas(road: VectorMap) -> MapAreas:
+    """Areas of all lanes, connectors and car parks of a map."""
+    limits = np.full(len(road.edges) + len(road.car_parks), FALLBACK_LIMIT)
+    known = np.nan_to_num(road.speed_limits, nan=0.0)
+    limits[: len(known)] = np.where(known == 0.0, FALLBACK_LIMIT, known)
+    return MapAreas(make_areas(road, []), limits)
+
+
+def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> RouteLanes:
+    """Lanes of a corrected route."""
+    unique = list(dict.fromkeys(blocks))
+    has_block = np.zeros(len(road.blocks), np.bool_)
+    has_block[unique] = True
+    is_on = (road.block_of != NONE) & has_block[road.block_of]
+    edges = np.flatnonzero(is_on)
+    starts = np.concatenate([edges[edges >= road.num_lanes], edges[edges < road.num_lanes]])
+    on_route = np.isin(made.areas.edge, edges)
+    areas = made.areas._replace(on_route=on_route)
+    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits)
+
+
+def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
+    """Drivable areas around the ego centre (x, y) [m]."""
+    admitted = admit(road, route.areas, x, y, AREA_HALF_SIDE)
+    limits = route.limits
+    if len(admitted) and admitted[-1] >= len(road.edges):
+        # nuPlan: a car park has the limit of the lane visited last (planner-pluto.md §2.4)
+        lanes = admitted[admitted < len(road.edges)]
+        limits = limits.copy()
+        limits[len(road.edges) :] = limits[lanes[-1]] if len(lanes) else FALLBACK_LIMIT
+    return Drivable(route.areas, admitted, limits)
+
+
+def reference_lines(
+    road: VectorMap, route: RouteLanes, rear: FloatArray, center: FloatArray
+) -> list[FloatArray]:
+    """Ways along the route from here on.
+
+    Args:
+        road: The map.
+        route: Its lanes on the route.
+        rear: (3,) rear axle x [m], y [m], heading [rad].
+        center: (3,) centre of the ego box, likewise.
+
+    Returns:
+        Lines (K, 3) of x [m], y [m], heading [rad]; none when no lane of the route is near.
+    """
+    x, y = float(rear[0]), float(rear[1])
+    found = np.empty(len(route.starts), np.int64)
+    count = _start_lanes(
+        road.edges.polygons, road.baselines, route.starts, rear, center[0], center[1], found
+    )
+    starts = found[:count].tolist()
+    after = {edge for start in starts for edge in road.outgoing.at(start).tolist()}
+    lines, lengths = [], []
+    for start in starts:
+        if start in after:
+            continue
+        for path in _paths_from(road, route.is_on, start, road.progress_on(start, x, y)):
+            line, length = _cut(road.baselines, np.array(path, np.int64), x, y)
+            lines.append(line)
+            lengths.append(length)
+    if any(length > LONG_ENOUGH for length in lengths):
+        lines = [lines[i] for i, length in enumerate(lengths) if length > LONG_ENOUGH]
+    return _distinct(lines)
+
+
+def _paths_from(road: VectorMap, is_on: BoolArray, start: int, behind: float) -> list[list[int]]:
+    """Sequences of lanes of the route from one lane on, depth first in the order of the edges."""
+    paths = []
+    stack = [([start], road.baselines.length(start) - behind)]
+    while stack:
+        path, length = stack.pop()
+        following = [edge for edge in road.outgoing.at(path[-1]).tolist() if is_on[edge]]
+        if not following or len(path) == MAX_LANES or length > LINE_LENGTH:
+            paths.append(path)
+            continue
+        stack += [
+            ([*path, edge], length + road.baselines.length(edge)) for edge in reversed(following)
+        ]
+    return paths
+
+
+def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
+    """The lines without those that run where an earlier one does."""
+    kept = [True] * len(lines)
+    for i, first in enumerate(lines):
+        for j in range(i + 1, len(lines)):
+            # nuPlan: a removed line still removes others (planner-pluto.md §2.5)
+            if kept[j] and _runs_along(first, lines[j]):
+                kept[j] = False
+    return [line for line, keep in zip(lines, kept, strict=True) if keep]
+
+
+@kernel
+def _runs_along(first: FloatArray, second: FloatArray) -> bool:
+    for row in range(min(len(first), len(second))):
+        dx, dy = first[row, 0] - second[row, 0], first[row, 1] - second[row, 1]
+        if abs(dx) + abs(dy) >= SAME_LINE:
+            return False
+    return True
+
+
+@kernel
+def _start_lanes(
+    polygons: Polygons,
+    baselines: Polylines,
+    candidates: IntArray,
+    rear: FloatArray,
+    x: float,
+    y: float,
+    out: IntArray,
+) -> int:
+    """Write the lanes a line may start on into `out`; their number."""
+    bounds, count = polygons.bounds, 0
+    square = square_around(x, y, START_HALF_SIDE)
+    for edge in candidates:
+        if (
+            bounds[edge, 0] <= x + START_HALF_SIDE
+            and bounds[edge, 2] >= x - START_HALF_SIDE
+            and bounds[edge, 1] <= y + START_HALF_SIDE
+            and bounds[edge, 3] >= y - START_HALF_SIDE
+            and baselines.arc[baselines.ptr[edge + 1] - 1] > MIN_BASELINE
+            and meets_convex(polygons, edge, square)
+            and _heading_error(baselines, edge, rear) < MAX_HEADING_ERROR
+        ):
+            out[count] = edge
+            count += 1
+    return count
+
+
+@kernel
+def _heading_error(baselines: Polylines, edge: int, rear: FloatArray) -> float:
+    """Heading error at the nearest of every fourth vertex of a baseline [rad]."""
+    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
+    best, found = np.inf, start
+    for index in range(start, stop, STRIDE):
+        distance = np.hypot(baselines.xy[index, 0] - rear[0], baselines.xy[index, 1] - rear[1])
+        if distance < best:
+            best, found = distance, index
+    return abs(wrap_angle(_vertex_heading(baselines, found, stop) - rear[2]))
+
+
+@kernel
+def _vertex_heading(baselines: Polylines, index: int, stop: int) -> float:
+    """Direction to the next vertex; the last one repeats the one before [rad]."""
+    at = min(index, stop - 2)
+    dx = baselines.xy[at + 1, 0] - baselines.xy[at, 0]
+    return np.arctan2(baselines.xy[at + 1, 1] - baselines.xy[at, 1], dx)
+
+
+@kernel
+def _cut(baselines: Polylines, path: IntArray, x: float, y: float) -> tuple[FloatArray, float]:
+    """The next 120 m of lanes from (x, y) on: poses (K, 3), and their length [m]."""
+    total = 0
+    for edge in path:
+        total += baselines.ptr[edge + 1] - baselines.ptr[edge]
+    xy, heading, progress = np.empty((total, 2)), np.empty(total), np.zeros(total)
+    row = 0
+    for edge in path:
+        stop = baselines.ptr[edge + 1]
+        for index in range(baselines.ptr[edge], stop):
+            xy[row, 0], xy[row, 1] = baselines.xy[index, 0], baselines.xy[index, 1]
+            heading[row] = _vertex_heading(baselines, index, stop)
+            if row > 0:
+                dx, dy = xy[row, 0] - xy[row - 1, 0], xy[row, 1] - xy[row - 1, 1]
+                progress[row] = progress[row - 1] + np.sqrt(dx * dx + dy * dy)
+            row += 1
+    here = project_on_polyline(xy, progress, 0, total, x, y)
+    count = 0
+    # nuPlan: a vertex goes when the next one repeats it, and so does always the very last one
+    for row in range(total - 1):
+        if progress[row + 1] - progress[row] > REPEATED:
+            xy[count, 0], xy[count, 1] = xy[row, 0], xy[row, 1]
+            heading[count], progress[count] = heading[row], progress[row]
+            count += 1
+    last = progress[count - 1]
+    start, end = min(max(here, progress[0]), last), min(here + LINE_LENGTH, last)
+    ahead = 0
+    while ahead < count and progress[ahead] <= start:
+        ahead += 1
+    is_cut = ahead < count
+    first = ahead if is_cut else max(count - 2, 0)
+    stop = first if is_cut else count
+    while stop < count and progress[stop] < end:
+        stop += 1
+    margin = 1 if is_cut else 0  # an interpolated pose at either end
+    out = np.empty((stop - first + 2 * margin, 3))
+    for vertex in range(first, stop):
+        place = vertex - first + margin
+        out[place, 0], out[place, 1], out[place, 2] = xy[vertex, 0], xy[vertex, 1], heading[vertex]
+    if is_cut:
+        _interpolate(xy, heading, progress, count, start, out[0])
+        _interpolate(xy, heading, progress, count, end, out[len(out) - 1])
+    return out, end - start
+
+
+@kernel
+def _interpolate(
+    xy: FloatArray,
+    heading: FloatArray,
+    progress: FloatArray,
+    count: int,
+    at: float,
+    out: FloatArray,
+) -> None:
+    """Write the pose at a progress between the first `count` vertices into `out` (3,)."""
+    upper = 1
+    while upper < count - 1 and progress[upper] < at:
+        upper += 1
+    low = upper - 1
+    share = (at - progress[low]) / (progress[upper] - progress[low])
+    out[0] = xy[low, 0] + share * (xy[upper, 0] - xy[low, 0])
+    out[1] = xy[low, 1] + share * (xy[upper, 1] - xy[low, 1])
+    out[2] = wrap_angle(heading[low] + share * wrap_angle(heading[upper] - heading[low]))
+
+
+class LineFeatures(NamedTuple):
+    """Reference lines as the network reads them, in the ego frame. R lines of 120 points.
+
+    Attributes:
+        position: (R, 120, 2) float32 [m].
+        vector: (R, 120, 2) float32, to the next point [m].
+        orientation: (R, 120) float32 [rad].
+        valid_mask: (R, 120).
+    """
+
+    position: np.ndarray
+    vector: np.ndarray
+    orientation: np.ndarray
+    valid_mask: BoolArray
+
+
+def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures:
+    """Every fourth point of each line, in the frame of the rear axle (3,)."""
+    made = LineFeatures(
+        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
+        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
+        np.zeros((len(lines), NUM_POINTS), np.float32),
+        np.zeros((len(lines), NUM_POINTS), np.bool_),
+    )
+    points = np.zeros((len(lines), NUM_POINTS, 5))
+    for row, line in enumerate(lines):
+        sampled = line[::STRIDE][: NUM_POINTS + 1]
+        count = len(sampled) - 1
+        points[row, :count, :2] = sampled[:-1, :2]
+        points[row, :count, 2:4] = np.diff(sampled[:, :2], axis=0)
+        points[row, :count, 4] = sampled[:-1, 2]
+        made.valid_mask[row, :count] = True
+    cos, sin = np.cos(rear[2]), np.sin(rear[2])
+    turn = np.array([[cos, -sin], [sin, cos]])
+    # padding is moved as well, as in the official features (planner-pluto.md §2.6)
+    made.position[:] = (points[..., :2] - rear[:2]) @ turn
+    made.vector[:] = points[..., 2:4] @ turn
+    made.orientation[:] = points[..., 4] - rear[2]
+    return made

@@ -1,0 +1,218 @@
+"""Scores of PLUTO's candidates, on their driven states (planner-pluto.md §5)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, kernel
+from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.planners.learned.pluto.collisions import (
+    OFF_ROAD,
+    ONCOMING,
+    collisions,
+    judge_places,
+    near_objects,
+    times_to_collision,
+)
+from shiftsim.planners.learned.pluto.reference import Drivable
+from shiftsim.planners.learned.pluto.world import SCORED, World
+from shiftsim.planners.pdm.parameters import DT, ComfortBounds
+from shiftsim.planners.pdm.scorer import place_ego
+from shiftsim.planners.proposals.areas import near_areas
+from shiftsim.planners.proposals.comfort import comfort, make_filters
+from shiftsim.planners.proposals.tracker import simulate_proposals
+from shiftsim.sim.dynamics.lqr import NUPLAN
+from shiftsim.world.layers import Polygons
+from shiftsim.world.state import NUM_STATE, VX, VY, VehicleParameters, X, Y
+
+LEARNED_WEIGHT = 0.3
+PROGRESS_WEIGHT, TTC_WEIGHT, SPEED_WEIGHT, COMFORT_WEIGHT = 5.0, 5.0, 2.0, 2.0
+UNCOMFORTABLE = TOO_FAST = 0.5  # factors
+SPEED_SCORE_MIN = 0.5
+MAX_OVERSPEED = 2.23  # m/s, on average
+DIRECTION_LIMITS = (4.0, 12.0)  # m on oncoming lanes
+MAX_REVERSE = 5  # frames
+ALREADY_OFF = 3  # first frames; when all candidates leave the road there, it does not count
+MIN_PROGRESS = 0.1  # m
+
+
+class Scores(NamedTuple):
+    """Scores of P candidates.
+
+    Attributes:
+        total: (P,) what decides.
+        rule: (P,) the rule-based part.
+        factors: (3, P) no collision, drivable area, driving direction.
+        terms: (4, P) progress, speed limit, comfort, time to collision.
+        progress: (P,) along the reference line [m].
+        fault_times: (P,) of the first at-fault collision, inf if none [s].
+        driven: (P, 41, 11) states as driven by the tracker.
+        flags: (P, 41, 3) several lanes, off the road, off the route.
+        speed_limits: (P, 41) [m/s].
+    """
+
+    total: FloatArray
+    rule: FloatArray
+    factors: FloatArray
+    terms: FloatArray
+    progress: FloatArray
+    fault_times: FloatArray
+    driven: FloatArray
+    flags: BoolArray
+    speed_limits: FloatArray
+
+
+class Place(NamedTuple):
+    """The map as the scorer sees it.
+
+    Attributes:
+        drivable: Drivable areas of the step.
+        edges: Areas of lanes and connectors.
+        baseline: (K, 2) line along which progress is measured [m].
+    """
+
+    drivable: Drivable
+    edges: Polygons
+    baseline: FloatArray
+
+
+def score(
+    poses: FloatArray,
+    learned: FloatArray,
+    ego: FloatArray,
+    world: World,
+    place: Place,
+    vehicle: VehicleParameters,
+) -> Scores:
+    """Drive candidates and score them.
+
+    Args:
+        poses: (P, 81, 3) candidates.
+        learned: (P,) their scores by the network.
+        ego: (11,) ego state.
+        world: What is around.
+        place: The map.
+        vehicle: Dimensions of the ego.
+    """
+    driven = drive(poses, ego, vehicle)
+    count, steps = driven.shape[:2]
+    corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
+    place_ego(
+        driven, (vehicle.length, vehicle.width, vehicle.rear_axle_to_center), corners, centers
+    )
+    drivable = place.drivable
+    flags, limits = np.empty((count, steps, 3), np.bool_), np.empty((count, steps))
+    lanes = near_areas(drivable.areas, drivable.admitted, corners)
+    judge_places(drivable.areas, lanes, drivable.limits, corners, driven, flags, limits)
+    near = near_objects(corners, driven, world)
+    clear, fault_times, ttc = np.empty(count), np.empty(count), np.empty(count)
+    collisions(driven, corners, flags, world, near, place.edges, clear, fault_times)
+    times_to_collision(driven, corners, flags, world, near, ttc)
+    factors = np.stack([clear, on_road(flags[..., OFF_ROAD]), direction(driven, flags)])
+    progress = travel(driven, place.baseline)
+    terms = np.stack([np.empty(count), speed_score(driven, limits), comfort_score(driven), ttc])
+    terms[0], rule = aggregate(factors, terms, progress)
+    total = rule + LEARNED_WEIGHT * learned
+    return Scores(total, rule, factors, terms, progress, fault_times, driven, flags, limits)
+
+
+def drive(poses: FloatArray, ego: FloatArray, vehicle: VehicleParameters) -> FloatArray:
+    """(P, 41, 11) states of candidates (P, 81, 3) as the tracker drives them."""
+    count, horizon = len(poses), poses.shape[1] - 1
+    speeds, curvatures = np.empty((count, horizon)), np.empty((count, horizon))
+    driven = np.empty((count, SCORED + 1, NUM_STATE))
+    tracker = NUPLAN._replace(wheel_base=vehicle.wheel_base)
+    simulate_proposals(poses, ego, tracker, DT, speeds, curvatures, driven)
+    return driven
+
+
+def on_road(off_road: BoolArray) -> FloatArray:
+    """(P,) factor of the drivable area, from flags (P, T) (§5.4)."""
+    # nuPlan: an ego that is off the road already may stay there
+    if off_road[:, :ALREADY_OFF].any(axis=1).all():
+        return np.ones(len(off_road))
+    return np.where(off_road.any(axis=1), 0.0, 1.0)
+
+
+def direction(driven: FloatArray, flags: BoolArray) -> FloatArray:
+    """(P,) factor of the driving direction (§5.4)."""
+    steps = np.hypot(np.diff(driven[..., X], axis=1), np.diff(driven[..., Y], axis=1))
+    astray = np.where(flags[:, 1:, ONCOMING], steps, 0.0).sum(axis=1)
+    low, high = DIRECTION_LIMITS
+    factor = np.where(astray < low, 1.0, np.where(astray < high, 0.5, 0.0))
+    reverse = (driven[..., VX] < 0.0).sum(axis=1) > MAX_REVERSE
+    return np.where(reverse, 0.0, factor)
+
+
+def speed_score(driven: FloatArray, limits: FloatArray) -> FloatArray:
+    """(P,) in [0, 1] (§5.5)."""
+    over = np.maximum(np.hypot(driven[..., VX], driven[..., VY]) - limits, 0.0)
+    return np.maximum(1.0 - over.sum(axis=1) / (MAX_OVERSPEED * limits.shape[1]), 0.0)
+
+
+def comfort_score(driven: FloatArray) -> FloatArray:
+    """(P,) 0 or 1 (§5.5)."""
+    count, steps = driven.shape[:2]
+    signals, bounded = np.empty((count, 6, steps)), np.empty((count, 6), np.bool_)
+    comfort(driven, make_filters(), ComfortBounds(), signals, bounded)
+    return np.where(bounded.all(axis=1), 1.0, 0.0)
+
+
+def travel(driven: FloatArray, baseline: FloatArray) -> FloatArray:
+    """(P,) progress along a line (K, 2) [m]."""
+    arc = np.zeros(len(baseline))
+    np.cumsum(np.hypot(*np.diff(baseline, axis=0).T), out=arc[1:])
+    out = np.empty(len(driven))
+    _project_ends(driven, baseline, arc, out)
+    return out
+
+
+@kernel
+def _project_ends(
+    driven: FloatArray, baseline: FloatArray, arc: FloatArray, out: FloatArray
+) -> None:
+    count, last = len(baseline), driven.shape[1] - 1
+    for row in range(len(driven)):
+        start = project_on_polyline(baseline, arc, 0, count, driven[row, 0, X], driven[row, 0, Y])
+        end = project_on_polyline(
+            baseline, arc, 0, count, driven[row, last, X], driven[row, last, Y]
+        )
+        out[row] = max(0.0, end - start)
+
+
+def aggregate(
+    factors: FloatArray, terms: FloatArray, progress: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Put the parts of the rule-based score together (§5.6).
+
+    Args:
+        factors: (3, P) of `Scores`.
+        terms: (4, P) of `Scores`; the first row is not read.
+        progress: (P,) [m].
+
+    Returns:
+        The progress scores (P,) in [0, 1], and the rule-based scores (P,).
+    """
+    product = factors.prod(axis=0)
+    product = product * np.where(terms[2] == 0.0, UNCOMFORTABLE, 1.0)
+    product = product * np.where(terms[1] < SPEED_SCORE_MIN, TOO_FAST, 1.0)
+    first = normalise(progress, product)
+    weighted = PROGRESS_WEIGHT * first + TTC_WEIGHT * terms[3]
+    weighted += SPEED_WEIGHT * terms[1] + COMFORT_WEIGHT * terms[2]
+    weights = PROGRESS_WEIGHT + TTC_WEIGHT + SPEED_WEIGHT + COMFORT_WEIGHT
+    return first, product * (weighted / weights)
+
+
+def normalise(progress: FloatArray, product: FloatArray) -> FloatArray:
+    """(P,) progress in [0, 1] from metres and the product of all factors (§5.6)."""
+    valid = progress * product
+    most = float(valid.max())
+    if most > MIN_PROGRESS:
+        return np.where(progress < MIN_PROGRESS, 0.0, valid / most)
+    return product
+
+
+def nearest_line(lines: list[FloatArray], rear: FloatArray) -> FloatArray:
+    """(K, 2) of the reference line that starts nearest to the rear axle; the first on ties."""
+    distances = [np.hypot(line[0, 0] - rear[0], line[0, 1] - rear[1]) for line in lines]
+    return np.ascontiguousarray(lines[int(np.argmin(distances))][:, :2])

@@ -1,0 +1,1 @@
+"""What PDM-Closed and PLUTO share to score proposals."""

@@ -1,0 +1,111 @@
+"""Runs planners written for nuPlan: subclasses of its `AbstractPlanner`, unchanged.
+
+Where nuPlan's devkit is installed, planners get its own objects. Where it is not, stand-ins take
+the `nuplan.*` module names in this process.
+
+    shiftsim run --planner nuplan:my_package.planner:MyPlanner --planner-arg horizon=8
+    shiftsim.run(wrap(MyPlanner(horizon=8)), store="demo")
+"""
+
+import functools
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from shiftsim.compat.nuplan.finder import StandInFinder, stand_ins_are_installed
+from shiftsim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from shiftsim.compat.nuplan.bridge.planner import NuplanPlanner
+
+_PROBE = "nuplan.planning.simulation.planner.abstract_planner"
+_METHODS = ("name", "initialize", "observation_type", "compute_planner_trajectory")
+
+
+def install() -> bool:
+    """Make `import nuplan…` work in this process; call it before importing a planner's module.
+
+    Returns:
+        Whether the stand-ins are used: false where nuPlan's devkit is there.
+    """
+    if stand_ins_are_installed():
+        return True
+    try:
+        if importlib.util.find_spec(_PROBE) is not None:
+            return False
+    except ModuleNotFoundError:
+        pass
+    # a folder named nuplan, of data for instance, counts as an empty package: drop it
+    for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
+        del sys.modules[name]
+    sys.meta_path.insert(0, StandInFinder())
+    return True
+
+
+def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
+    """A planner for shiftsim from one for nuPlan.
+
+    Args:
+        planner: An instance, which is initialized again for every scenario, or a class, of which
+            every scenario gets a new instance, as in nuPlan.
+        arguments: For the constructor of a class.
+
+    Raises:
+        ConfigError: It is no nuPlan planner, or asks for what shiftsim does not have.
+    """
+    install()
+    from shiftsim.compat.nuplan.bridge.planner import NuplanPlanner
+
+    kind = planner if inspect.isclass(planner) else type(planner)
+    _check(kind)
+    if kind is not planner and arguments:
+        raise ConfigError(
+            f"arguments {', '.join(arguments)} were given for an instance of {kind.__name__}",
+            hint=f"wrap({kind.__name__}, …) or wrap({kind.__name__}(…))",
+        )
+    return NuplanPlanner(planner, arguments)
+
+
+def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
+    """What makes wrapped planners of a class; it takes the arguments of the class's constructor.
+
+    Raises:
+        ConfigError: It is no class of nuPlan planners, or asks for what shiftsim does not have.
+    """
+    if not inspect.isclass(kind):
+        raise ConfigError(
+            f"{getattr(kind, '__name__', kind)!r} is not a class",
+            hint="nuplan:package.module:Class",
+        )
+    _check(kind)
+
+    def make(**arguments: Any) -> "NuplanPlanner":
+        return wrap(kind, **arguments)
+
+    functools.update_wrapper(make, kind, updated=())
+    # said, for `AbstractPlanner.__new__` hides the constructor from some versions of `inspect`
+    parameters = [*inspect.signature(kind.__init__, eval_str=True).parameters.values()][1:]
+    if kind.__init__ is object.__init__:
+        parameters = []
+    vars(make)["__signature__"] = inspect.Signature(parameters)
+    return make
+
+
+def _check(kind: type) -> None:
+    missing = [name for name in _METHODS if not callable(getattr(kind, name, None))]
+    abstract = sorted(getattr(kind, "__abstractmethods__", ()))
+    if missing or abstract:
+        raise ConfigError(
+            f"{kind.__name__} has no method {(missing or abstract)[0]}()",
+            hint="a nuPlan planner is a subclass of AbstractPlanner with "
+            + ", ".join(f"{name}()" for name in _METHODS),
+        )
+    if getattr(kind, "requires_scenario", False):
+        raise ConfigError(
+            f"{kind.__name__} has requires_scenario = True: it wants nuPlan's scenario object with "
+            "the recorded future, which shiftsim does not have",
+            hint="what a planner is given: route, goal, map, history, traffic lights; "
+            "the oracle of shiftsim is log-future",
+        )

@@ -1,0 +1,316 @@
+"""Objects of a map, made when asked for; each one knows its map and its index there."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from nuplan.common.actor_state.state_representation import Point2D, StateSE2
+from nuplan.common.maps.abstract_map_objects import (
+    Intersection,
+    Lane,
+    LaneConnector,
+    PolygonMapObject,
+    PolylineMapObject,
+    RoadBlockGraphEdgeMapObject,
+    StopLine,
+)
+from nuplan.common.maps.maps_datatypes import IntersectionType, LaneConnectorType, StopLineType
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import MapError
+from shiftsim.world.map import NONE
+
+if TYPE_CHECKING:
+    from shiftsim.compat.nuplan.bridge.map import BridgeMap
+
+_HEADING_STEP = 0.5  # m, nuPlan polyline map object
+_CURVATURE_STEP = 2.0  # m, nuPlan polyline map object
+_FLAT = 1e-6  # m^4, sixteen squared areas of a triangle below which a line counts as straight
+
+
+class _NotInNuplan:
+    """What nuPlan's interface names and its own map does not have either."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: Any, owner: type | None = None) -> Any:
+        if holder is None:
+            return self
+        raise NotImplementedError(f"{type(holder).__name__}.{self._name}: not in nuPlan either")
+
+
+class BridgePolyline(PolylineMapObject):
+    """A line: baseline or boundary."""
+
+    def __init__(self, line_id: str, xy: FloatArray) -> None:
+        self.id = line_id
+        self._xy = xy
+
+    @cached_property
+    def linestring(self) -> shapely.LineString:
+        """The line."""
+        return shapely.LineString(self._xy)
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        return float(self.linestring.length)
+
+    @cached_property
+    def discrete_path(self) -> list[Any]:
+        """Poses at the vertices, heading for the next one; the last two have the same heading."""
+        step = np.diff(self._xy, axis=0)
+        headings = np.arctan2(step[:, 1], step[:, 0])
+        rows = np.c_[self._xy, np.append(headings, headings[-1])]
+        return [StateSE2(*row) for row in rows.tolist()]
+
+    def get_nearest_arc_length_from_position(self, point: Point2D) -> float:
+        """Where along the line it is nearest to a point [m]."""
+        return float(self.linestring.project(shapely.Point(point.x, point.y)))
+
+    def get_nearest_pose_from_position(self, point: Point2D) -> Any:
+        """The nearest point of the line, heading for the point 0.5 m further on it."""
+        # at the end of the line the heading is that of its last 0.5 m
+        arc = self.get_nearest_arc_length_from_position(point)
+        here, behind, ahead = (
+            self._point(arc + offset) for offset in (0.0, -_HEADING_STEP, _HEADING_STEP)
+        )
+        step = here - behind if (here == ahead).all() else ahead - here
+        return StateSE2(*here.tolist(), float(np.arctan2(step[1], step[0])))
+
+    def get_curvature_at_arc_length(self, arc_length: float) -> float:
+        """Curvature of the circle through three points 2 m apart, positive to the left [1/m]."""
+        assert 0.0 <= arc_length <= self.length, f"{arc_length} m is not on the line"
+        half = min(_CURVATURE_STEP, 0.5 * self.length)
+        middle = min(max(arc_length, half), self.length - half)
+        before, here, after = (self._point(middle + offset) for offset in (-half, 0.0, half))
+        first, second = here - before, after - here
+        a, b, c = np.hypot(*first), np.hypot(*second), np.hypot(*(before - after))
+        # Heron: sixteen times the squared area of the triangle
+        squared = (a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))
+        if squared < _FLAT:
+            return 0.0
+        side = np.sign(first[0] * (after - before)[1] - first[1] * (after - before)[0])
+        return float(side * np.sqrt(squared) / (a * b * c))
+
+    def _point(self, arc: float) -> FloatArray:
+        # negative distances would count from the end
+        return np.array(self.linestring.interpolate(max(arc, 0.0)).coords[0])
+
+
+class _Edge:
+    """What lanes and lane connectors share."""
+
+    parallel_edges = _NotInNuplan()
+    get_width_left_right = _NotInNuplan()
+    oriented_distance = _NotInNuplan()
+
+    def __init__(self, owner: "BridgeMap", index: int) -> None:
+        self._map, self._index = owner, index
+        self.id = owner.source.edges.ids[index]
+
+    @cached_property
+    def incoming_edges(self) -> list[Any]:
+        """Edges that lead here."""
+        return [self._map.edge(i) for i in self._map.source.incoming.at(self._index).tolist()]
+
+    @cached_property
+    def outgoing_edges(self) -> list[Any]:
+        """Edges that this one leads to."""
+        return [self._map.edge(i) for i in self._map.source.outgoing.at(self._index).tolist()]
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._map.source.edges.shape(self._index)
+
+    @cached_property
+    def baseline_path(self) -> BridgePolyline:
+        """Its centre line."""
+        return BridgePolyline(self.id, self._map.source.baselines.at(self._index))
+
+    @cached_property
+    def left_boundary(self) -> BridgePolyline:
+        """The line on its left."""
+        return self._boundary(self._map.source.left_boundaries.at(self._index), 0)
+
+    @cached_property
+    def right_boundary(self) -> BridgePolyline:
+        """The line on its right."""
+        return self._boundary(self._map.source.right_boundaries.at(self._index), 1)
+
+    def _boundary(self, xy: FloatArray, side: int) -> BridgePolyline:
+        if len(xy) < 2:
+            raise MapError(
+                f"map {self._map.map_name!r}: {self.id!r} has no {('left', 'right')[side]} boundary"
+            )
+        return BridgePolyline(self._map.source.boundary_ids[self._index][side], xy)
+
+    @property
+    def speed_limit_mps(self) -> float | None:
+        """[m/s]; None where the map has none."""
+        limit = float(self._map.source.speed_limits[self._index])
+        return None if np.isnan(limit) else limit
+
+    @property
+    def parent(self) -> Any:
+        """Its roadblock or roadblock connector; None where the map names an unknown one."""
+        block = int(self._map.source.block_of[self._index])
+        return None if block == NONE else self._map.block(block)
+
+    def get_roadblock_id(self) -> str:
+        """Id of its roadblock or roadblock connector."""
+        return "" if self.parent is None else str(self.parent.id)
+
+    def has_traffic_lights(self) -> bool:
+        """Whether lights govern it."""
+        return bool(self._map.source.has_traffic_lights[self._index])
+
+    @cached_property
+    def stop_lines(self) -> list[Any]:
+        """Where its lights make one stop."""
+        found = self._map.source.stop_lines.at(self._index).tolist()
+        return [self._map.stop_line(i) for i in found]
+
+
+class BridgeLane(_Edge, Lane):
+    """A lane."""
+
+    @property
+    def index(self) -> int:
+        """Position in the roadblock, 0 leftmost."""
+        return int(self._map.source.lane_index[self._index])
+
+    def is_left_of(self, other: Any) -> bool:
+        """Whether it is further left in the same roadblock."""
+        assert self.is_same_roadblock(other), "lanes of different roadblocks"
+        return self.index < other.index
+
+    def is_right_of(self, other: Any) -> bool:
+        """Whether it is further right in the same roadblock."""
+        assert self.is_same_roadblock(other), "lanes of different roadblocks"
+        return self.index > other.index
+
+    @property
+    def adjacent_edges(self) -> tuple[Any, Any]:
+        """The lanes on the left and on the right, or None."""
+        source, index = self._map.source, self._index
+        sides = int(source.left_lane[index]), int(source.right_lane[index])
+        left, right = (None if side == NONE else self._map.edge(side) for side in sides)
+        return left, right
+
+
+class BridgeLaneConnector(_Edge, LaneConnector):
+    """A lane across an intersection."""
+
+    adjacent_edges = (None, None)
+
+    @property
+    def turn_type(self) -> Any:
+        """Where it turns."""
+        return LaneConnectorType(int(self._map.source.turn_type[self._index]))
+
+    def is_left_of(self, other: Any) -> bool:
+        """False: connectors have no neighbours."""
+        return False
+
+    def is_right_of(self, other: Any) -> bool:
+        """False: connectors have no neighbours."""
+        return False
+
+
+class BridgeRoadBlock(RoadBlockGraphEdgeMapObject):
+    """A roadblock or a roadblock connector."""
+
+    parallel_edges = _NotInNuplan()
+    children_stop_lines = _NotInNuplan()
+
+    def __init__(self, owner: "BridgeMap", index: int) -> None:
+        self._map, self._index = owner, index
+        self.id = owner.source.blocks.ids[index]
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._map.source.blocks.shape(self._index)
+
+    @cached_property
+    def incoming_edges(self) -> list[Any]:
+        """Blocks that lead here."""
+        found = self._map.source.block_incoming.at(self._index).tolist()
+        return [self._map.block(i) for i in found]
+
+    @cached_property
+    def outgoing_edges(self) -> list[Any]:
+        """Blocks that this one leads to."""
+        found = self._map.source.block_outgoing.at(self._index).tolist()
+        return [self._map.block(i) for i in found]
+
+    @cached_property
+    def interior_edges(self) -> list[Any]:
+        """Its lanes or lane connectors."""
+        return [self._map.edge(i) for i in self._map.source.block_edges.at(self._index).tolist()]
+
+    @property
+    def intersection(self) -> Any:
+        """The intersection of a roadblock connector, or None."""
+        source = self._map.source
+        edges = source.block_edges.at(self._index).tolist()
+        where = {int(source.intersection_of[i]) for i in edges} - {NONE}
+        return self._map.intersection(min(where)) if where else None
+
+
+class BridgeStopLine(StopLine):
+    """Where one stops."""
+
+    intersection_from = _NotInNuplan()
+    parent = _NotInNuplan()
+
+    def __init__(self, owner: "BridgeMap", index: int) -> None:
+        self._map, self._index = owner, index
+        source = owner.source
+        super().__init__(
+            source.stop_polygons.ids[index], StopLineType(int(source.stop_kinds[index]))
+        )
+
+    @property
+    def layer_type(self) -> Any:
+        """Why one stops here."""
+        return self.stop_line_type
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._map.source.stop_polygons.shape(self._index)
+
+
+class BridgeIntersection(Intersection):
+    """Where roads meet."""
+
+    interior_edges = _NotInNuplan()
+    incoming_edges = _NotInNuplan()
+    is_signaled = _NotInNuplan()
+
+    def __init__(self, owner: "BridgeMap", index: int) -> None:
+        self._map, self._index = owner, index
+        # nuPlan: its map never says of which kind an intersection is
+        super().__init__(owner.source.intersections.ids[index], IntersectionType.DEFAULT)
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._map.source.intersections.shape(self._index)
+
+
+class BridgeArea(PolygonMapObject):
+    """A crosswalk, a walkway or a car park."""
+
+    def __init__(self, area_id: str, polygon: shapely.Polygon) -> None:
+        self.id, self._polygon = area_id, polygon
+
+    @property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._polygon

@@ -1,0 +1,172 @@
+"""Makes `import nuplan…` find the stand-ins, and says clearly what they do not have."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+from shiftsim.errors import MissingExtraError
+
+_STATE = "nuplan.common.actor_state."
+_GEOMETRY = "nuplan.common.geometry."
+_MAPS = "nuplan.common.maps."
+_SIMULATION = "nuplan.planning.simulation."
+
+_SOURCES = ("geometry", "transforms", "boxes", "objects", "ego", "map_types", "planning")
+# module -> the names that can be imported from it: its own, then those it imports itself
+MODULES = {
+    f"{_STATE}agent": (
+        "Agent AgentState AgentTemporalState OrientedBox PredictedTrajectory "
+        "SceneObjectMetadata StateVector2D TimePoint TrackedObjectType"
+    ),
+    f"{_STATE}agent_state": (
+        "AgentState OrientedBox SceneObject SceneObjectMetadata StateSE2 StateVector2D "
+        "TrackedObjectType"
+    ),
+    f"{_STATE}agent_temporal_state": "AgentTemporalState PredictedTrajectory TimePoint Waypoint",
+    f"{_STATE}car_footprint": (
+        "CarFootprint OrientedBox OrientedBoxPointType Point2D StateSE2 VehicleParameters "
+        "translate_longitudinally"
+    ),
+    f"{_STATE}dynamic_car_state": (
+        "DynamicCarState get_velocity_shifted get_acceleration_shifted StateVector2D"
+    ),
+    f"{_STATE}ego_state": (
+        "EgoState AgentState CarFootprint DynamicCarState InterpolatableState "
+        "SceneObjectMetadata SplitState StateSE2 StateVector2D TimePoint TrackedObjectType "
+        "VehicleParameters Waypoint get_acceleration_shifted get_velocity_shifted"
+    ),
+    f"{_STATE}oriented_box": (
+        "OrientedBox OrientedBoxPointType Dimension in_collision collision_by_radius_check "
+        "Point2D StateSE2 translate_longitudinally_and_laterally"
+    ),
+    f"{_STATE}scene_object": (
+        "SceneObject SceneObjectMetadata OrientedBox StateSE2 TrackedObjectType"
+    ),
+    f"{_STATE}state_representation": (
+        "TimeDuration TimePoint Point2D StateSE2 ProgressStateSE2 TemporalStateSE2 StateVector2D"
+    ),
+    f"{_STATE}static_object": (
+        "StaticObject OrientedBox SceneObject SceneObjectMetadata StateVector2D TrackedObjectType"
+    ),
+    f"{_STATE}tracked_objects": (
+        "TrackedObjects TrackedObject AGENT_TYPES Agent AgentTemporalState OrientedBox "
+        "STATIC_OBJECT_TYPES SceneObject SceneObjectMetadata StaticObject TrackedObjectType"
+    ),
+    f"{_STATE}tracked_objects_types": "TrackedObjectType AGENT_TYPES STATIC_OBJECT_TYPES",
+    f"{_STATE}vehicle_parameters": "BoxParameters VehicleParameters get_pacifica_parameters",
+    f"{_STATE}waypoint": (
+        "Waypoint InterpolatableState OrientedBox SplitState StateSE2 StateVector2D TimePoint"
+    ),
+    f"{_GEOMETRY}compute": (
+        "lateral_distance longitudinal_distance compute_distance principal_value "
+        "AngularInterpolator Dimension OrientedBox Point2D StateSE2 get_pacifica_parameters "
+        "translate_laterally translate_longitudinally"
+    ),
+    f"{_GEOMETRY}convert": (
+        "pose_from_matrix matrix_from_pose absolute_to_relative_poses "
+        "relative_to_absolute_poses numpy_array_to_absolute_pose "
+        "numpy_array_to_absolute_velocity vector_2d_from_magnitude_angle StateSE2 StateVector2D"
+    ),
+    f"{_GEOMETRY}transform": (
+        "rotate_2d translate rotate rotate_angle transform translate_longitudinally "
+        "translate_laterally translate_longitudinally_and_laterally Point2D StateSE2"
+    ),
+    f"{_MAPS}abstract_map": (
+        "AbstractMap MapObject PolygonMapObject Intersection Lane LaneConnector Point2D "
+        "RoadBlockGraphEdgeMapObject SemanticMapLayer StopLine"
+    ),
+    f"{_MAPS}abstract_map_objects": (
+        "AbstractMapObject PolygonMapObject PolylineMapObject GraphEdgeMapObject "
+        "LaneGraphEdgeMapObject Lane LaneConnector RoadBlockGraphEdgeMapObject StopLine "
+        "Intersection IntersectionType LaneConnectorType Point2D StateSE2 StopLineType"
+    ),
+    f"{_MAPS}maps_datatypes": (
+        "SemanticMapLayer LaneConnectorType StopLineType IntersectionType "
+        "TrafficLightStatusType TrafficLightStatusData"
+    ),
+    "nuplan.common.utils.interpolatable_state": "InterpolatableState SplitState TimePoint",
+    "nuplan.common.utils.split_state": "SplitState",
+    f"{_SIMULATION}controller.motion_model.kinematic_bicycle": (
+        "KinematicBicycleModel DynamicCarState EgoState StateSE2 StateVector2D TimePoint "
+        "VehicleParameters principal_value"
+    ),
+    f"{_SIMULATION}history.simulation_history_buffer": (
+        "SimulationHistoryBuffer DetectionsTracks EgoState Observation Sensors"
+    ),
+    f"{_SIMULATION}observation.observation_type": (
+        "CameraChannel LidarChannel Observation Sensors DetectionsTracks TrackedObjects"
+    ),
+    f"{_SIMULATION}planner.abstract_planner": (
+        "AbstractPlanner PlannerInitialization PlannerInput AbstractMap AbstractTrajectory "
+        "Observation PlannerReport SimulationHistoryBuffer SimulationIteration StateSE2 "
+        "TrafficLightStatusData"
+    ),
+    f"{_SIMULATION}planner.planner_report": "PlannerReport MLPlannerReport",
+    f"{_SIMULATION}simulation_time_controller.simulation_iteration": (
+        "SimulationIteration TimePoint"
+    ),
+    f"{_SIMULATION}trajectory.abstract_trajectory": "AbstractTrajectory TimePoint",
+    f"{_SIMULATION}trajectory.interpolated_trajectory": (
+        "InterpolatedTrajectory AbstractTrajectory AngularInterpolator InterpolatableState "
+        "SplitState TimePoint"
+    ),
+    f"{_SIMULATION}trajectory.predicted_trajectory": (
+        "PredictedTrajectory AbstractTrajectory EgoState InterpolatedTrajectory Waypoint"
+    ),
+    f"{_SIMULATION}trajectory.trajectory_sampling": "TrajectorySampling",
+}
+_PACKAGES = {name[:end] for name in MODULES for end, sign in enumerate(name) if sign == "."}
+
+_HINT = "install nuplan-devkit itself, which is then used instead, or leave that import out"
+
+
+class StandInFinder(MetaPathFinder, Loader):
+    """Finds the modules of `MODULES`. Nothing else of that name exists once it is installed.
+
+    Every module says that it is a package: then `from module import name` with a name that it does
+    not have comes here, and ends with one clear error instead of Python's own.
+    """
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """A spec for a stand-in, or None for modules of others.
+
+        Raises:
+            MissingExtraError: There is no stand-in for this part of the devkit.
+        """
+        if name.partition(".")[0] != "nuplan":
+            return None
+        if name in MODULES or name in _PACKAGES:
+            return ModuleSpec(name, self, is_package=True)
+        raise MissingExtraError(_lacking(name), hint=_HINT)
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """The ordinary kind of module."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the names into a module."""
+        if wanted := MODULES.get(module.__name__, "").split():
+            sources = [
+                import_module(f"shiftsim.compat.nuplan.stand_ins.{name}") for name in _SOURCES
+            ]
+            known = {name: value for source in sources for name, value in vars(source).items()}
+            vars(module).update((name, known[name]) for name in wanted)
+
+        def missing(name: str) -> Any:
+            raise AttributeError(f"{_lacking(f'{module.__name__}.{name}')}; {_HINT}")
+
+        vars(module)["__getattr__"] = missing
+
+
+def stand_ins_are_installed() -> bool:
+    """Whether `import nuplan` finds the stand-ins in this process."""
+    return any(isinstance(finder, StandInFinder) for finder in sys.meta_path)
+
+
+def _lacking(name: str) -> str:
+    return f"{name!r} is not among shiftsim's stand-ins for nuPlan's devkit"

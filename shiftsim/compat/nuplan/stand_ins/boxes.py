@@ -1,0 +1,271 @@
+"""Vehicle dimensions and oriented boxes."""
+
+import math
+from dataclasses import astuple, dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+
+from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2
+from shiftsim.compat.nuplan.stand_ins.transforms import (
+    translate_longitudinally,
+    translate_longitudinally_and_laterally,
+)
+from shiftsim.world.state import PACIFICA
+
+
+@dataclass
+class BoxParameters:
+    """Width and length [m]."""
+
+    width: float
+    length: float
+
+    @property
+    def half_width(self) -> float:
+        """Half the width [m]."""
+        return self.width / 2.0
+
+    @property
+    def half_length(self) -> float:
+        """Half the length [m]."""
+        return self.length / 2.0
+
+
+class VehicleParameters(BoxParameters):
+    """Dimensions of a vehicle [m]."""
+
+    def __init__(
+        self,
+        width: float,
+        front_length: float,
+        rear_length: float,
+        cog_position_from_rear_axle: float,
+        wheel_base: float,
+        vehicle_name: str,
+        vehicle_type: str,
+        height: float | None = None,
+    ) -> None:
+        super().__init__(width, front_length + rear_length)
+        self.front_length, self.rear_length = front_length, rear_length
+        self.cog_position_from_rear_axle = cog_position_from_rear_axle
+        self.wheel_base, self.height = wheel_base, height
+        self.vehicle_name, self.vehicle_type = vehicle_name, vehicle_type
+
+    @property
+    def rear_axle_to_center(self) -> float:
+        """From the rear axle forward to the centre of the box [m]."""
+        return self.half_length - self.rear_length
+
+    @property
+    def length_cog_to_front_axle(self) -> float:
+        """From the centre of gravity forward to the front axle [m]."""
+        return self.wheel_base - self.cog_position_from_rear_axle
+
+    def __hash__(self) -> int:
+        return hash(tuple(vars(self).values()))
+
+    def __repr__(self) -> str:
+        inside = ", ".join(f"{name}={value}" for name, value in vars(self).items())
+        return f"VehicleParameters({inside})"
+
+
+def get_pacifica_parameters() -> VehicleParameters:
+    """The car of nuPlan, which is also shiftsim's ego."""
+    return VehicleParameters(
+        width=PACIFICA.width,
+        front_length=PACIFICA.front_length,
+        rear_length=PACIFICA.rear_length,
+        cog_position_from_rear_axle=1.67,
+        wheel_base=PACIFICA.wheel_base,
+        vehicle_name="pacifica",
+        vehicle_type="gen1",
+        height=PACIFICA.height,
+    )
+
+
+class OrientedBoxPointType(IntEnum):
+    """Points of a box."""
+
+    FRONT_BUMPER = 1
+    REAR_BUMPER = 2
+    FRONT_LEFT = 3
+    FRONT_RIGHT = 4
+    REAR_LEFT = 5
+    REAR_RIGHT = 6
+    CENTER = 7
+    LEFT = 8
+    RIGHT = 9
+
+
+# half lengths forward and half widths to the left of the centre
+_WHERE = {
+    OrientedBoxPointType.FRONT_LEFT: (1, 1),
+    OrientedBoxPointType.REAR_LEFT: (-1, 1),
+    OrientedBoxPointType.REAR_RIGHT: (-1, -1),
+    OrientedBoxPointType.FRONT_RIGHT: (1, -1),
+    OrientedBoxPointType.FRONT_BUMPER: (1, 0),
+    OrientedBoxPointType.REAR_BUMPER: (-1, 0),
+    OrientedBoxPointType.LEFT: (0, 1),
+    OrientedBoxPointType.RIGHT: (0, -1),
+}
+_CORNERS = tuple(_WHERE)[:4]
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """Length, width and height [m]."""
+
+    length: float
+    width: float
+    height: float
+
+
+class OrientedBox:
+    """A box by the pose of its centre and its size [m]; its polygon is made when asked for."""
+
+    def __init__(self, center: StateSE2, length: float, width: float, height: float) -> None:
+        self.dimensions = Dimension(length, width, height)
+        self._center = center
+
+    @classmethod
+    def from_new_pose(cls, box: "OrientedBox", pose: StateSE2) -> "OrientedBox":
+        """A box of the same size elsewhere."""
+        return OrientedBox(pose, *astuple(box.dimensions))
+
+    @property
+    def center(self) -> StateSE2:
+        """Pose of the centre."""
+        return self._center
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        return self.dimensions.length
+
+    @property
+    def width(self) -> float:
+        """Width [m]."""
+        return self.dimensions.width
+
+    @property
+    def height(self) -> float:
+        """Height [m]."""
+        return self.dimensions.height
+
+    @property
+    def half_length(self) -> float:
+        """Half the length [m]."""
+        return self.length / 2.0
+
+    @property
+    def half_width(self) -> float:
+        """Half the width [m]."""
+        return self.width / 2.0
+
+    @property
+    def half_height(self) -> float:
+        """Half the height [m]."""
+        return self.height / 2.0
+
+    def corner(self, point: OrientedBoxPointType) -> Point2D:
+        """One point of the box."""
+        if point == OrientedBoxPointType.CENTER:
+            return self.center.point
+        along, across = _WHERE[point]
+        return translate_longitudinally_and_laterally(
+            self.center, along * self.half_length, across * self.half_width
+        ).point
+
+    def all_corners(self) -> list[Point2D]:
+        """Front left, rear left, rear right, front right."""
+        return [self.corner(point) for point in _CORNERS]
+
+    @cached_property
+    def geometry(self) -> shapely.Polygon:
+        """The polygon of the corners."""
+        return shapely.Polygon([(point.x, point.y) for point in self.all_corners()])
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, OrientedBox):
+            return NotImplemented
+        pairs = zip(astuple(self.dimensions), astuple(other.dimensions), strict=True)
+        return all(math.isclose(a, b) for a, b in pairs) and self.center == other.center
+
+    def __hash__(self) -> int:
+        return hash((self.center, self.dimensions))
+
+
+class CarFootprint(OrientedBox):
+    """The box of a vehicle."""
+
+    def __init__(self, center: StateSE2, vehicle_parameters: VehicleParameters) -> None:
+        height: Any = vehicle_parameters.height
+        super().__init__(center, vehicle_parameters.length, vehicle_parameters.width, height)
+        self.vehicle_parameters = vehicle_parameters
+
+    @classmethod
+    def build_from_rear_axle(
+        cls, rear_axle_pose: StateSE2, vehicle_parameters: VehicleParameters
+    ) -> "CarFootprint":
+        """From the pose of the rear axle, which is kept as it is."""
+        distance = vehicle_parameters.rear_axle_to_center
+        made = cls(translate_longitudinally(rear_axle_pose, distance), vehicle_parameters)
+        made.__dict__["rear_axle"] = rear_axle_pose  # nuPlan computes it back, off by an ulp
+        return made
+
+    @classmethod
+    def build_from_center(
+        cls, center: StateSE2, vehicle_parameters: VehicleParameters
+    ) -> "CarFootprint":
+        """From the pose of the centre."""
+        return cls(center, vehicle_parameters)
+
+    @classmethod
+    def build_from_cog(
+        cls, cog_pose: StateSE2, vehicle_parameters: VehicleParameters
+    ) -> "CarFootprint":
+        """From the pose of the centre of gravity."""
+        ahead = vehicle_parameters.cog_position_from_rear_axle
+        distance = vehicle_parameters.rear_axle_to_center - ahead
+        return cls(translate_longitudinally(cog_pose, distance), vehicle_parameters)
+
+    @property
+    def oriented_box(self) -> OrientedBox:
+        """The box itself."""
+        return self
+
+    @property
+    def rear_axle_to_center_dist(self) -> float:
+        """From the rear axle forward to the centre [m]."""
+        return float(self.vehicle_parameters.rear_axle_to_center)
+
+    @cached_property
+    def rear_axle(self) -> StateSE2:
+        """Pose of the rear axle."""
+        return translate_longitudinally(self.center, -self.rear_axle_to_center_dist)
+
+    def get_point_of_interest(self, point_of_interest: OrientedBoxPointType) -> Point2D:
+        """One point of the box."""
+        return self.corner(point_of_interest)
+
+
+def collision_by_radius_check(
+    box1: OrientedBox, box2: OrientedBox, radius_threshold: float | None
+) -> bool:
+    """Whether the centres are nearer than a radius [m]; without one, whether the circles meet."""
+    reach = radius_threshold or 0.5 * (
+        np.hypot(box1.width, box1.length) + np.hypot(box2.width, box2.length)
+    )
+    return bool(box1.center.distance_to(box2.center) < reach)
+
+
+def in_collision(
+    box1: OrientedBox, box2: OrientedBox, radius_threshold: float | None = None
+) -> bool:
+    """Whether two boxes share a point, provided they pass `collision_by_radius_check`."""
+    near = collision_by_radius_check(box1, box2, radius_threshold)
+    return near and bool(box1.geometry.intersects(box2.geometry))

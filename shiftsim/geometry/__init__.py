@@ -1,0 +1,1 @@
+"""Kernels that two subsystems need, each once: boxes, rings, polylines, frames, predicates."""

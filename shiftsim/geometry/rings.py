@@ -1,0 +1,222 @@
+"""Points, segments and rings: inside or not, touching or not, how far.
+
+A ring is a closed or open sequence of vertices (the closing edge is implied). Coordinates may
+be UTM: differences are always taken first.
+"""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.geometry.predicates import orientation
+
+INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
+
+
+@lean_kernel
+def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
+    count = len(a)
+    for index in range(count):
+        ax, ay = a[index, 0], a[index, 1]
+        after = index + 1 if index + 1 < count else 0
+        bx, by = a[after, 0], a[after, 1]
+        if ax == bx and ay == by:
+            continue
+        outside = True
+        for vertex in range(len(b)):
+            if orientation(ax, ay, bx, by, b[vertex, 0], b[vertex, 1]) >= 0:
+                outside = False
+                break
+        if outside:
+            return True
+    return False
+
+
+@lean_kernel
+def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two convex rings (V, 2), counter-clockwise, share a point; touching counts.
+
+    A separating line, if there is one, can be taken along an edge of either ring. Rings must have
+    a positive area.
+    """
+    return not (_separated_by_edges(a, b) or _separated_by_edges(b, a))
+
+
+@lean_kernel
+def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
+    """Whether the closed segments a-b and c-d, points (2,) each, share a point."""
+    if (
+        max(a[0], b[0]) < min(c[0], d[0])
+        or max(c[0], d[0]) < min(a[0], b[0])
+        or max(a[1], b[1]) < min(c[1], d[1])
+        or max(c[1], d[1]) < min(a[1], b[1])
+    ):
+        return False
+    o1 = orientation(a[0], a[1], b[0], b[1], c[0], c[1])
+    o2 = orientation(a[0], a[1], b[0], b[1], d[0], d[1])
+    if o1 * o2 > 0:
+        return False
+    o3 = orientation(c[0], c[1], d[0], d[1], a[0], a[1])
+    o4 = orientation(c[0], c[1], d[0], d[1], b[0], b[1])
+    return o3 * o4 <= 0
+
+
+@lean_kernel
+def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
+    """Where a point lies relative to one ring (V, 2): INTERIOR, BOUNDARY or EXTERIOR."""
+    parity, on_edge = ray_crossings(ring, len(ring) - 1, 0, len(ring), x, y)
+    if on_edge:
+        return BOUNDARY
+    return INTERIOR if parity else EXTERIOR
+
+
+@lean_kernel
+def ray_crossings(
+    xy: FloatArray, before: int, start: int, stop: int, x: float, y: float
+) -> tuple[bool, bool]:
+    """Whether a ray from (x, y) to +x crosses a chain an odd number of times, or starts on it.
+
+    Args:
+        xy: (V, 2) vertices [m].
+        before: Vertex the chain starts at; for a whole ring its last one.
+        start: Second vertex of the chain.
+        stop: One past its last vertex.
+        x: Point [m].
+        y: Point [m].
+    """
+    parity = False
+    px, py = xy[before, 0], xy[before, 1]
+    for index in range(start, stop):
+        qx, qy = xy[index, 0], xy[index, 1]
+        if qx == x and qy == y:
+            return False, True
+        if py == y and qy == y:
+            if min(px, qx) <= x <= max(px, qx):
+                return False, True
+        elif (py > y) != (qy > y) and (px >= x or qx >= x):
+            if px > x and qx > x:
+                parity = not parity
+            else:
+                side = orientation(px, py, qx, qy, x, y)
+                if side == 0:
+                    return False, True
+                if (side > 0) == (qy > py):
+                    parity = not parity
+        px, py = qx, qy
+    return parity, False
+
+
+@lean_kernel
+def locate_in_polygon(
+    xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
+) -> int:
+    """Where a point lies relative to a polygon with holes: INTERIOR, BOUNDARY or EXTERIOR.
+
+    Args:
+        xy: (V, 2) vertices of all rings [m].
+        ring_ptr: Ring r has the vertices ring_ptr[r] … ring_ptr[r + 1] - 1.
+        first: First ring of the polygon (its shell; the others are holes).
+        last: One past its last ring.
+        x: Point [m].
+        y: Point [m].
+    """
+    inside = False
+    for ring in range(first, last):
+        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
+        parity, on_edge = ray_crossings(xy, stop - 1, start, stop, x, y)
+        if on_edge:
+            return BOUNDARY
+        if parity:
+            inside = not inside
+    return INTERIOR if inside else EXTERIOR
+
+
+@lean_kernel
+def point_segment_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
+    """Distance from a point to the closed segment a-b [m]."""
+    dx, dy = bx - ax, by - ay
+    square = dx * dx + dy * dy
+    if square == 0.0:
+        return np.hypot(x - ax, y - ay)
+    along = ((x - ax) * dx + (y - ay) * dy) / square
+    if along <= 0.0:
+        return np.hypot(x - ax, y - ay)
+    if along >= 1.0:
+        return np.hypot(x - bx, y - by)
+    return abs((ay - y) * dx - (ax - x) * dy) / np.sqrt(square)
+
+
+@lean_kernel
+def polygon_distance(
+    xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
+) -> float:
+    """Distance from a point to a polygon with holes (see `locate_in_polygon`), 0 inside [m]."""
+    if locate_in_polygon(xy, ring_ptr, first, last, x, y) != EXTERIOR:
+        return 0.0
+    best = np.inf
+    for ring in range(first, last):
+        start, stop = ring_ptr[ring], ring_ptr[ring + 1]
+        before = stop - 1
+        for index in range(start, stop):
+            best = min(
+                best,
+                point_segment_distance(
+                    x, y, xy[before, 0], xy[before, 1], xy[index, 0], xy[index, 1]
+                ),
+            )
+            before = index
+    return best
+
+
+@lean_kernel
+def boundary_distance_below(
+    xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
+) -> float:
+    """Distance from a point to the edges of a ring, or `limit` where that is not below it [m].
+
+    Args:
+        xy: (V, 2) vertices of all rings [m].
+        start: First vertex of the ring.
+        stop: One past its last vertex.
+        x: Point [m].
+        y: Point [m].
+        limit: Distance of interest [m]; edges beyond it cost a comparison each.
+    """
+    best = limit
+    ax, ay = xy[stop - 1, 0] - x, xy[stop - 1, 1] - y
+    for index in range(start, stop):
+        bx, by = xy[index, 0] - x, xy[index, 1] - y
+        if (
+            min(ax, bx) < best
+            and max(ax, bx) > -best
+            and min(ay, by) < best
+            and max(ay, by) > -best
+        ):
+            best = min(best, point_segment_distance(0.0, 0.0, ax, ay, bx, by))
+        ax, ay = bx, by
+    return best
+
+
+@lean_kernel
+def ring_distance(a: FloatArray, b: FloatArray) -> float:
+    """Distance between two convex rings (V, 2), counter-clockwise; 0 when they share a point."""
+    if convex_intersect(a, b):
+        return 0.0
+    best = np.inf
+    for swap in range(2):
+        first, second = (a, b) if swap == 0 else (b, a)
+        before = len(second) - 1
+        for edge in range(len(second)):
+            for vertex in range(len(first)):
+                best = min(
+                    best,
+                    point_segment_distance(
+                        first[vertex, 0],
+                        first[vertex, 1],
+                        second[before, 0],
+                        second[before, 1],
+                        second[edge, 0],
+                        second[edge, 1],
+                    ),
+                )
+            before = edge
+    return best

@@ -1,0 +1,170 @@
+"""Why a rollout has its score: every metric, its value, threshold and first violation."""
+
+import difflib
+from typing import Any
+
+from shiftsim.errors import ConfigError
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
+from shiftsim.runs.results import Run
+from shiftsim.runs.rollouts import Task
+
+_COLLISIONS = "no_ego_at_fault_collisions"
+_UNITS = {  # nuPlan's names, shortened
+    "meters": "m",
+    "seconds": "s",
+    "meters_per_second": "m/s",
+    "meters_per_second_squared": "m/s²",
+    "meters_per_second_cubed": "m/s³",
+    "radians_per_second": "rad/s",
+    "radians_per_second_squared": "rad/s²",
+    "count": "",
+    "ratio": "",
+    "boolean": "",
+}
+
+
+def select_tasks(
+    run: Run,
+    token: str,
+    *,
+    planner: str | None = None,
+    noise: str | None = None,
+    seed: int | None = None,
+) -> list[dict[str, Any]]:
+    """The tasks of one scenario, each with its score row and its metric rows.
+
+    Args:
+        run: The run.
+        token: Scenario token, or an unambiguous beginning of one.
+        planner: Only this planner.
+        noise: Only this noise.
+        seed: Only this seed.
+
+    Returns:
+        Rows of `tasks.parquet`, with `cls`, `why` and `metrics` added; every metric has its `role`
+        (`multiplier`, `weighted` or empty) and `weight`.
+
+    Raises:
+        ConfigError: There is no such task, or several scenarios begin like that.
+    """
+    full = _find_token(run, token)
+    wanted = {"planner": planner, "noise": noise, "seed": seed, "token": full}
+    rows = [
+        row
+        for row in run.tasks.to_pylist()
+        if all(value is None or row[name] == value for name, value in wanted.items())
+    ]
+    if not rows:
+        config = run.manifest["config"]
+        raise ConfigError(
+            f"run {run.path.name!r} has no task planner={planner} noise={noise} seed={seed}",
+            hint=f"planners {config['planners']}, noise {config['noise']}, seeds {config['seeds']}",
+        )
+    scores = {_key(row): row for row in run.scores.to_pylist()}
+    metrics: dict[Task, list[dict[str, Any]]] = {}
+    for row in run.metrics.to_pylist():
+        metrics.setdefault(_key(row), []).append(row)
+    out = []
+    for row in rows:
+        cls = scores.get(_key(row), {}).get("cls")
+        known = [_with_role(metric) for metric in metrics.get(_key(row), [])]
+        out.append({**row, "cls": cls, "why": why(cls, known), "metrics": known})
+    return out
+
+
+def _with_role(row: dict[str, Any]) -> dict[str, Any]:
+    name = row["metric"]
+    role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
+    return {**row, "role": role, "weight": WEIGHTS.get(name)}
+
+
+def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
+    """A score in one line: what made it 0, or how it is composed; empty for a failed task."""
+    if cls is None:
+        return ""
+    scored = [row for row in metrics if row["score"] is not None]
+    factors = [row for row in scored if row["role"] == "multiplier"]
+    parts = [row for row in scored if row["role"] == "weighted"]
+    zero = [row for row in factors if row["score"] == 0.0]
+    if zero:
+        causes = (f"{row['metric']} is 0{_first_violation(row)}" for row in zero)
+        return f"score 0 because {' and '.join(causes)}"
+    if cls == 0.0:
+        return "score 0 because every weighted metric is 0"
+    product = " × ".join(f"{row['score']:g}" for row in factors)
+    terms = " + ".join(f"{row['weight']:g}·{row['score']:.4g}" for row in parts)
+    total = sum(row["weight"] for row in parts)
+    return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
+
+
+def _first_violation(row: dict[str, Any]) -> str:
+    if row["first_violation_iteration"] is None:
+        return ""
+    partner = f", track {row['partner_token']}" if row["partner_token"] else ""
+    return f" ({row['first_violation_s']:.1f} s{partner})"
+
+
+def _key(row: dict[str, Any]) -> Task:
+    return Task(*(row[name] for name in Task._fields))
+
+
+def _find_token(run: Run, token: str) -> str:
+    tokens = sorted(set(run.tasks["token"].to_pylist()))
+    if token in tokens:
+        return token
+    found = [known for known in tokens if known.startswith(token)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ConfigError(
+            f"{len(found)} scenarios begin with {token!r}", hint=f"such as {', '.join(found[:4])}"
+        )
+    near = difflib.get_close_matches(token, tokens, n=1) or tokens[:1]
+    raise ConfigError(
+        f"run {run.path.name!r} has no scenario {token!r}",
+        hint=f"did you mean {near[0]!r}?" if near else "the run is empty",
+    )
+
+
+def explain_lines(task: dict[str, Any]) -> list[str]:
+    """One task in words; `task` is a row of `select_tasks`."""
+    seed = "" if task["noise"] == "none" else f"  seed {task['seed']}"
+    head = f"{task['token']}  {task['scenario_type']}  {task['planner']} {task['noise']}{seed}"
+    if task["status"] != "ok":
+        lines = [f"{head}  {task['status']}", f"  {task['error']}"]
+        lines += [f"  hint: {task['hint']}"] if task["hint"] else []
+        return lines + [f"  {line}" for line in (task["traceback"] or "").splitlines()]
+    lines = [f"{head}  CLS {task['cls']:.4f}"]
+    lines.append(f"  {task['why']}")
+    lines.append("  the score is the product of the × rows and the weighted mean of the + rows")
+    scored = [row for row in task["metrics"] if row["metric"] in SHORT_NAMES]
+    scored.sort(key=lambda row: row["metric"] not in MULTIPLIERS)
+    others = [row for row in task["metrics"] if row["metric"] not in SHORT_NAMES]
+    return lines + [f"  {_metric_line(row)}" for row in scored + others]
+
+
+def _metric_line(row: dict[str, Any]) -> str:
+    name = row["metric"]
+    role, weight = " ", ""
+    if name in MULTIPLIERS:
+        role = "×"
+    elif name in WEIGHTS:
+        role, weight = "+", f"weight {WEIGHTS[name]:g}"
+    score = "–" if row["score"] is None else f"{row['score']:.4f}"
+    parts = [f"{role} {SHORT_NAMES.get(name, ''):3} {name:33} {score:>6}", f"{weight:8}"]
+    if row["value"] is not None:
+        parts.append(f"value {row['value']:.4g}{_unit(row)}")
+    if row["threshold"] is not None:
+        parts.append(f"threshold {row['threshold']:.4g}{_unit(row)}")
+    if row["first_violation_iteration"] is not None:
+        partner = f", track {row['partner_token']}" if row["partner_token"] else ""
+        value = f"{row['first_violation_value']:.4g}{_unit(row)}"
+        if name == _COLLISIONS:  # its value counts collisions, that of a violation is a speed
+            value = f"delta-v {value} m/s"
+        parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{partner}")
+    return "  ".join(parts).rstrip()
+
+
+def _unit(row: dict[str, Any]) -> str:
+    unit = _UNITS.get(row["unit"], row["unit"])
+    return f" {unit}" if unit else ""

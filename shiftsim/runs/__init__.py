@@ -1,0 +1,1 @@
+"""Many rollouts: settings, tasks, workers, and the folder of a run."""

@@ -1,0 +1,309 @@
+"""Two runs scenario by scenario: where scores differ, and the first step at which rollouts part.
+
+Rollouts are compared as they were stored, bit by bit. Within one step the order is that of cause
+and effect: the world as the planner saw it, its plan, the command, the noise.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shiftsim.errors import ConfigError
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.runs.results import Run
+from shiftsim.runs.rollouts import Task
+
+# columns of a stored rollout in the order of cause and effect within one step
+_KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
+_LATER = ("degraded", "plan_poses", "command_", "noise_")
+_UNITS = {
+    "m": "m",
+    "rad": "rad",
+    "mps": "m/s",
+    "mps2": "m/s²",
+    "radps": "rad/s",
+    "radps2": "rad/s²",
+}
+
+
+_AXES = ("x [m]", "y [m]", "heading [rad]")
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """The first step at which two rollouts differ.
+
+    Attributes:
+        iteration: The step.
+        seconds: Its time since the start [s].
+        quantity: What differs first, with its unit.
+        first: Its value in the first run.
+        second: Its value in the second run.
+    """
+
+    iteration: int
+    seconds: float
+    quantity: str
+    first: float
+    second: float
+
+    def __str__(self) -> str:
+        name, _, unit = self.quantity.partition(" [")
+        values = f"{self.first:.6g} vs {self.second:.6g}"
+        if f"{self.first:.6g}" == f"{self.second:.6g}":
+            values = f"{self.first!r} vs {self.second!r}"
+        when = f"iteration {self.iteration} ({self.seconds:.1f} s)"
+        return f"{when}: {name} {values} {unit.removesuffix(']')}".rstrip()
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A rollout whose score is another one.
+
+    Attributes:
+        task: Key in the first run.
+        planner: Planner of the second run.
+        first: Score in the first run.
+        second: Score in the second run.
+        metrics: Scores of the metrics that differ, in both runs.
+        departure: Where the rollouts part; None where they do not, or are not stored.
+        note: Why there is no departure.
+    """
+
+    task: Task
+    planner: str
+    first: float
+    second: float
+    metrics: dict[str, tuple[float | None, float | None]]
+    departure: Departure | None
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Two runs compared.
+
+    Attributes:
+        settings: Names of the settings that results depend on and that differ.
+        same: Rollouts with the same score.
+        better: Rollouts that are better in the second run.
+        worse: Rollouts that are worse in it.
+        only_first: Rollouts that finished in the first run alone.
+        only_second: Rollouts that finished in the second run alone.
+        means: Mean score of the common rollouts in both runs.
+        changes: The rollouts that changed most.
+    """
+
+    settings: tuple[str, ...]
+    same: int
+    better: int
+    worse: int
+    only_first: int
+    only_second: int
+    means: tuple[float, float]
+    changes: tuple[Change, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        out = asdict(self)
+        for change, row in zip(self.changes, out["changes"], strict=True):
+            row["task"] = change.task._asdict()
+        return out
+
+
+def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
+    """Compare two runs.
+
+    Planners are paired by name; two runs of one planner each are compared whatever their names.
+
+    Args:
+        first: One run.
+        second: The other one.
+        limit: How many changes are looked into, those with the largest change of score first.
+
+    Raises:
+        ConfigError: They have no rollout in common.
+    """
+    names = _planner_names(first, second)
+    ours = {_key(row): row for row in first.scores.to_pylist()}
+    theirs = {_key(row): row for row in second.scores.to_pylist()}
+    back = {other: name for name, other in names.items()}
+    paired = {
+        task._replace(planner=back.get(task.planner, "")): row for task, row in theirs.items()
+    }
+    common = sorted(task for task in ours if task in paired)
+    if not common:
+        raise ConfigError(
+            f"runs {first.path.name!r} and {second.path.name!r} have no rollout in common",
+            hint="compare runs of the same planners, noises, seeds and scenarios",
+        )
+    before = np.array([ours[task]["cls"] for task in common])
+    after = np.array([paired[task]["cls"] for task in common])
+    changed = [
+        i for i in np.argsort(-np.abs(after - before), kind="stable") if before[i] != after[i]
+    ]
+    changes = [
+        _change(first, second, common[i], names[common[i].planner], ours, paired)
+        for i in changed[:limit]
+    ]
+    return Difference(
+        settings=_settings(first, second),
+        same=int(np.sum(before == after)),
+        better=int(np.sum(after > before)),
+        worse=int(np.sum(after < before)),
+        only_first=len(ours) - len(common),
+        only_second=len(theirs) - len(common),
+        means=(float(before.mean()), float(after.mean())),
+        changes=tuple(changes),
+    )
+
+
+def diff_lines(found: Difference) -> list[str]:
+    """Two runs compared, in words."""
+    before, after = (100.0 * mean for mean in found.means)
+    lone = f" · only in one run {found.only_first} and {found.only_second}"
+    lines = [
+        f" same {found.same} · better {found.better} · worse {found.worse}"
+        f"{lone if found.only_first or found.only_second else ''}"
+        f"      CLS of the common ones {before:.2f} → {after:.2f}"
+    ]
+    if found.settings:
+        lines.append(f" settings that differ: {', '.join(found.settings)}")
+    for change in found.changes:
+        task = change.task
+        seed = "" if task.noise == "none" else f" seed {task.seed}"
+        both = (
+            task.planner if change.planner == task.planner else f"{task.planner}/{change.planner}"
+        )
+        metrics = ", ".join(
+            f"{name} {_score(a)} → {_score(b)}" for name, (a, b) in change.metrics.items()
+        )
+        lines.append(
+            f" {task.token}  {both} {task.noise}{seed}  "
+            f"{change.first:.4f} → {change.second:.4f}  {metrics}"
+        )
+        lines.append(
+            f"   {f'first difference {change.departure}' if change.departure else change.note}"
+        )
+    left = found.better + found.worse - len(found.changes)
+    return lines + ([f" and {left} more (--limit)"] if left else [])
+
+
+def _score(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _key(row: dict[str, Any]) -> Task:
+    return Task(*(row[name] for name in Task._fields))
+
+
+def _planner_names(first: Run, second: Run) -> dict[str, str]:
+    """Planner of the second run by that of the first."""
+    ours, theirs = (run.manifest["config"]["planners"] for run in (first, second))
+    if len(ours) == len(theirs) == 1:
+        return {ours[0]: theirs[0]}
+    return {name: name for name in ours if name in theirs}
+
+
+def _settings(first: Run, second: Run) -> tuple[str, ...]:
+    ours, theirs = (run.manifest["determining"] for run in (first, second))
+    return tuple(n for n in sorted({*ours, *theirs}) if ours.get(n) != theirs.get(n))
+
+
+def _change(
+    first: Run,
+    second: Run,
+    task: Task,
+    planner: str,
+    ours: dict[Task, dict[str, Any]],
+    theirs: dict[Task, dict[str, Any]],
+) -> Change:
+    rows = ours[task], theirs[task]
+    metrics = {
+        short: (rows[0][name], rows[1][name])
+        for name, short in SHORT_NAMES.items()
+        if name != "score" and rows[0][name] != rows[1][name]
+    }
+    departure, note = None, ""
+    theirs_of = task._replace(planner=planner)
+    if first.rollout_places.get(task) is None or second.rollout_places.get(theirs_of) is None:
+        note = "rollouts are not stored"
+    else:
+        departure = find_departure(first.rollout_rows(task), second.rollout_rows(theirs_of))
+        note = "" if departure else _why_only_judged(first, second)
+    return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
+
+
+def _why_only_judged(first: Run, second: Run) -> str:
+    """Why scores differ where the ego drove the same."""
+    ours, theirs = (run.manifest["determining"]["traffic"] for run in (first, second))
+    if ours != theirs:
+        return f"the ego drove the same, but in other traffic ({ours}, {theirs})"
+    return "the rollouts are the same: they were judged differently"
+
+
+def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
+    """The first step at which two stored rollouts differ; None where they never do."""
+    rows = min(len(first), len(second))
+    best: tuple[int, str] | None = None
+    for name in _ordered(set(first.schema.names) & set(second.schema.names)):
+        row = _first_difference(_values(first[name], rows), _values(second[name], rows))
+        if row is not None and (best is None or row < best[0]):
+            best = (row, name)
+    if best is None and len(first) == len(second):
+        return None
+    row, name = best or (rows, "")
+    seconds = float(_since_start(first if len(first) > row else second, row))
+    if not name:
+        return Departure(row, seconds, "length of the rollout", len(first), len(second))
+    ours, theirs = (np.ravel(_values(table[name], rows)[row]) for table in (first, second))
+    place = _first_difference(ours, theirs)
+    index = 0 if place is None else place
+    return Departure(row, seconds, _quantity(name, index), float(ours[index]), float(theirs[index]))
+
+
+def _ordered(names: Iterable[str]) -> list[str]:
+    def rank(name: str) -> tuple[int, str]:
+        later = (i for i, start in enumerate(_LATER, 1) if name.startswith(start))
+        return (next(later, 0), name)
+
+    return sorted((name for name in names if name not in _KEYS), key=rank)
+
+
+def _values(column: pa.Array, rows: int) -> np.ndarray:
+    """(rows, …) numbers of a column of numbers, or of lists of numbers."""
+    array = column.slice(0, rows)
+    if pa.types.is_list(array.type):
+        flat = array.flatten().to_numpy(zero_copy_only=False).astype(np.float64)
+        return flat.reshape(rows, -1) if rows else flat
+    return array.to_numpy(zero_copy_only=False).astype(np.float64)
+
+
+def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
+    if first.shape != second.shape:
+        return 0
+    differ = (first != second) & ~(np.isnan(first) & np.isnan(second))
+    if not differ.any():
+        return None
+    return int(np.argmax(differ.reshape(len(differ), -1).any(axis=1)))
+
+
+def _since_start(table: pa.RecordBatch, row: int) -> float:
+    times = table["time_us"]
+    return (times[row].as_py() - times[0].as_py()) * 1e-6
+
+
+def _quantity(name: str, index: int) -> str:
+    if name == "plan_poses":
+        pose, axis = divmod(index, 3)
+        return f"plan, pose {pose} {_AXES[axis]}"
+    if name.startswith("track_"):
+        return f"{name.replace('_', ' ')}, number {index}"
+    words = name.split("_")
+    unit = _UNITS.get(words[-1])
+    text = " ".join(words[:-1] if unit else words)
+    owner = "" if name.startswith(("command", "noise", "degraded")) else "ego "
+    return f"{owner}{text} [{unit}]" if unit else f"{owner}{text}"

@@ -1,0 +1,255 @@
+"""Many rollouts: scenarios x planners x noises x seeds, in worker processes, into one run folder.
+
+Two steps: `prepare` checks everything that can be checked before the first simulated step, and
+`execute` does the tasks.
+"""
+
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from shiftsim.errors import DataError
+from shiftsim.runs.bundle import write_bundle
+from shiftsim.runs.config import make_config
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.manifest import make_manifest, now
+from shiftsim.runs.planners import planner_name
+from shiftsim.runs.prepare import RUNS as RUNS
+from shiftsim.runs.prepare import Prepared as Prepared
+from shiftsim.runs.prepare import open_named_store as open_named_store
+from shiftsim.runs.prepare import prepare as prepare
+from shiftsim.runs.prepare import run_name as run_name
+from shiftsim.runs.results import FAILED, OK, TIMEOUT, Run, TaskResult, open_run
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.task import TaskRunner, Unit
+from shiftsim.runs.workers import Outcome, map_unordered
+from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        done: Tasks that have ended, failed ones and those of an earlier attempt included.
+        total: Tasks of the run.
+        failed: Tasks that failed, in this attempt.
+        seconds: Time spent so far by purpose, over all workers [s].
+    """
+
+    done: int
+    total: int
+    failed: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def execute(
+    prepared: Prepared,
+    *,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    argv: Sequence[str] = (),
+) -> Run:
+    """Do all tasks and write the run folder.
+
+    Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
+    with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
+    replaced by an incomplete one.
+
+    Args:
+        prepared: The run.
+        on_progress: Called after every task.
+        argv: The command line, for the manifest.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    if prepared.resumes and prepared.before == "complete":
+        return open_run(prepared.folder)
+    manifest = make_manifest(
+        prepared.folder,
+        config=prepared.config,
+        split=prepared.split,
+        store=prepared.runner.store,
+        determining=prepared.determining,
+        argv=argv,
+    )
+    manifest["workers"] = prepared.workers
+    if prepared.config.shard:  # what the whole run would be, for `merge`
+        manifest["tokens"] = sorted(prepared.tokens)
+    try:
+        return _execute(prepared, manifest, on_progress)
+    except OSError as error:
+        raise DataError(
+            f"run {str(prepared.folder)!r} cannot be written: {error.strerror or error}",
+            hint="check path and disk; what is finished is kept, and --resume goes on with it",
+        ) from error
+
+
+def _execute(
+    prepared: Prepared, manifest: dict[str, Any], on_progress: Callable[[Progress], None]
+) -> Run:
+    writer = RunWriter(prepared.folder, manifest, resume=prepared.resumes)
+    try:
+        interrupted = _do_units(prepared, writer, on_progress)
+        if interrupted and prepared.before == "complete":
+            raise KeyboardInterrupt
+        state = "interrupted" if interrupted else "finished"
+        if prepared.config.bundle:
+            store = open_named_store(prepared.runner.store)
+            tokens = {task.token for task in prepared.tasks}
+            manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
+        lacking = set(prepared.missing)
+        run = writer.finish(
+            {**manifest, "state": state, "ended": now()},
+            (*prepared.tasks, *prepared.missing),
+            lambda task: (
+                "the store does not hold this scenario"
+                if task in lacking
+                else "the run was interrupted"
+            ),
+        )
+    finally:
+        writer.close()
+    if interrupted:
+        raise KeyboardInterrupt
+    return run
+
+
+def _do_units(
+    prepared: Prepared, writer: RunWriter, on_progress: Callable[[Progress], None]
+) -> bool:
+    """Do what is not finished; returns whether the user interrupted."""
+    statuses = {task: line.status for task, line in writer.ended.items()}
+    todo = remaining(prepared.units, statuses, retry=prepared.config.retry_failed)
+    total = len(prepared.tasks)
+    progress = Progress(total - sum(map(len, todo)), total, 0)
+    try:
+        with closing(_outcomes(prepared, todo)) as outcomes:
+            for outcome in outcomes:
+                for result in ended(outcome):
+                    writer.add(result)
+                    progress = advanced(progress, result)
+                on_progress(progress)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def remaining(units: Iterable[Unit], ended: Mapping[Task, str], *, retry: bool) -> list[Unit]:
+    """What is left to do of a run.
+
+    Args:
+        units: All of it. A unit that is not finished is done as a whole again: its results may
+            depend on one another in the last digits.
+        ended: Status of the tasks that have ended.
+        retry: Whether those that failed are done again.
+    """
+    out: list[Unit] = []
+    for unit in units:
+        failed = tuple(task for task in unit if ended.get(task) in (FAILED, TIMEOUT))
+        if not all(task in ended for task in unit):
+            out.append(unit)
+        elif retry and failed:
+            out.append(failed)
+    return out
+
+
+def _outcomes(
+    prepared: Prepared, units: Sequence[Unit]
+) -> Generator[Outcome[Unit, list[TaskResult]], None, None]:
+    config = prepared.config
+    make = partial(_runner, prepared.runner)
+    leading = min(len(prepared.runner.planners), len(units))
+    if config.executor == "dask":
+        from shiftsim.runs.cluster import map_on_cluster
+
+        return map_on_cluster(
+            make,
+            units,
+            scheduler=config.scheduler,
+            alone=leading,
+            limit=config.timeout,
+            pieces=_pieces,
+        )
+    return map_unordered(
+        make,
+        units,
+        workers=prepared.workers,
+        alone=leading,
+        limit=config.timeout,
+        pieces=_pieces,
+        group=_scenario,
+    )
+
+
+def _scenario(unit: Unit) -> str:
+    return unit[0].token
+
+
+def _runner(runner: TaskRunner) -> TaskRunner:
+    return runner
+
+
+def _pieces(unit: Unit) -> list[Unit]:
+    return [(task,) for task in unit]
+
+
+def ended(outcome: Outcome[Unit, list[TaskResult]]) -> list[TaskResult]:
+    """The results of a unit, whose worker may have died."""
+    if outcome.result is not None:
+        return outcome.result
+    status = TIMEOUT if outcome.is_late else FAILED
+    hint = "run this scenario alone with --workers 1 to see why"
+    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task]
+
+
+def advanced(progress: Progress, result: TaskResult) -> Progress:
+    """The progress after one more result."""
+    seconds = dict(progress.seconds)
+    for name, value in result.seconds.items():
+        seconds[name] = seconds.get(name, 0.0) + value
+    failed = progress.failed + (result.status != OK)
+    return Progress(progress.done + 1, progress.total, failed, seconds)
+
+
+def run(
+    planner: Any,
+    *,
+    noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
+    seeds: int | Iterable[int] = 0,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    **settings: Any,
+) -> Run:
+    """Simulate and score planners on scenarios, as `shiftsim run` does.
+
+    Args:
+        planner: A name, `package.module:Class`, a class or an instance, or a list of those.
+            Classes and instances of the main script run in this process.
+        noise: Name or model, or a list of them.
+        seeds: Seeds of the noise.
+        on_progress: Called after every task.
+        settings: The other settings of `RunConfig`: `store`, `split`, `limit`, `traffic`,
+            `thresholds`, `workers`, `out`, …
+
+    Returns:
+        The finished run; print `.table()`.
+
+    Raises:
+        ShiftsimError: A setting is wrong, or something it names is missing.
+    """
+    sources = list(planner) if isinstance(planner, (list, tuple)) else [planner]
+    models = [noise] if isinstance(noise, (str, NoiseModel)) else list(noise)
+    names = [model for model in models if isinstance(model, str)]
+    made = [m if isinstance(m, NoiseModel) else parse_noise(m) for m in models if m != "all"]
+    if "all" in names:
+        made += [parse_noise(name) for name in NOISE_NAMES]
+    values = {
+        "planners": [planner_name(source) for source in sources],
+        "noise": [model.name for model in made],
+        "seeds": [seeds] if isinstance(seeds, int) else list(seeds),
+        **settings,
+    }
+    prepared = prepare(make_config(values), planners=sources, noises=made)
+    return execute(prepared, on_progress=on_progress)

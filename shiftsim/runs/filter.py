@@ -1,0 +1,336 @@
+"""The automatic filter: drive scenarios as recorded, drop those that cannot be driven so.
+
+Rules and thresholds are those of deepplan-conversion.md §10. The verdicts lie beside the scenarios,
+in `filter/verdicts.parquet` of the store; the scenarios themselves stay as they are. Runs over a
+whole store use the accepted ones.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shiftsim.data.store.files import Table, digest, write_blocks
+from shiftsim.data.store.reading import open_store
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
+from shiftsim.runs.config import default_workers
+from shiftsim.runs.results import TaskResult
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.task import attempt
+from shiftsim.runs.workers import map_unordered
+from shiftsim.sim.loop import simulate
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import center_poses
+
+VERDICTS = "filter/verdicts.parquet"
+_UNFINISHED = "filter/unfinished.jsonl"
+ACCEPTED, DROPPED, FAILED = "accepted", "dropped", "failed"
+COLLISION, AREA = "at-fault collision", "drivable area"
+STANDING, OFF_ROUTE = "path too short", "progress along the route"
+_COLLISIONS, _DRIVABLE = "no_ego_at_fault_collisions", "drivable_area_compliance"
+_PROGRESS = "expert_total_progress_along_route"
+
+_SCHEMA = pa.schema(
+    [
+        pa.field("token", pa.string(), nullable=False),
+        pa.field("verdict", pa.string(), nullable=False),  # accepted, dropped or failed
+        pa.field("reason", pa.string(), nullable=False),  # rules broken, or the error
+        pa.field("no_at_fault_collisions", pa.float64()),  # score
+        pa.field("drivable_area_compliance", pa.float64()),  # score
+        pa.field("max_outside_m", pa.float64()),  # furthest corner outside the drivable area
+        pa.field("path_m", pa.float64()),  # travelled from iteration 0 to the last one
+        pa.field("progress_m", pa.float64()),  # of it along the route driven
+        pa.field("partner_token", pa.string()),  # of the first at-fault collision
+        pa.field("first_violation_s", pa.float64()),  # since iteration 0, of the first rule broken
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FilterConfig:
+    """What a scenario must satisfy.
+
+    Attributes:
+        thresholds: Threshold profile of collisions and drivable area.
+        min_path_m: Shortest path from iteration 0 to the end [m].
+        min_progress_share: Smallest share of that path that is progress along the route.
+    """
+
+    thresholds: str = "deepplan"
+    min_path_m: float = 5.0
+    min_progress_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        thresholds_of(self.thresholds)
+        if not (0.0 <= self.min_path_m < np.inf and 0.0 <= self.min_progress_share <= 1.0):
+            raise ConfigError(
+                f"filter: min_path_m {self.min_path_m!r} or min_progress_share "
+                f"{self.min_progress_share!r} is out of range",
+                hint="min_path_m from 0 on, min_progress_share within 0 and 1",
+            )
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """The verdicts of a store.
+
+    Attributes:
+        path: The file.
+        rows: One row per scenario, sorted by token; the columns of the file.
+        hash: Digest of the file.
+        config: What the scenarios had to satisfy.
+    """
+
+    path: Path
+    rows: tuple[Mapping[str, Any], ...]
+    hash: str
+    config: Mapping[str, Any]
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        """Tokens of the accepted scenarios, sorted."""
+        return tuple(row["token"] for row in self.rows if row["verdict"] == ACCEPTED)
+
+    @property
+    def rejected(self) -> tuple[Mapping[str, Any], ...]:
+        """Rows of the scenarios that were dropped or could not be driven."""
+        return tuple(row for row in self.rows if row["verdict"] != ACCEPTED)
+
+    def counts(self) -> dict[str, int]:
+        """How many scenarios there are by verdict, and how many break each rule."""
+        out = {name: 0 for name in (ACCEPTED, DROPPED, FAILED)}
+        out |= {name: 0 for name in (COLLISION, AREA, STANDING, OFF_ROUTE)}
+        for row in self.rows:
+            out[row["verdict"]] += 1
+            for reason in row["reason"].split(", ") if row["verdict"] == DROPPED else ():
+                out[reason] += 1
+        return out
+
+
+@dataclass
+class Playback:
+    """Judges one scenario after the other.
+
+    Attributes:
+        store: Folder of the store.
+        config: What a scenario must satisfy.
+    """
+
+    store: Path
+    config: FilterConfig
+    _open: Any = field(default=None, init=False)
+
+    def __call__(self, token: str) -> TaskResult:
+        """The verdict, as the scores of the result."""
+        return attempt(Task("log-playback", "none", 0, token), partial(self._judge, token))
+
+    def _judge(self, token: str, seconds: dict[str, float], result: TaskResult) -> TaskResult:
+        if self._open is None:
+            self._open = open_store(self.store)
+        return replace(result, scores=judge_scenario(self._open.read(token), self.config))
+
+
+def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
+    """Drive a scenario as it was recorded, and say whether it is fit for use.
+
+    Returns:
+        The row of the verdict.
+    """
+    log = simulate(scenario, None, controller="log-playback")
+    result = compute_metrics(log, scenario.map, thresholds=config.thresholds)
+    centers = center_poses(log.expert_ego[:, :3])
+    path = float(np.hypot(*np.diff(centers[:, :2], axis=0).T).sum())
+    progress = next(s.value for s in result.statistics if s.name == _PROGRESS)
+    rows = {row.metric: row for row in result.rows}
+    broken = []
+    if rows[_COLLISIONS].score != 1.0:
+        broken.append(COLLISION)
+    if rows[_DRIVABLE].score != 1.0:
+        broken.append(AREA)
+    if path < config.min_path_m:
+        broken.append(STANDING)
+    elif progress < config.min_progress_share * path:
+        broken.append(OFF_ROUTE)
+    return {
+        "token": scenario.token,
+        "verdict": DROPPED if broken else ACCEPTED,
+        "reason": ", ".join(broken),
+        "no_at_fault_collisions": rows[_COLLISIONS].score,
+        "drivable_area_compliance": rows[_DRIVABLE].score,
+        "max_outside_m": rows[_DRIVABLE].value,
+        "path_m": path,
+        "progress_m": progress,
+        **_first_violation(result, int(log.time_us[0])),
+    }
+
+
+def _first_violation(result: MetricResult, start_us: int) -> dict[str, Any]:
+    by_metric = {row.metric: row.violation for row in result.rows if row.score != 1.0}
+    found = [v for name in (_COLLISIONS, _DRIVABLE) if (v := by_metric.get(name)) is not None]
+    return {
+        "partner_token": next((v.partner for v in found if v.partner is not None), None),
+        "first_violation_s": (found[0].time_us - start_us) * 1e-6 if found else None,
+    }
+
+
+def filter_store(
+    store: str | Path,
+    config: FilterConfig | None = None,
+    *,
+    workers: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Verdicts:
+    """Judge every scenario of a store and write the verdicts into it.
+
+    A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
+    settings on the same scenarios are kept. The file has the same bytes for any number of workers.
+
+    Args:
+        store: Folder of the store.
+        config: What a scenario must satisfy; the values of the benchmark where None.
+        workers: Worker processes; 0 chooses from the cores.
+        on_progress: Called with scenarios judged and scenarios in all.
+
+    Raises:
+        DataError: There is no store, or it is damaged.
+    """
+    path, config = Path(store), config or FilterConfig()
+    opened = open_store(path)
+    conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
+    done = {
+        row["token"]: row
+        for row in (*_finished(path, conditions), *_unfinished(path, conditions))
+        if row["verdict"] != FAILED
+    }
+    waiting = [token for token in opened.tokens if token not in done]
+    on_progress(len(done), len(opened))
+    if waiting:
+        number = max(1, min(workers or default_workers(), len(waiting)))
+        for row in _judged(path, conditions, config, waiting, number):
+            done[row["token"]] = row
+            on_progress(len(done), len(opened))
+    rows = [done[token] for token in opened.tokens]
+    _write(path, rows, conditions)
+    (path / _UNFINISHED).unlink(missing_ok=True)
+    return _read(path)
+
+
+def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[str, Any]:
+    """Everything that verdicts depend on, and a digest of it."""
+    out = {
+        "config": asdict(config),
+        "thresholds": asdict(thresholds_of(config.thresholds)),
+        "metric_version": METRIC_VERSION,
+        "store": store_hash,
+    }
+    if route_hash:  # corrected in the review
+        out["routes"] = route_hash
+    text = json.dumps(out, sort_keys=True)
+    return out | {"hash": hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}
+
+
+def _judged(
+    path: Path,
+    conditions: Mapping[str, Any],
+    config: FilterConfig,
+    tokens: Iterable[str],
+    workers: int,
+) -> Iterator[dict[str, Any]]:
+    """Judge scenarios; each verdict is on disk before it is yielded."""
+    make = partial(Playback, path.resolve(), config)
+    unfinished = path / _UNFINISHED
+    unfinished.parent.mkdir(exist_ok=True)
+    kept = list(_unfinished(path, conditions))  # without a line that was cut off
+    with unfinished.open("w", encoding="utf-8") as file:
+        for row in (conditions, *kept):
+            file.write(json.dumps(row) + "\n")
+        outcomes = map_unordered(make, tokens, workers=workers, alone=1)
+        with closing(outcomes):
+            for outcome in outcomes:
+                row = _row(outcome.task, outcome.result, outcome.death)
+                file.write(json.dumps(row) + "\n")
+                file.flush()
+                yield row
+
+
+def _row(token: str, result: TaskResult | None, death: str) -> dict[str, Any]:
+    if result is not None and result.status == "ok":
+        return result.scores
+    reason = death if result is None else result.error
+    return dict.fromkeys(_SCHEMA.names) | {"token": token, "verdict": FAILED, "reason": reason}
+
+
+def _unfinished(store: Path, conditions: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Verdicts of an interrupted filter with the same conditions."""
+    path = store / _UNFINISHED
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as file:
+        if _json(next(file, "")) != conditions:
+            return
+        for line in file:
+            row = _json(line)
+            if isinstance(row, dict) and set(row) == set(_SCHEMA.names):
+                yield row
+
+
+def _json(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None  # the last line of a killed filter may be cut off
+
+
+def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    if not (store / VERDICTS).is_file():
+        return ()
+    try:
+        found = _read(store)
+    except DataError:
+        return ()  # it is written anew
+    same = Table(found.path, _SCHEMA).footer.get("hash") == conditions["hash"]
+    return found.rows if same else ()
+
+
+def _write(store: Path, rows: Iterable[Mapping[str, Any]], conditions: Mapping[str, Any]) -> None:
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=_SCHEMA)
+    write_blocks(store / VERDICTS, [table], conditions)
+
+
+def _read(store: Path) -> Verdicts:
+    path = store / VERDICTS
+    table = Table(path, _SCHEMA)
+    config = table.footer.get("config")
+    if not isinstance(config, dict):
+        raise DataError(f"{path}: the footer has no 'config'", hint=f"shiftsim filter {store}")
+    return Verdicts(path, tuple(table.read().to_pylist()), digest(path), config)
+
+
+def read_verdicts(store: str | Path, store_hash: str) -> Verdicts | None:
+    """The verdicts of a store; None where it was not filtered.
+
+    Args:
+        store: Folder of the store.
+        store_hash: Its content hash.
+
+    Raises:
+        DataError: The file is damaged, or of another content of the store.
+    """
+    path = Path(store)
+    if not (path / VERDICTS).is_file():
+        return None
+    found = _read(path)
+    if Table(found.path, _SCHEMA).footer.get("store") != store_hash:
+        raise DataError(
+            f"{found.path}: the verdicts are of another content of the store",
+            hint=f"shiftsim filter {path}, or --all to use every scenario",
+        )
+    return found

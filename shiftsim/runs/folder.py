@@ -1,0 +1,268 @@
+"""Writing a run folder: results go to a journal one by one, the tables are made at the end.
+
+`finish` writes the rollouts of the journal into Parquet files, and reads its lines in the order of
+the tables, both one by one, so that memory does not grow with the run.
+"""
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.runs.journal import Journal, Line, whole_file
+from shiftsim.runs.results import (
+    MISSING,
+    OK,
+    PLACE,
+    STATUSES,
+    TABLES,
+    TEXTS,
+    Run,
+    TaskResult,
+    open_run,
+)
+from shiftsim.runs.rollout_files import (
+    FOLDER,
+    PartWriter,
+    Place,
+    RolloutReader,
+    next_number,
+    num_rows,
+    part_name,
+    without_key,
+)
+from shiftsim.runs.rollouts import Task
+
+WRITE_OPTIONS: dict[str, Any] = {
+    "compression": "zstd",
+    "compression_level": 3,
+    "version": "2.6",
+    "data_page_version": "1.0",
+    "use_dictionary": True,
+    "write_statistics": True,
+}
+ROW_GROUP = 1 << 16  # rows
+_CHUNK = 256  # results turned into tables at once
+
+
+class RunWriter:
+    """The folder of a run under way.
+
+    Attributes:
+        path: The folder.
+        rollouts: The folder of its rollouts.
+    """
+
+    def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
+        """Begin a run, or go on with one.
+
+        Args:
+            path: Its folder.
+            manifest: Says what the run is; written as `running`, unless a complete run is there,
+                which stays as it is until this one has finished as well.
+            resume: Keep what is finished.
+
+        Raises:
+            ConfigError: Another process works on this folder.
+        """
+        self.path = path
+        self.rollouts = path / FOLDER
+        path.mkdir(parents=True, exist_ok=True)
+        self._journal = Journal(path, resume=resume)
+        if not _is_complete(path):
+            self._write_manifest(manifest | {"state": "running", "counts": {}})
+        self.rollouts.mkdir(exist_ok=True)
+        self._number = next_number(self.rollouts)  # of the next file that is linked to
+        self._linked: dict[Path, str] = {}
+
+    @property
+    def ended(self) -> Mapping[Task, Line]:
+        """What has ended so far, in an earlier attempt included."""
+        return self._journal.lines
+
+    def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
+        """Put one result on disk.
+
+        Args:
+            result: The result.
+            stored: Where its rollout is, if another run has it already.
+        """
+        place = (self._link(stored.file), stored.row, stored.rows) if stored else ()
+        self._journal.add(result, place)
+
+    def _link(self, file: Path) -> str:
+        """Have a file of another run in this one, too; returns its name here."""
+        if file not in self._linked:
+            name = part_name(self._number)
+            _link(file, self.rollouts / name)
+            self._linked[file], self._number = name, self._number + 1
+        return self._linked[file]
+
+    def finish(
+        self,
+        manifest: dict[str, Any],
+        expected: Iterable[Task],
+        absent: Callable[[Task], str] = lambda task: "the run was interrupted",
+    ) -> Run:
+        """Write tables and manifest.
+
+        Args:
+            manifest: The manifest; its `counts` are filled in.
+            expected: All tasks of a complete run.
+            absent: Why a task has no result.
+        """
+        counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
+        tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
+        try:
+            places = _write_rollouts(self.rollouts, self._journal)
+            tasks = iter(sorted(expected))
+            while chunk := list(islice(tasks, _CHUNK)):
+                rows = [self._values(task, places.get(task), absent) for task in chunk]
+                for values in rows:
+                    counts["expected"] += 1
+                    counts[values["status"]] += 1
+                for table, content in zip(tables, _contents(chunk, rows), strict=True):
+                    table.add(content)
+            for table in tables:
+                table.close()
+        finally:
+            for table in tables:
+                table.discard()
+        self._write_manifest({**manifest, "counts": counts})
+        self._journal.remove()  # what it points to is needed until then
+        used = {place.file for place in places.values()}
+        for path in self.rollouts.iterdir():
+            if path not in used:
+                path.unlink()
+        return open_run(self.path)
+
+    def close(self) -> None:
+        """Let another process work on the folder."""
+        self._journal.close()
+
+    def _values(
+        self, task: Task, place: Place | None, absent: Callable[[Task], str]
+    ) -> dict[str, Any]:
+        """What the tables say of a task beyond its key."""
+        line = self.ended.get(task)
+        if line is None:
+            texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
+            return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
+        columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
+        return {**self._journal.read(line), **dict(zip(PLACE, columns, strict=True))}
+
+    def _write_manifest(self, manifest: dict[str, Any]) -> None:
+        with whole_file(self.path / "manifest.json") as partial:
+            partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _write_rollouts(folder: Path, journal: Journal) -> dict[Task, Place]:
+    """Put the rollouts of a run that ends into files, those of a scenario together.
+
+    A file from an earlier attempt stays as it is, unless some of its rollouts have been made again:
+    then the others move.
+
+    Returns:
+        Where they are.
+    """
+    lines = {task: line for task, line in journal.lines.items() if line.rollout}
+    kept: Counter[str] = Counter()
+    for line in lines.values():
+        if line.has_place:
+            name, _, rows = line.rollout
+            kept[name] += rows
+    whole = {name for name, rows in kept.items() if rows == num_rows(folder / name)}
+    places: dict[Task, Place] = {}
+    writer, reader = PartWriter(folder), RolloutReader()
+    try:
+        for task in sorted(lines, key=lambda task: (task.token, task)):
+            line = lines[task]
+            if line.has_place:
+                name, row, rows = line.rollout
+                place = Place(folder / name, row, rows)
+                if name not in whole:
+                    place = writer.add(task, without_key(reader.read(place)))
+            else:
+                place = writer.add(task, journal.rollout(line))
+            places[task] = place
+        writer.close()
+    finally:
+        writer.discard()
+    return places
+
+
+def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
+    """Rows of the tables, in the order of `TABLES`."""
+    names = (*TEXTS, *PLACE)
+    keyed = [(task._asdict(), row) for task, row in zip(tasks, values, strict=True)]
+    done = [(key, row) for key, row in keyed if row["status"] == OK]
+    return (
+        [{**key, **{name: row[name] for name in names}, **row["seconds"]} for key, row in keyed],
+        [{**key, **row["scores"]} for key, row in done],
+        [{**key, **metric} for key, row in done for metric in row["metrics"]],
+    )
+
+
+class _SortedTable:
+    """A table that grows at its end; the file is there when it is closed, and not before.
+
+    Row groups are cut at fixed places whatever the pieces were.
+    """
+
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        self.path, self.schema = path, schema
+        self._partial = path.with_name(f".{path.name}.tmp")
+        self._writer = pq.ParquetWriter(self._partial, schema, **WRITE_OPTIONS)
+        self._pending = schema.empty_table()
+
+    def add(self, rows: list[dict[str, Any]]) -> None:
+        self.add_table(pa.Table.from_pylist(rows, self.schema))
+
+    def add_table(self, table: pa.Table) -> None:
+        self._pending = pa.concat_tables([self._pending, table])
+        while len(self._pending) >= ROW_GROUP:
+            self._write(ROW_GROUP)
+
+    def _write(self, count: int) -> None:
+        group = self._pending.slice(0, count).combine_chunks()
+        self._writer.write_table(group, row_group_size=ROW_GROUP)
+        self._pending = self._pending.slice(count)
+
+    def close(self) -> None:
+        self._write(len(self._pending))
+        self._writer.close()
+        self._partial.replace(self.path)
+
+    def discard(self) -> None:
+        """Remove what is not finished."""
+        with suppress(OSError):
+            self._writer.close()
+        self._partial.unlink(missing_ok=True)
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file once more, without its bytes where the disk can do that."""
+    if target.exists() and target.samefile(source):
+        return
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        with whole_file(target) as partial:
+            shutil.copyfile(source, partial)
+
+
+def _is_complete(path: Path) -> bool:
+    try:
+        return open_run(path).is_complete
+    except (ConfigError, DataError):
+        return False

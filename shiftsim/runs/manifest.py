@@ -1,0 +1,114 @@
+"""The manifest of a run: how its results were made."""
+
+import hashlib
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import shiftsim
+from shiftsim.runs.config import RunConfig
+from shiftsim.runs.results import FORMAT_VERSION
+
+_PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
+# what computes a result: a task, and everything that may be named by a setting
+_ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
+_IMPORT = re.compile(
+    r"^ *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))",
+    re.MULTILINE,
+)
+
+
+def make_manifest(
+    folder: Path,
+    *,
+    config: RunConfig,
+    split: str,
+    store: str,
+    determining: dict[str, Any],
+    argv: Sequence[str],
+) -> dict[str, Any]:
+    """What a run folder says about how its results were made; state and counts come later."""
+    return {
+        "format": FORMAT_VERSION,
+        "run": folder.name,
+        "state": "running",
+        "argv": list(argv),
+        "config": replace(config, resume=False, retry_failed=False).to_dict(),
+        "split": split,
+        "shard": config.shard,
+        "store": store,
+        "counts": {},
+        "determining": determining,
+        "started": now(),
+        "versions": versions(),
+        "machine": {
+            "system": platform.platform(),
+            "processor": platform.machine(),
+            "cores": os.cpu_count(),
+        },
+        "git": _git_state(),
+    }
+
+
+def now() -> str:
+    """The time, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@cache
+def code_digest() -> str:
+    """Digest of all sources that results depend on: two versions of them are not mixed."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, source in sorted(_sources().items()):
+        digest.update(f"{name}\n".encode() + source)
+    return digest.hexdigest()
+
+
+def _sources() -> dict[str, bytes]:
+    """The modules of `_ROOTS` and all that they import, one from the other, by path."""
+    root = Path(shiftsim.__file__).parent
+    waiting = [path for pattern in _ROOTS for path in root.glob(pattern)]
+    found: dict[str, bytes] = {}
+    while waiting:
+        path = waiting.pop()
+        name = path.relative_to(root).as_posix()
+        if name in found:
+            continue
+        found[name] = path.read_bytes()
+        for module, block, line, plain in _IMPORT.findall(found[name].decode()):
+            place = root.joinpath(*(module or plain).split("."))
+            names = re.findall(r"\w+", block + line)
+            tried = [place, *(place / name for name in names)]
+            files = [file for at in tried for file in (at.with_suffix(".py"), at / "__init__.py")]
+            waiting += [file for file in files if file.is_file()]
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, shiftsim and the packages that results could depend on."""
+    out = {"shiftsim": shiftsim.__version__, "python": sys.version.split()[0]}
+    for name in _PACKAGES:
+        try:
+            out[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return out
+
+
+def _git_state() -> str:
+    """Commit of the checkout that shiftsim runs from, empty when it is none."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()

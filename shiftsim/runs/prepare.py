@@ -1,0 +1,392 @@
+"""Everything that is checked before the first simulated step of a run.
+
+What was checked is what is run: `prepare` resolves the settings to units of work, which
+`shiftsim.runs.execute` then does.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import shiftsim
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.runs.config import (
+    DEFAULT_STORE,
+    RunConfig,
+    Value,
+    default_workers,
+    one_of,
+    parse_shard,
+    store_path,
+)
+from shiftsim.runs.filter import Verdicts, read_verdicts
+from shiftsim.runs.manifest import code_digest
+from shiftsim.runs.planners import PlannerEntry, can_travel, planner_entry, takes_argument
+from shiftsim.runs.resume import State, check_resumable, check_room, check_target
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.splits import find_split, token_hash
+from shiftsim.runs.task import TaskRunner, Unit
+from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+from shiftsim.sim.traffic import make_traffic, traffic_name
+
+RUNS = Path("runs")
+_MAX_NAME = 40  # characters of one part of a run's name
+_MEMORY_OF_NETWORK = 1.5e9  # bytes per worker
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that has been checked and can start.
+
+    Attributes:
+        config: The settings, names resolved.
+        runner: Does one unit of tasks.
+        units: All tasks whose scenario exists, as they are handed out.
+        missing: Tasks whose scenario the store does not hold.
+        split: Name of the split.
+        tokens: All scenarios of the run, whatever the shard.
+        determining: Everything that the scores depend on.
+        folder: Where the run folder will be.
+        before: What it holds now.
+        workers: Number of worker processes.
+        num_dropped: Scenarios left out because the filter dropped them.
+    """
+
+    config: RunConfig
+    runner: TaskRunner
+    units: tuple[Unit, ...]
+    missing: tuple[Task, ...]
+    split: str
+    tokens: tuple[str, ...]
+    determining: dict[str, Any]
+    folder: Path
+    before: State
+    workers: int
+    num_dropped: int = 0
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """All tasks whose scenario exists."""
+        return tuple(task for unit in self.units for task in unit)
+
+    @property
+    def num_expected(self) -> int:
+        """Tasks that a complete run has."""
+        return len(self.tasks) + len(self.missing)
+
+    @property
+    def resumes(self) -> bool:
+        """Whether what is finished is kept."""
+        return self.config.resume or self.config.retry_failed
+
+
+def open_named_store(name: str) -> Any:
+    """A store by name, path or URL; the demo store is made when it is not there yet."""
+    from shiftsim.data.store.reading import open_store
+
+    if "://" in name:
+        return open_store(name)
+    path = store_path(name)
+    if name == DEFAULT_STORE and not path.exists():
+        from shiftsim.data.demo.store import demo_store
+
+        path = demo_store(path)
+    if not path.exists():
+        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
+        raise DataError(
+            f"no store {name!r} at {str(path)!r}",
+            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
+        )
+    return open_store(path)
+
+
+def prepare(
+    config: RunConfig,
+    *,
+    planners: Sequence[Any] = (),
+    noises: Sequence[NoiseModel] = (),
+) -> Prepared:
+    """Resolve every name and check everything that a run needs.
+
+    Args:
+        config: The settings; `planners` and `noise` name what the next two hold, if given.
+        planners: Classes or instances that take the place of the names.
+        noises: Noise models that take the place of the names.
+
+    Raises:
+        ShiftsimError: Something is unknown, missing or contradictory.
+    """
+    models = list(noises) or [parse_noise(name) for name in _expanded(config.noise)]
+    config = replace(
+        config,
+        noise=tuple(model.name for model in models),
+        traffic=traffic_name(config.traffic),
+    )
+    _check_traffic(config.traffic)
+    thresholds = asdict(thresholds_of(config.thresholds))
+    for metric in config.metrics:
+        load_metric(metric)
+    entries = _entries(config, planners or config.planners)
+    store = open_named_store(config.store)
+    split, present, lacking, dropped, determining = _scenarios(config, store)
+    determining |= _determining(config, entries, models, thresholds)
+    folder = Path(config.out) if config.out else RUNS / run_name(config, split, determining)
+    before = _check_folder(config, folder, determining)
+    runner = TaskRunner(
+        store.source,
+        {entry.name: entry for entry in entries},
+        {model.name: model for model in models},
+        config.traffic,
+        config.controller,
+        config.thresholds,
+        config.metrics,
+        config.save_rollouts,
+        config.strict,
+    )
+    tasks = list(_tasks(entries, models, config.seeds, present))
+    units = _of_shard(config.shard, _units(entries, tasks, config.batch_size))
+    if before == "new":
+        count = sum(map(len, units))
+        check_room(folder, count, with_rollouts=config.save_rollouts == "all")
+    missing: list[Unit] = [(task,) for task in _tasks(entries, models, config.seeds, lacking)]
+    return Prepared(
+        config,
+        runner,
+        tuple(_leading_first(units)),
+        tuple(task for (task,) in _of_shard(config.shard, missing)),
+        split,
+        (*present, *lacking),
+        determining,
+        folder,
+        before,
+        _workers(config, entries, len(units)),
+        dropped,
+    )
+
+
+def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
+    checkpoints = _checkpoints(config, sources)
+    entries = []
+    for name, source in zip(config.planners, sources, strict=True):
+        arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
+        if name in checkpoints:
+            arguments["checkpoint"] = checkpoints[name]
+        if takes_argument(source, "device"):
+            arguments.setdefault("device", config.device)
+        entries.append(planner_entry(source, arguments))
+    return entries
+
+
+def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
+    """Checkpoint by planner."""
+    named = zip(config.planners, sources, strict=True)
+    takers = [name for name, source in named if takes_argument(source, "checkpoint")]
+    out: dict[str, str] = {}
+    for text in config.checkpoints:
+        name, equals, path = text.partition("=")
+        if not equals or name not in config.planners:
+            name, path = (takers[0], text) if len(takers) == 1 else ("", text)
+        if not name:
+            raise ConfigError(
+                f"checkpoint {text!r} does not say which planner is meant",
+                hint=f"write PLANNER={path}; planners with one: {', '.join(takers) or 'none'}",
+            )
+        one_of("planner with a checkpoint", name, takers)
+        if name in out:
+            raise ConfigError(f"planner {name!r} has two checkpoints: {out[name]!r} and {path!r}")
+        out[name] = path
+    return out
+
+
+def _scenarios(
+    config: RunConfig, store: Any
+) -> tuple[str, list[str], list[str], int, dict[str, Any]]:
+    """Name of the split, tokens found and lacking, number dropped, and what identifies them."""
+    known = tuple(store.tokens)
+    verdicts = _verdicts(config, store)
+    usable = known if verdicts is None else verdicts.accepted
+    if not config.all_scenarios and config.split in ("", store.path.name):
+        usable = store.reviews.usable(known, usable)
+    split = find_split(config.split, Path(store.path), usable)
+    chosen = split.tokens[: config.limit] if config.limit else split.tokens
+    lacking = sorted(set(chosen) - set(known))
+    if lacking and not config.allow_partial:
+        raise DataError(
+            f"split {split.name!r} needs {len(chosen)} scenarios, store {config.store!r} "
+            f"lacks {len(lacking)} of them, such as {lacking[0]!r}",
+            hint="convert the missing scenarios, or --allow-partial",
+        )
+    if len(lacking) == len(chosen):
+        raise DataError(
+            f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
+            hint="name the store that was converted for this split",
+        )
+    absent = set(lacking)
+    present = [token for token in chosen if token not in absent]
+    determining = {"store": store.hash, "tokens": token_hash(chosen)}
+    if verdicts is not None:
+        determining["filter"] = verdicts.hash
+    if store.reviews.hash:
+        determining["review"] = store.reviews.hash
+    return split.name, present, lacking, len(known) - len(usable), determining
+
+
+def _verdicts(config: RunConfig, store: Any) -> Verdicts | None:
+    """The verdicts that decide which scenarios of a whole store are run.
+
+    A split names its scenarios itself.
+    """
+    if config.all_scenarios or config.split not in ("", store.path.name):
+        return None
+    found = read_verdicts(store.path, store.hash)
+    if found is not None and not found.accepted:
+        raise DataError(
+            f"store {config.store!r}: the filter dropped all {len(found.rows)} scenarios",
+            hint="`shiftsim filter` says why; --all to use them nevertheless",
+        )
+    return found
+
+
+def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) -> State:
+    before = check_target(folder, determining, shard=config.shard)
+    if config.resume or config.retry_failed:
+        if before == "new" and not config.out:
+            check_resumable(folder, determining, shard=config.shard)
+    elif before == "unfinished":
+        raise ConfigError(
+            f"{str(folder)!r} holds an unfinished run with these settings",
+            hint="--resume finishes it; remove the folder to begin anew",
+        )
+    return before
+
+
+def _workers(config: RunConfig, entries: Sequence[PlannerEntry], num_units: int) -> int:
+    """Number of worker processes; 1 for planners that cannot be sent to another process."""
+    stuck = [entry.name for entry in entries if not can_travel(entry)]
+    if stuck and (config.timeout or config.executor != "processes"):
+        raise ConfigError(
+            f"planner {stuck[0]!r} cannot be sent to a worker process, as a timeout or a cluster "
+            "needs it",
+            hint="put its class into a module of its own, beside the main script",
+        )
+    memory = max([_MEMORY_OF_NETWORK for entry in entries if entry.in_batches], default=0.0)
+    workers = config.workers or (default_workers(memory) if memory else default_workers())
+    return 1 if stuck else max(1, min(workers, num_units))
+
+
+def _expanded(names: Iterable[str]) -> list[str]:
+    """`all` stands for the seven of the benchmark."""
+    out = [name for given in names for name in (NOISE_NAMES if given == "all" else (given,))]
+    return list(dict.fromkeys(out))
+
+
+def _check_traffic(name: str) -> None:
+    try:
+        make_traffic(name)
+    except (ImportError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"traffic {name!r} is not available: {error}", hint="use --traffic nonreactive"
+        ) from error
+
+
+def _tasks(
+    entries: Iterable[PlannerEntry],
+    models: Iterable[NoiseModel],
+    seeds: Iterable[int],
+    tokens: Iterable[str],
+) -> Iterator[Task]:
+    """All tasks, scenario by scenario, so that a worker can often reuse the one it has read."""
+    runs = [
+        (entry.name, model.name, seed)
+        for entry in entries
+        for model in models
+        for seed in ((0,) if model.kind == "none" else seeds)
+    ]
+    return (Task(*run, token) for token in tokens for run in runs)
+
+
+def _units(entries: Iterable[PlannerEntry], tasks: list[Task], size: int) -> list[Unit]:
+    """The tasks, those of a planner that answers in batches grouped.
+
+    The groups depend on the whole run only, not on workers, shards or what is finished already. The
+    first is a single task: other workers wait until it has compiled the planner's kernels.
+    """
+    batched = {entry.name for entry in entries if entry.in_batches}
+    units: list[Unit] = [(task,) for task in tasks if task.planner not in batched]
+    for name in sorted(batched):
+        own = [task for task in tasks if task.planner == name]
+        units += [tuple(own[:1]), *(tuple(own[i : i + size]) for i in range(1, len(own), size))]
+    return units
+
+
+def _of_shard(shard: str, units: list[Unit]) -> list[Unit]:
+    """The units of a shard: by the hash of their first task, so no shard needs to know another."""
+    if not shard:
+        return units
+    number, count = parse_shard(shard)
+
+    def bucket(task: Task) -> int:
+        digest = hashlib.blake2b(repr(tuple(task)).encode(), digest_size=8).digest()
+        return int.from_bytes(digest, "little") % count
+
+    return [unit for unit in units if bucket(unit[0]) == number - 1]
+
+
+def _leading_first(units: list[Unit]) -> list[Unit]:
+    """One unit per planner to the front: they compile all the kernels."""
+    leading: dict[str, Unit] = {}
+    for unit in units:
+        leading.setdefault(unit[0].planner, unit)
+    first = list(leading.values())
+    chosen = set(first)
+    return first + [unit for unit in units if unit not in chosen]
+
+
+def _determining(
+    config: RunConfig,
+    entries: Sequence[PlannerEntry],
+    models: Sequence[NoiseModel],
+    thresholds: dict[str, Any],
+) -> dict[str, Any]:
+    """Everything else that the scores depend on, as JSON values."""
+    noisy = any(model.kind != "none" for model in models)
+    fields = {
+        "shiftsim": shiftsim.__version__,
+        "code": code_digest(),
+        "metric_version": METRIC_VERSION,
+        "planners": {entry.name: dict(entry.fingerprint) for entry in entries},
+        "noise": {model.name: _noise_fields(model) for model in models},
+        "seeds": sorted(config.seeds) if noisy else [0],
+        "traffic": config.traffic,
+        "controller": config.controller,
+        "thresholds": thresholds,
+        "metrics": sorted(config.metrics),
+        "strict": config.strict,
+        "batch_size": config.batch_size if any(entry.in_batches for entry in entries) else 1,
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(fields, sort_keys=True, default=str))
+    return plain
+
+
+def _noise_fields(model: NoiseModel) -> dict[str, Any]:
+    out = {name: getattr(model, name) for name in ("kind", "sigma_accel", "sigma_rate", "theta")}
+    return out | {"function": model.name if model.function is not None else None}
+
+
+def run_name(config: RunConfig, split: str, determining: dict[str, Any]) -> str:
+    """Name of a run's folder: the same settings on the same data give the same name."""
+    text = json.dumps(determining, sort_keys=True)
+    digest = hashlib.blake2b(text.encode(), digest_size=2).hexdigest()
+    planners = _joined(config.planners, "planners")
+    name = f"{planners}_{_joined(config.noise, 'noises')}_{_joined((split,), 'split')}_{digest}"
+    return f"{name}.{config.shard.replace('/', '-of-')}" if config.shard else name
+
+
+def _joined(names: Sequence[str], what: str) -> str:
+    text = "+".join(re.sub(r"[^A-Za-z0-9.-]+", "-", name) for name in names)
+    return text if len(text) <= _MAX_NAME else f"{len(names)}-{what}"

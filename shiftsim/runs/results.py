@@ -1,0 +1,316 @@
+"""The run folder: tables and rollouts on disk, and reading all of it back (ux.md §5).
+
+`scores.parquet` and `metrics.parquet` hold nothing but results, sorted by task and written with
+fixed settings, so that the same run gives the same bytes for any number of workers and any order.
+Timings are in `tasks.parquet`.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.runs.rollout_files import FOLDER, Place, RolloutReader
+from shiftsim.runs.rollouts import Task, complete_rollout, describe
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.scenario import Scenario
+
+FORMAT_VERSION = 4
+OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
+
+_KEY = [
+    ("planner", pa.string()),
+    ("noise", pa.string()),
+    ("seed", pa.int64()),
+    ("token", pa.string()),
+]
+_PROFILE = [("thresholds", pa.string()), ("metric_version", pa.string())]
+TASKS_SCHEMA = pa.schema(
+    [
+        *_KEY,
+        ("scenario_type", pa.string()),
+        ("status", pa.string()),
+        ("error", pa.string()),
+        ("hint", pa.string()),
+        ("traceback", pa.string()),
+        ("read_seconds", pa.float64()),
+        ("simulate_seconds", pa.float64()),
+        ("planner_seconds", pa.float64()),
+        ("planning_ms_mean", pa.float64()),
+        ("planning_ms_p95", pa.float64()),
+        ("metrics_seconds", pa.float64()),
+        ("rollout", pa.string()),  # file below rollouts/
+        ("rollout_row", pa.int64()),
+        ("rollout_rows", pa.int64()),
+    ]
+)
+PLACE = ("rollout", "rollout_row", "rollout_rows")
+TEXTS = ("status", "scenario_type", "error", "hint", "traceback")
+_DURATIONS = [n for n in TASKS_SCHEMA.names if n.endswith("_seconds") or "_ms_" in n]
+SCORES_SCHEMA = pa.schema(
+    [
+        *_KEY,
+        ("scenario_type", pa.string()),
+        ("city", pa.string()),
+        ("log_name", pa.string()),
+        ("traffic", pa.string()),
+        ("cls", pa.float64()),
+        *((name, pa.float64()) for name in SHORT_NAMES if name != "score"),
+        ("degraded_steps", pa.int64()),
+        *_PROFILE,
+    ]
+)
+METRICS_SCHEMA = pa.schema(
+    [
+        *_KEY,
+        ("metric", pa.string()),
+        ("value", pa.float64()),
+        ("unit", pa.string()),
+        ("threshold", pa.float64()),
+        ("score", pa.float64()),
+        ("first_violation_iteration", pa.int64()),
+        ("first_violation_time_us", pa.int64()),
+        ("first_violation_s", pa.float64()),
+        ("first_violation_value", pa.float64()),
+        ("partner_token", pa.string()),
+        *_PROFILE,
+    ]
+)
+TABLES = {"tasks": TASKS_SCHEMA, "scores": SCORES_SCHEMA, "metrics": METRICS_SCHEMA}
+
+
+@dataclass(frozen=True, slots=True)
+class TaskResult:
+    """What became of one task.
+
+    Attributes:
+        task: The task.
+        status: One of `STATUSES`.
+        scenario_type: Type of the scenario, where it could be read.
+        error: What went wrong, empty for `ok`.
+        hint: What to do about it.
+        traceback: Where it went wrong.
+        seconds: Durations by column name of `tasks.parquet` [s], or [ms] where the name says so.
+        scores: The row of `scores.parquet` beyond the key; empty unless `ok`.
+        metrics: The rows of `metrics.parquet` beyond the key.
+        rollout: The rollout, encoded; empty when it is not to be stored.
+    """
+
+    task: Task
+    status: str
+    scenario_type: str = ""
+    error: str = ""
+    hint: str = ""
+    traceback: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+    scores: dict[str, Any] = field(default_factory=dict)
+    metrics: list[dict[str, Any]] = field(default_factory=list)
+    rollout: bytes = b""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run on disk.
+
+    Attributes:
+        path: Its folder.
+        manifest: Everything the run depended on, and its counts.
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+
+    @cached_property
+    def scores(self) -> pa.Table:
+        """One row per finished task: closed-loop score and metric scores."""
+        return _read(self.path / "scores.parquet")
+
+    @cached_property
+    def metrics(self) -> pa.Table:
+        """One row per finished task and metric: value, threshold, first violation."""
+        return _read(self.path / "metrics.parquet")
+
+    @cached_property
+    def tasks(self) -> pa.Table:
+        """One row per task: status, error, durations."""
+        return _read(self.path / "tasks.parquet")
+
+    @cached_property
+    def rollout_places(self) -> dict[Task, Place | None]:
+        """Where every rollout is stored; None where there is none."""
+        keys, places = (
+            zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
+            for names in (Task._fields, PLACE)
+        )
+        return {
+            Task(*key): stored_place(self.path, *place)
+            for key, place in zip(keys, places, strict=True)
+        }
+
+    def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
+        """One stored rollout.
+
+        Args:
+            task: Which one.
+            scenario: Its scenario, from the store the run was made with.
+
+        Raises:
+            DataError: It was not stored, cannot be read, or the scenario is another one.
+        """
+        return complete_rollout(self.rollout_rows(task), scenario)
+
+    def rollout_rows(self, task: Task) -> pa.RecordBatch:
+        """One stored rollout as it lies on disk, a row per sample.
+
+        Raises:
+            DataError: It was not stored, or cannot be read.
+        """
+        place = self.rollout_places.get(task)
+        if place is None:
+            raise DataError(
+                f"run {self.path.name!r} holds no rollout of {describe(task)}",
+                hint="run again with --save-rollouts all",
+            )
+        return self._reader.read(place)
+
+    @cached_property
+    def _reader(self) -> RolloutReader:
+        return RolloutReader()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every expected task finished."""
+        return bool(self.manifest["counts"]["ok"] == self.manifest["counts"]["expected"])
+
+    def table(self, *, allow_partial: bool = False) -> str:
+        """The score table as text."""
+        from shiftsim.report import score_table
+
+        return score_table([self], allow_partial=allow_partial)
+
+    def worst(self, count: int = 10) -> list[dict[str, Any]]:
+        """The rollouts with the lowest scores: key, `cls` and `reason`."""
+        from shiftsim.report import worst_rollouts
+
+        return worst_rollouts(self, count)
+
+    def view(self, token: str) -> Any:
+        """The replay of one scenario: a page that notebooks show, and that has `.save(path)`.
+
+        Raises:
+            ConfigError: There is no stored rollout of it.
+            DataError: The store of the run is not there.
+        """
+        from shiftsim.runs.bundle import open_run_store
+        from shiftsim.view.build import Gallery
+
+        gallery = Gallery([self], open_run_store(self))
+        return gallery.page(gallery.find(token))
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})\n{self.table()}"
+
+    def _repr_html_(self) -> str:
+        import html
+
+        return f"<pre>{html.escape(self.table())}</pre>"
+
+
+def stored_place(
+    run: Path, rollout: str | None, rollout_row: int, rollout_rows: int
+) -> Place | None:
+    """Where a rollout is, by the columns of `tasks.parquet`."""
+    return Place(run / FOLDER / rollout, rollout_row, rollout_rows) if rollout else None
+
+
+def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
+    """What made the tables of a run, task by task, and where the rollout is.
+
+    A task without a result has none.
+    """
+    scores, metrics = (_by_task(path / f"{name}.parquet") for name in ("scores", "metrics"))
+    for key, (row,) in _by_task(path / "tasks.parquet"):
+        if row["status"] == MISSING:
+            continue
+        done = row["status"] == OK
+        result = TaskResult(
+            Task(*key),
+            **{name: row[name] for name in TEXTS},
+            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
+            scores=next(scores)[1][0] if done else {},
+            metrics=next(metrics)[1] if done else [],
+        )
+        yield result, stored_place(path, *(row[name] for name in PLACE))
+
+
+def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
+    key = itemgetter(*Task._fields)
+    batches = pq.ParquetFile(path).iter_batches(batch_size=4096)
+    rows = (row for batch in batches for row in batch.to_pylist())
+    for found, group in groupby(rows, key):
+        yield found, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]
+
+
+def _read(path: Path) -> pa.Table:
+    try:
+        return pq.ParquetFile(path).read(use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            f"{str(path)!r} cannot be read: {error}", hint="make the run again"
+        ) from error
+
+
+def open_run(path: str | Path) -> Run:
+    """A run folder.
+
+    Raises:
+        ConfigError: There is no such folder.
+        DataError: It is not a run folder, one of another format, or the run is not finished.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ConfigError(f"no run folder {str(folder)!r}", hint=_known_runs(folder.parent))
+    manifest = read_manifest(folder)
+    if manifest["state"] == "running":
+        raise DataError(
+            f"run {str(folder)!r} is not finished, or still under way",
+            hint="the command that started it, with --resume, finishes it",
+        )
+    return Run(folder, manifest)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a run folder, finished or not.
+
+    Raises:
+        DataError: It is not a run folder, or one of another format.
+    """
+    path = folder / "manifest.json"
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        version, _ = manifest["format"], manifest["state"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{str(folder)!r} is not a run folder: manifest.json is missing or broken",
+            hint="name a folder that `shiftsim run` wrote",
+        ) from error
+    if version != FORMAT_VERSION:
+        raise DataError(
+            f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
+            hint="make the run again with this version of shiftsim",
+        )
+    return manifest
+
+
+def _known_runs(parent: Path) -> str:
+    runs = sorted(str(path.parent) for path in parent.glob("*/manifest.json"))
+    return f"there are: {', '.join(runs[:8])}" if runs else "make one with `shiftsim run`"

@@ -1,0 +1,168 @@
+"""Splits: named lists of scenario tokens."""
+
+import difflib
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+
+from shiftsim.errors import ConfigError
+from shiftsim.runs.config import one_of, read_toml
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """A named list of scenario tokens.
+
+    Attributes:
+        name: As in tables and folder names.
+        tokens: The tokens, each once, in the order listed.
+    """
+
+    name: str
+    tokens: tuple[str, ...]
+
+    @property
+    def hash(self) -> str:
+        """Digest of the set of tokens; their order does not matter."""
+        return token_hash(self.tokens)
+
+
+def token_hash(tokens: Iterable[str]) -> str:
+    """Digest of a set of tokens."""
+    return hashlib.blake2b("\n".join(sorted(tokens)).encode(), digest_size=16).hexdigest()
+
+
+def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
+    """The split of a name.
+
+    Args:
+        name: A file (`.toml`, or `.txt` with one token per line), a name below `splits/` of the
+            store, or the store's own name (or nothing) for all its scenarios.
+        store: Folder of the store.
+        tokens: All scenarios of the store.
+
+    Raises:
+        ConfigError: There is no such split, or it contradicts itself.
+    """
+    if name in ("", store.name):
+        return Split(store.name, tokens)
+    path = Path(name)
+    if path.suffix in (".toml", ".txt"):
+        return read_split(path)
+    path = store / "splits" / f"{name}.toml"
+    if path.is_file():
+        return read_split(path)
+    known = sorted([store.name, *(found.stem for found in (store / "splits").glob("*.toml"))])
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ConfigError(
+        f"split {name!r} unknown",
+        hint=f"{hint}available: {', '.join(known)}, or a .toml or .txt file",
+    )
+
+
+def read_split(path: Path) -> Split:
+    """A split from a file: TOML with `tokens`, or text with one token per line.
+
+    Raises:
+        ConfigError: The file cannot be read, names no tokens or a token twice, or its `count` or
+            `hash` says otherwise.
+    """
+    table: dict[str, object] = {}
+    if path.suffix == ".toml":
+        table = read_toml(path)
+        listed = table.get("tokens")
+    else:
+        try:
+            listed = path.read_text().split()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"cannot read split {str(path)!r}: {error}", hint="check the path"
+            ) from error
+    if not isinstance(listed, list) or not listed or not all(isinstance(t, str) for t in listed):
+        raise ConfigError(f"split {str(path)!r} lists no tokens", hint='write tokens = ["…", "…"]')
+    split = Split(str(table.get("name", path.stem)), tuple(listed))
+    if len(set(listed)) < len(listed):
+        twice = next(token for token in listed if listed.count(token) > 1)
+        raise ConfigError(f"split {str(path)!r} lists {twice!r} twice", hint="remove one of them")
+    actual = {"count": len(listed), "hash": split.hash}
+    for name, value in actual.items():
+        if table.get(name, value) != value:
+            raise ConfigError(
+                f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
+                hint="the file was edited or cut off; fetch or write it again",
+            )
+    return split
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted.
+
+    Args:
+        rows: `token`, `type` and `city` of every scenario.
+        usable: Tokens to choose from.
+        wanted: Values by column; none for any.
+        per_type: At most so many of every type, the first ones by token.
+        limit: At most so many in all, the first ones by token.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        lines = [
+            f"name = {json.dumps(split.name)}",
+            f"count = {len(tokens)}",
+            f'hash = "{split.hash}"',
+            "tokens = [",
+            *(f'    "{token}",' for token in tokens),
+            "]",
+        ]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
+    return split

@@ -1,0 +1,1 @@
+"""One rollout: the closed loop, what it asks of planners, noise, dynamics, traffic."""

@@ -1,0 +1,135 @@
+"""Kinematic bicycle model at the rear axle, with nuPlan's low-pass filters on the command.
+
+One forward Euler step: the pose moves with the old speed, heading and steering angle; the yaw rate
+follows from the new ones (nuplan-simulation.md §7). Speed may become negative; only the steering
+angle is limited.
+"""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.world.state import (
+    AX,
+    AY,
+    HEADING,
+    PACIFICA,
+    STEERING,
+    STEERING_RATE,
+    VX,
+    VY,
+    YAW_ACCEL,
+    YAW_RATE,
+    X,
+    Y,
+)
+
+MAX_STEERING = np.pi / 3.0  # rad, nuPlan kinematic bicycle
+ACCEL_TIME_CONSTANT = 0.2  # s, nuPlan kinematic bicycle
+STEERING_TIME_CONSTANT = 0.05  # s, nuPlan kinematic bicycle
+WHEEL_BASE = PACIFICA.wheel_base  # m
+
+
+@lean_kernel
+def step_seconds(now_us: int, next_us: int) -> float:
+    """Seconds from one time stamp to another, for the motion model.
+
+    nuPlan: a difference of time points, so microseconds times 1e-6: 100000 us are
+    0.09999999999999999 s (nuplan-simulation.md §12 Q1).
+    """
+    return (next_us - now_us) * 1e-6
+
+
+@lean_kernel
+def step_bicycle(
+    state: FloatArray,
+    accel: float,
+    steering_rate: float,
+    wheel_base: float,
+    dt: float,
+    out: FloatArray,
+) -> None:
+    """Advance the kinematic bicycle by one Euler step, low-pass filters included.
+
+    Args:
+        state: (11,) columns of `state.STATE_COLUMNS`; vy and ay are ignored.
+        accel: Commanded longitudinal acceleration [m/s^2].
+        steering_rate: Commanded rate of the steering angle [rad/s].
+        wheel_base: Distance between the axles [m].
+        dt: Step [s].
+        out: (11,) receives the next state; heading wrapped to [-pi, pi), vy = ay = 0. May be
+            `state` itself.
+    """
+    heading, speed, steering = state[HEADING], state[VX], state[STEERING]
+    old_accel, old_yaw_rate = state[AX], state[YAW_RATE]
+    new_accel = old_accel + dt / (dt + ACCEL_TIME_CONSTANT) * (accel - old_accel)
+    ideal = steering + dt * steering_rate
+    filtered = steering + dt / (dt + STEERING_TIME_CONSTANT) * (ideal - steering)
+    rate = (filtered - steering) / dt
+
+    new_speed = speed + new_accel * dt
+    # nuPlan: the pose uses the old steering angle, the yaw rate the new one (§12 Q7); the stored
+    # rate is the one before clipping (Q8)
+    new_steering = min(max(steering + rate * dt, -MAX_STEERING), MAX_STEERING)
+    yaw_rate = new_speed * np.tan(new_steering) / wheel_base
+    out[X] = state[X] + speed * np.cos(heading) * dt
+    out[Y] = state[Y] + speed * np.sin(heading) * dt
+    out[HEADING] = wrap_angle(heading + speed * np.tan(steering) / wheel_base * dt)
+    out[VX] = new_speed
+    out[VY] = 0.0
+    out[AX] = new_accel
+    out[AY] = 0.0
+    out[STEERING] = new_steering
+    out[STEERING_RATE] = rate
+    out[YAW_RATE] = yaw_rate
+    out[YAW_ACCEL] = (yaw_rate - old_yaw_rate) / dt
+
+
+@lean_kernel
+def step_bicycles(
+    states: FloatArray,
+    commands: FloatArray,
+    wheel_base: float,
+    dt: float,
+    out: FloatArray,
+) -> None:
+    """Advance P independent vehicles by one step of `step_bicycle`.
+
+    Args:
+        states: (P, 11) columns of `state.STATE_COLUMNS`.
+        commands: (P, 2) acceleration [m/s^2], steering rate [rad/s].
+        wheel_base: Distance between the axles [m].
+        dt: Step [s].
+        out: (P, 11) receives the next states.
+    """
+    for row in range(len(states)):
+        step_bicycle(states[row], commands[row, 0], commands[row, 1], wheel_base, dt, out[row])
+
+
+@lean_kernel
+def command_and_step(
+    now_us: int,
+    next_us: int,
+    state: FloatArray,
+    command: FloatArray,
+    noise_accel: float,
+    noise_rate: float,
+    out_state: FloatArray,
+) -> None:
+    """One step of nuPlan's vehicle for a planner that returns commands: noise, then the model.
+
+    Args:
+        now_us: Time stamp of `state` [us].
+        next_us: Time stamp of the next iteration [us].
+        state: (11,) ego state.
+        command: (2,) clean acceleration [m/s^2] and steering rate [rad/s].
+        noise_accel: Added to the acceleration, unless exactly 0 [m/s^2].
+        noise_rate: Added to the steering rate, unless exactly 0 [rad/s].
+        out_state: (11,) receives the next state.
+    """
+    accel, rate = command[0], command[1]
+    if noise_accel != 0.0:
+        accel += noise_accel
+    if noise_rate != 0.0:
+        rate += noise_rate
+    step_bicycle(state, accel, rate, WHEEL_BASE, step_seconds(now_us, next_us), out_state)

@@ -1,0 +1,389 @@
+"""nuPlan's LQR tracker: trajectory in, command (acceleration, steering rate) out.
+
+The plan is resampled at 0.1 s. Displacements along the heading give a smoothed speed profile,
+heading changes a smoothed curvature profile; the speed one second ahead and the curvatures of the
+next second are the references of two small LQR problems (nuplan-simulation.md §6).
+
+nuPlan fits (initial speed, accelerations) and (initial curvature, curvature rates) by the
+pseudo-inverse of dense normal equations. Here the unknowns are the profiles themselves, which makes
+the same least-squares problems banded:
+
+    sum (d_k - D v_k)^2 + j sum ((v_k+2 - 2 v_k+1 + v_k) / D)^2             pentadiagonal
+    sum (t_k - D v_k c_k)^2 + p c_0^2 + r sum ((c_k+1 - c_k) / D)^2         tridiagonal
+
+with d displacement along the heading, t heading change, v speed, c curvature, D the time step, and
+the penalties j (jerk), r (curvature rate), p (initial curvature). No singular value of nuPlan's
+matrices ever falls below the cut of its pseudo-inverse, so the solutions are the same.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.errors import InvalidTrajectoryError
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
+from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
+from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
+
+INITIAL_CURVATURE_PENALTY = 1e-10  # nuPlan tracker utilities
+MIN_POSES = 3  # of the resampled plan; fewer have no second difference
+
+TRACKED, NOT_COVERED, TOO_SHORT = 0, 1, 2  # what the kernels return
+
+
+class LqrParameters(NamedTuple):
+    """Weights and times of the tracker; the defaults are nuPlan's."""
+
+    q_longitudinal: float = 10.0
+    r_longitudinal: float = 1.0
+    q_lateral_error: float = 1.0
+    q_heading_error: float = 10.0
+    q_steering: float = 0.0
+    r_lateral: float = 1.0
+    step_us: int = 100_000  # us, discretisation time
+    horizon: int = 10  # steps
+    jerk_penalty: float = 1e-4
+    curvature_rate_penalty: float = 1e-2
+    stopping_gain: float = 0.5  # 1/s
+    stopping_speed: float = 0.2  # m/s
+    wheel_base: float = PACIFICA.wheel_base  # m
+
+
+NUPLAN = LqrParameters()
+
+
+class Reference(NamedTuple):
+    """What the tracker steers to.
+
+    Attributes:
+        status: TRACKED, or why there is none: NOT_COVERED, TOO_SHORT.
+        lateral_error: Of the rear axle, left of the plan is positive [m].
+        heading_error: Ego minus plan, in [-pi, pi) [rad].
+        speed: Of the plan one horizon ahead [m/s]; negative in reverse.
+        curvature: (horizon,) of the plan at the next steps [1/m].
+    """
+
+    status: int
+    lateral_error: float
+    heading_error: float
+    speed: float
+    curvature: FloatArray
+
+
+@lean_kernel
+def num_resampled(traj_time_us: IntArray, step_us: int) -> int:
+    """Number of poses of a trajectory at whole steps from its start."""
+    return (traj_time_us[-1] - traj_time_us[0]) // step_us + 1
+
+
+@lean_kernel
+def resample_poses(
+    traj_time_us: IntArray, traj_states: FloatArray, step_us: int, out: FloatArray
+) -> None:
+    """Poses at whole steps from the start of a trajectory, into `out` (N, 3).
+
+    The same numbers as `perfect.interpolate` at each time, in one sweep.
+    """
+    end, turn, query = 1, 0.0, traj_time_us[0]
+    next_turn = unwrap_correction(traj_states[0, HEADING], traj_states[1, HEADING])
+    for row in range(len(out)):
+        while traj_time_us[end] < query:
+            end += 1
+            turn = next_turn
+            next_turn = turn + unwrap_correction(
+                traj_states[end - 1, HEADING], traj_states[end, HEADING]
+            )
+        begin = end - 1
+        span = float(traj_time_us[end] - traj_time_us[begin])
+        ahead = float(query - traj_time_us[begin])
+        x, y, heading = traj_states[begin, X], traj_states[begin, Y], traj_states[begin, HEADING]
+        out[row, 0] = (traj_states[end, X] - x) / span * ahead + x
+        out[row, 1] = (traj_states[end, Y] - y) / span * ahead + y
+        heading += turn
+        last = traj_states[end, HEADING] + next_turn
+        out[row, 2] = wrap_angle((last - heading) / span * ahead + heading)
+        query += step_us
+
+
+@kernel
+def fit_speed(poses: FloatArray, dt: float, jerk_penalty: float, out: FloatArray) -> None:
+    """Smoothed signed speed between poses (M + 1, 3), into `out` (M,) [m/s]; M >= 2.
+
+    Solves (I + w D'D) v = d / dt, D the second difference, w = jerk_penalty / dt^4, by an LDL'
+    factorisation with two sub-diagonals. Its condition is at most 1 + 16 w.
+    """
+    count = len(out)
+    weight = jerk_penalty / dt**4
+    lower1, lower2 = np.empty(count), np.empty(count)
+    pivot1 = pivot2 = solved1 = solved2 = 0.0  # of the row before, and of the one before that
+    factor1 = 0.0  # first sub-diagonal of the row before
+    for row in range(count):
+        # each second difference (1, -2, 1) that row takes part in, by its place in it
+        first, middle, last = row + 2 < count, 0 < row < count - 1, row >= 2
+        diagonal = 1.0
+        if first:
+            diagonal += weight
+        if middle:
+            diagonal += 4.0 * weight
+        if last:
+            diagonal += weight
+        side2 = weight if last else 0.0
+        side1 = 0.0  # with the row before
+        if last:
+            side1 -= 2.0 * weight
+        if middle:
+            side1 -= 2.0 * weight
+        right = (
+            (poses[row + 1, 0] - poses[row, 0]) * np.cos(poses[row, 2])
+            + (poses[row + 1, 1] - poses[row, 1]) * np.sin(poses[row, 2])
+        ) / dt
+        factor2 = side2 / pivot2 if row >= 2 else 0.0
+        coupled = side1 - factor2 * factor1 * pivot2
+        factor = coupled / pivot1 if row >= 1 else 0.0
+        pivot = diagonal - factor2 * side2 - factor * coupled
+        solved = right - factor * solved1 - factor2 * solved2
+        lower1[row], lower2[row] = factor, factor2
+        out[row] = solved / pivot
+        pivot2, pivot1 = pivot1, pivot
+        solved2, solved1 = solved1, solved
+        factor1 = factor
+    for row in range(count - 2, -1, -1):
+        out[row] -= lower1[row + 1] * out[row + 1]
+        if row + 2 < count:
+            out[row] -= lower2[row + 2] * out[row + 2]
+
+
+@kernel
+def fit_curvature(
+    poses: FloatArray, speed: FloatArray, dt: float, rate_penalty: float, out: FloatArray
+) -> None:
+    """Smoothed curvature between poses (M + 1, 3), into `out` (M,) [1/m].
+
+    Eliminates the tridiagonal system from its end. Divided by the penalty w = rate_penalty / dt^2
+    every pivot is 1 + gain, and gain is a sum of positive terms: no digits are lost at standstill,
+    where only the initial-curvature penalty keeps the matrix regular.
+    """
+    count = len(out)
+    weight = rate_penalty / dt**2
+    gains = np.empty(count)
+    gain = load = 0.0
+    for row in range(count - 1, -1, -1):
+        arm = speed[row] * dt
+        turn = wrap_angle(poses[row + 1, 2] - poses[row, 2])
+        load = load / (1.0 + gain) + arm * turn / weight
+        gain = gain / (1.0 + gain) + arm * arm / weight
+        gains[row], out[row] = gain, load
+    out[0] /= gains[0] + INITIAL_CURVATURE_PENALTY / weight
+    for row in range(1, count):
+        out[row] = (out[row] + out[row - 1]) / (1.0 + gains[row])
+
+
+@lean_kernel
+def profile_at(profile: FloatArray, start_us: int, step_us: int, seconds: float) -> float:
+    """Value of a profile sampled at whole steps, at a time [s]; clamped at both ends.
+
+    nuPlan: the sample times are microseconds / 1e6, the queried time microseconds * 1e-6; with
+    epoch-size stamps the two differ by up to 2.4e-7 s (nuplan-simulation.md §12 Q1).
+    """
+    last = len(profile) - 1
+    if seconds <= start_us / 1e6:
+        return profile[0]
+    if seconds >= (start_us + last * step_us) / 1e6:
+        return profile[last]
+    low = int((seconds * 1e6 - start_us) / step_us)
+    low = min(max(low, 0), last - 1)
+    while low > 0 and (start_us + low * step_us) / 1e6 > seconds:
+        low -= 1
+    while low < last - 1 and (start_us + (low + 1) * step_us) / 1e6 <= seconds:
+        low += 1
+    begin = (start_us + low * step_us) / 1e6
+    end = (start_us + (low + 1) * step_us) / 1e6
+    slope = (profile[low + 1] - profile[low]) / (end - begin)
+    return slope * (seconds - begin) + profile[low]
+
+
+@kernel
+def fit_profiles(
+    traj_time_us: IntArray, traj_states: FloatArray, params: LqrParameters
+) -> tuple[FloatArray, FloatArray]:
+    """Speed [m/s] and curvature [1/m] profiles (M,) at whole steps from the plan's start."""
+    dt = params.step_us / 1e6
+    poses = np.empty((num_resampled(traj_time_us, params.step_us), 3))
+    resample_poses(traj_time_us, traj_states, params.step_us, poses)
+    speed, curvature = np.empty(len(poses) - 1), np.empty(len(poses) - 1)
+    fit_speed(poses, dt, params.jerk_penalty, speed)
+    fit_curvature(poses, speed, dt, params.curvature_rate_penalty, curvature)
+    return speed, curvature
+
+
+@kernel
+def reference(
+    now_us: int,
+    state: FloatArray,
+    traj_time_us: IntArray,
+    traj_states: FloatArray,
+    params: LqrParameters,
+) -> Reference:
+    """Errors of the ego against the plan, and the speeds and curvatures to aim at.
+
+    Args:
+        now_us: Time stamp of the current iteration [us].
+        state: (11,) ego state.
+        traj_time_us: (H,) strictly increasing time stamps of the plan [us].
+        traj_states: (H, 11) states of the plan; only the poses are read.
+        params: Parameters of the tracker.
+    """
+    curvature = np.zeros(params.horizon)
+    target = np.empty(NUM_STATE)
+    if not interpolate(traj_time_us, traj_states, now_us, target):
+        return Reference(NOT_COVERED, 0.0, 0.0, 0.0, curvature)
+    if num_resampled(traj_time_us, params.step_us) < MIN_POSES:
+        return Reference(TOO_SHORT, 0.0, 0.0, 0.0, curvature)
+    heading = target[HEADING]
+    lateral = -(state[X] - target[X]) * np.sin(heading) + (state[Y] - target[Y]) * np.cos(heading)
+    speeds, curvatures = fit_profiles(traj_time_us, traj_states, params)
+    start_us, dt, now = traj_time_us[0], params.step_us / 1e6, now_us * 1e-6
+    for step in range(params.horizon):
+        curvature[step] = profile_at(curvatures, start_us, params.step_us, now + step * dt)
+    speed = profile_at(speeds, start_us, params.step_us, now + params.horizon * dt)
+    return Reference(TRACKED, lateral, wrap_angle(state[HEADING] - heading), speed, curvature)
+
+
+@lean_kernel
+def is_stopping(speed: float, reference_speed: float, params: LqrParameters) -> bool:
+    """Whether the stop controller acts; signed speeds, so also when reversing (§12 Q9)."""
+    return reference_speed <= params.stopping_speed and speed <= params.stopping_speed
+
+
+@lean_kernel
+def steering_rate(
+    ref: Reference, speed: float, steering: float, accel: float, params: LqrParameters
+) -> float:
+    """Steering rate [rad/s] of the lateral LQR, one rate held over the whole horizon."""
+    dt = params.step_us / 1e6
+    # x_end = a x_0 + b rate + g, propagated as columns (lateral, heading, steering)
+    lateral, heading = ref.lateral_error, ref.heading_error
+    b_lateral = b_heading = b_steering = 0.0
+    for step in range(params.horizon):
+        arm = (speed + step * dt * accel) * dt
+        lateral += arm * heading
+        heading += arm * steering / params.wheel_base - arm * ref.curvature[step]
+        b_lateral += arm * b_heading
+        b_heading += arm * b_steering / params.wheel_base
+        b_steering += dt
+    heading, steering = wrap_angle(heading), wrap_angle(steering)
+    top = (
+        b_lateral * params.q_lateral_error * lateral
+        + b_heading * params.q_heading_error * heading
+        + b_steering * params.q_steering * steering
+    )
+    bottom = (
+        params.r_lateral
+        + b_lateral * params.q_lateral_error * b_lateral
+        + b_heading * params.q_heading_error * b_heading
+        + b_steering * params.q_steering * b_steering
+    )
+    return -top / bottom
+
+
+@lean_kernel
+def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[float, float]:
+    """Acceleration [m/s^2] and steering rate [rad/s] that follow the reference; no limits."""
+    speed = state[VX]
+    if is_stopping(speed, ref.speed, params):
+        return -params.stopping_gain * (speed - ref.speed), 0.0
+    hold = params.horizon * (params.step_us / 1e6)
+    gain = hold * params.q_longitudinal / (params.r_longitudinal + hold**2 * params.q_longitudinal)
+    accel = -gain * (speed - ref.speed)
+    return accel, steering_rate(ref, speed, state[STEERING], accel, params)
+
+
+@lean_kernel
+def track(
+    now_us: int,
+    state: FloatArray,
+    traj_time_us: IntArray,
+    traj_states: FloatArray,
+    params: LqrParameters,
+) -> tuple[int, float, float]:
+    """Status, acceleration [m/s^2] and steering rate [rad/s] for one iteration.
+
+    Arguments as for `reference`. The command is 0 when the status is not TRACKED.
+    """
+    ref = reference(now_us, state, traj_time_us, traj_states, params)
+    if ref.status != TRACKED:
+        return ref.status, 0.0, 0.0
+    accel, rate = command(state, ref, params)
+    return TRACKED, accel, rate
+
+
+@lean_kernel
+def track_and_step(
+    now_us: int,
+    next_us: int,
+    state: FloatArray,
+    traj_time_us: IntArray,
+    traj_states: FloatArray,
+    noise_accel: float,
+    noise_rate: float,
+    out_state: FloatArray,
+    out_command: FloatArray,
+) -> int:
+    """One closed-loop step with nuPlan's parameters: tracker, noise, kinematic bicycle.
+
+    Args:
+        now_us: Time stamp of `state` [us].
+        next_us: Time stamp of the next iteration [us].
+        state: (11,) ego state.
+        traj_time_us: (H,) strictly increasing time stamps of the plan [us].
+        traj_states: (H, 11) states of the plan; only the poses are read.
+        noise_accel: Added to the acceleration, unless exactly 0 [m/s^2].
+        noise_rate: Added to the steering rate, unless exactly 0 [rad/s].
+        out_state: (11,) receives the next state.
+        out_command: (2,) receives the clean command, before noise.
+
+    Returns:
+        TRACKED, or why nothing was written (see `raise_for_status`).
+    """
+    status, accel, rate = track(now_us, state, traj_time_us, traj_states, NUPLAN)
+    if status != TRACKED:
+        return status
+    out_command[0], out_command[1] = accel, rate
+    if noise_accel != 0.0:
+        accel += noise_accel
+    if noise_rate != 0.0:
+        rate += noise_rate
+    dt = step_seconds(now_us, next_us)
+    step_bicycle(state, accel, rate, NUPLAN.wheel_base, dt, out_state)
+    return TRACKED
+
+
+def raise_for_status(status: int, now_us: int, traj_time_us: IntArray) -> None:
+    """Turn a status of the kernels into an error.
+
+    Args:
+        status: TRACKED, NOT_COVERED or TOO_SHORT.
+        now_us: Time stamp of the current iteration [us].
+        traj_time_us: (H,) time stamps of the plan [us].
+
+    Raises:
+        InvalidTrajectoryError: The status is not TRACKED.
+    """
+    if status == TRACKED:
+        return
+    if len(traj_time_us) < 2:
+        raise InvalidTrajectoryError(
+            f"trajectory has {len(traj_time_us)} states", "return at least 3 states, 0.1 s apart"
+        )
+    seconds = (int(traj_time_us[-1]) - int(traj_time_us[0])) / 1e6
+    if status == TOO_SHORT:
+        raise InvalidTrajectoryError(
+            f"trajectory lasts {seconds:g} s", "plan at least 0.2 s, better 1 s and more"
+        )
+    start = (int(traj_time_us[0]) - now_us) / 1e6
+    raise InvalidTrajectoryError(
+        f"trajectory covers {start:g} s to {start + seconds:g} s from now, not the present",
+        "let the first state be the present ego state, at the time stamp of the iteration",
+    )

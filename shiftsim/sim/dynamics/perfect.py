@@ -1,0 +1,134 @@
+"""States along a trajectory at any time, and perfect tracking.
+
+nuPlan interpolates linearly over microseconds; headings are unwrapped over the whole trajectory
+first and wrapped afterwards; yaw rate, yaw acceleration and steering rate are not carried and come
+out as 0; nothing is extrapolated (nuplan-simulation.md §4).
+"""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.errors import InvalidTrajectoryError, PlannerError
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.world.state import (
+    HEADING,
+    NUM_STATE,
+    STEERING,
+    STEERING_RATE,
+    VX,
+    VY,
+    YAW_ACCEL,
+    YAW_RATE,
+    Trajectory,
+)
+
+MAX_SPEED = 50.0  # m/s, nuPlan perfect tracking controller
+SAMPLE_US = 100_000  # us, spacing of the poses of a plan that a rollout keeps
+
+
+@lean_kernel
+def unwrap_correction(before: float, after: float) -> float:
+    """What to add to a heading (and all later ones) to make the step from the one before small.
+
+    nuPlan: numpy.unwrap, whose steps of exactly half a turn keep their sign.
+    """
+    step = after - before
+    if abs(step) < np.pi:
+        return 0.0
+    wrapped = (step + np.pi) % (2.0 * np.pi) - np.pi
+    if wrapped == -np.pi and step > 0.0:
+        wrapped = np.pi
+    return wrapped - step
+
+
+@lean_kernel
+def segment_end(traj_time_us: IntArray, query_us: int) -> int:
+    """Index of the first knot at or after the query, at least 1, at most the last knot."""
+    low, high = 1, len(traj_time_us) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if traj_time_us[middle] < query_us:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@lean_kernel
+def interpolate(
+    traj_time_us: IntArray, traj_states: FloatArray, query_us: int, out: FloatArray
+) -> bool:
+    """State of a trajectory at one time.
+
+    nuPlan also interpolates the time stamp and truncates it to whole microseconds; over its own
+    abscissa the slope is exactly 1, so the result is the queried stamp (§12 Q15).
+
+    Args:
+        traj_time_us: (H,) strictly increasing time stamps, H >= 2 [us].
+        traj_states: (H, 11) columns of `state.STATE_COLUMNS`.
+        query_us: Time stamp [us].
+        out: (11,) receives the state; steering rate, yaw rate and yaw acceleration are 0.
+
+    Returns:
+        False, and `out` is untouched, when the trajectory does not cover the query.
+    """
+    count = len(traj_time_us)
+    if count < 2 or query_us < traj_time_us[0] or query_us > traj_time_us[count - 1]:
+        return False
+    end = segment_end(traj_time_us, query_us)
+    begin = end - 1
+    # nuPlan: slope times distance plus start, also where the query is a knot (scipy's interp1d)
+    span = float(traj_time_us[end] - traj_time_us[begin])
+    ahead = float(query_us - traj_time_us[begin])
+    for column in range(STEERING + 1):
+        first = traj_states[begin, column]
+        out[column] = (traj_states[end, column] - first) / span * ahead + first
+    turn = 0.0
+    for knot in range(1, end):
+        turn += unwrap_correction(traj_states[knot - 1, HEADING], traj_states[knot, HEADING])
+    first = traj_states[begin, HEADING] + turn
+    turn += unwrap_correction(traj_states[begin, HEADING], traj_states[end, HEADING])
+    last = traj_states[end, HEADING] + turn
+    out[HEADING] = wrap_angle((last - first) / span * ahead + first)
+    out[STEERING_RATE] = 0.0
+    out[YAW_RATE] = 0.0
+    out[YAW_ACCEL] = 0.0
+    return True
+
+
+@kernel
+def sample_poses(
+    traj_time_us: IntArray, traj_states: FloatArray, now_us: int, out: FloatArray
+) -> None:
+    """Poses of a trajectory every 0.1 s from now on, into `out` (P, 3); NaN where it has none."""
+    state = np.empty(NUM_STATE)
+    for row in range(len(out)):
+        covered = interpolate(traj_time_us, traj_states, now_us + row * SAMPLE_US, state)
+        for column in range(3):
+            out[row, column] = state[column] if covered else np.nan
+
+
+def follow_perfectly(plan: Trajectory, next_us: int, out: FloatArray) -> None:
+    """Put the ego where the plan wants it at the next iteration.
+
+    Args:
+        plan: The plan, with log time stamps.
+        next_us: Time stamp of the next iteration [us].
+        out: (11,) receives the state.
+
+    Raises:
+        InvalidTrajectoryError: The plan does not cover the next iteration.
+        PlannerError: The plan is there at 50 m/s or more.
+    """
+    if not interpolate(plan.time_us, plan.states, next_us, out):
+        raise InvalidTrajectoryError(
+            f"trajectory does not cover the next iteration at {next_us} us",
+            "return at least two states, from the present iteration to the next one or beyond",
+        )
+    speed = float(np.hypot(out[VX], out[VY]))
+    if speed >= MAX_SPEED:
+        raise PlannerError(
+            f"trajectory has speed {speed:.6g} m/s at {next_us} us; "
+            f"perfect tracking needs less than {MAX_SPEED:g} m/s",
+            "give velocities in m/s, in the body frame",
+        )

@@ -1,0 +1,217 @@
+"""Actuation noise: what is added to the command between tracker and motion model.
+
+White noise (`awgn`) is sigma times a standard normal at every step. The Ornstein-Uhlenbeck process
+(`ou`) starts at 0 and is updated before it is applied: x += theta (0 - x) dt + sigma sqrt(dt) eps
+(benchmark.md, track 2). Random numbers are keyed by (seed, scenario token, channel) alone, so the
+same noise hits every planner, in any order of runs and on any number of workers.
+"""
+
+import difflib
+import hashlib
+import importlib
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import ConfigError
+
+CHANNELS = ("noise-accel", "noise-steer")
+NOISE_NAMES = ("none", "awgn-low", "awgn-mid", "awgn-high", "ou-low", "ou-mid", "ou-high")
+SIGMA_BY_LEVEL = {  # acceleration [m/s^2], steering rate [rad/s]; benchmark.md
+    "low": (0.5, 0.1),
+    "mid": (1.0, 0.2),
+    "high": (1.5, 0.3),
+}
+OU_THETA = 2.0  # 1/s, benchmark.md
+
+
+class NoiseFunction(Protocol):
+    """An own noise model: any callable with this signature, named `module:attribute`."""
+
+    def __call__(
+        self, accel: np.random.Generator, steering: np.random.Generator, num_steps: int, dt: float
+    ) -> FloatArray:
+        """Noise of a whole rollout.
+
+        Args:
+            accel: Random numbers of the acceleration channel.
+            steering: Random numbers of the steering-rate channel.
+            num_steps: T, number of steps.
+            dt: Nominal step [s].
+
+        Returns:
+            (T, 2) added to the acceleration [m/s^2] and to the steering rate [rad/s].
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Kind and strength of the actuation noise.
+
+    Attributes:
+        kind: "none", "awgn", "ou" or "custom".
+        sigma_accel: Of the acceleration; for `ou` per square root of a second [m/s^2].
+        sigma_rate: Of the steering rate; for `ou` per square root of a second [rad/s].
+        theta: Rate of return to zero of `ou` [1/s].
+        function: The model of kind "custom".
+        name: As in tables and on the command line; derived from the parameters when empty.
+    """
+
+    kind: str = "none"
+    sigma_accel: float = 0.0
+    sigma_rate: float = 0.0
+    theta: float = OU_THETA
+    function: NoiseFunction | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("none", "awgn", "ou", "custom"):
+            raise ConfigError(f"noise kind {self.kind!r} unknown", "use none, awgn, ou or custom")
+        for field in ("sigma_accel", "sigma_rate", "theta"):
+            value = getattr(self, field)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise ConfigError(f"noise {field} is {value!r}", "give a finite number, 0 or more")
+        if (self.kind == "custom") != (self.function is not None):
+            raise ConfigError(
+                f"noise kind {self.kind!r} with function {self.function!r}",
+                "give a function with kind 'custom', and only then",
+            )
+        if not self.name:
+            object.__setattr__(self, "name", self._derived_name())
+
+    def _derived_name(self) -> str:
+        if self.function is not None:
+            owner = self.function
+            label = getattr(owner, "__qualname__", type(owner).__qualname__)
+            return f"{owner.__module__}:{label}"
+        if self.kind == "none":
+            return "none"
+        sigmas = f"{self.sigma_accel:g},{self.sigma_rate:g}"
+        return f"ou({sigmas},{self.theta:g})" if self.kind == "ou" else f"awgn({sigmas})"
+
+
+def parse_noise(name: str) -> NoiseModel:
+    """The noise model of a name.
+
+    Args:
+        name: One of `NOISE_NAMES`, or `module:attribute` of an own model: a `NoiseFunction` or a
+            `NoiseModel`.
+
+    Raises:
+        ConfigError: The name is unknown, or the own model cannot be imported.
+    """
+    if name == "none":
+        return NoiseModel()
+    if name in NOISE_NAMES:
+        kind, level = name.split("-")
+        accel, rate = SIGMA_BY_LEVEL[level]
+        return NoiseModel(kind, accel, rate, name=name)
+    if ":" in name:
+        return _load_noise(name)
+    near = difflib.get_close_matches(name, NOISE_NAMES, n=1, cutoff=0.5)
+    question = f"did you mean {near[0]!r}? " if near else ""
+    raise ConfigError(
+        f"noise {name!r} unknown",
+        f"{question}available: {', '.join(NOISE_NAMES)}, or module:attribute of an own model",
+    )
+
+
+def sample_noise(
+    model: NoiseModel | str, *, seed: int, token: str, num_steps: int, dt: float = 0.1
+) -> FloatArray:
+    """The noise of a whole rollout.
+
+    Args:
+        model: Kind and strength, or a name for `parse_noise`.
+        seed: Seed of the run.
+        token: Id of the scenario.
+        num_steps: T, number of steps.
+        dt: Nominal step [s].
+
+    Returns:
+        (T, 2) added to the acceleration [m/s^2] and to the steering rate [rad/s]; exactly 0 where
+        sigma is 0.
+
+    Raises:
+        ConfigError: The name is unknown, or an own model returned something else than (T, 2)
+            finite numbers.
+    """
+    if isinstance(model, str):
+        model = parse_noise(model)
+    if model.kind == "none":
+        return np.zeros((num_steps, 2))
+    accel, steering = (keyed_generator(seed, token, channel) for channel in CHANNELS)
+    if model.function is not None:
+        return _checked(model, model.function(accel, steering, num_steps, dt), num_steps)
+    eps = np.stack([accel.standard_normal(num_steps), steering.standard_normal(num_steps)], axis=1)
+    return noise_from_normals(model, eps, dt)
+
+
+def noise_from_normals(model: NoiseModel, eps: FloatArray, dt: float = 0.1) -> FloatArray:
+    """The noise (T, 2) that standard normals (T, 2) make, acceleration and steering rate."""
+    sigmas = (model.sigma_accel, model.sigma_rate)
+    out = np.zeros(eps.shape)
+    for column, sigma in enumerate(sigmas):
+        if sigma == 0.0 or model.kind == "none":
+            continue  # not 0 * eps, which can be -0.0
+        normals = eps[:, column]
+        out[:, column] = (
+            ou_from_normals(normals, sigma, model.theta, dt)
+            if model.kind == "ou"
+            else awgn_from_normals(normals, sigma)
+        )
+    return out
+
+
+def awgn_from_normals(eps: FloatArray, sigma: float) -> FloatArray:
+    """White noise (T,) from standard normals (T,)."""
+    return sigma * eps
+
+
+def ou_from_normals(eps: FloatArray, sigma: float, theta: float, dt: float) -> FloatArray:
+    """Ornstein-Uhlenbeck process (T,) from standard normals (T,): 0 at first, updated, applied."""
+    value, diffusion = 0.0, sigma * float(np.sqrt(dt))
+    out = []
+    for normal in eps.tolist():
+        value = value + theta * (0.0 - value) * dt + diffusion * normal
+        out.append(value)
+    return np.array(out, np.float64)
+
+
+def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
+    """Random numbers that depend on nothing but seed, scenario token and channel name."""
+    text = f"{int(seed)}\n{token}\n{channel}"
+    digest = hashlib.blake2b(text.encode(), digest_size=16).digest()
+    return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
+
+
+def _load_noise(name: str) -> NoiseModel:
+    module_name, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"noise {name!r} cannot be imported: {error}",
+            "give module:attribute of a function or NoiseModel on the Python path",
+        ) from error
+    if isinstance(found, NoiseModel):
+        return found
+    if not callable(found):
+        raise ConfigError(
+            f"noise {name!r} is {type(found).__name__}, not callable",
+            "see shiftsim.sim.noise.NoiseFunction for the signature",
+        )
+    return NoiseModel("custom", function=found, name=name)
+
+
+def _checked(model: NoiseModel, noise: FloatArray, num_steps: int) -> FloatArray:
+    values = np.asarray(noise, np.float64)
+    if values.shape != (num_steps, 2) or not np.isfinite(values).all():
+        raise ConfigError(
+            f"noise {model.name!r} returned shape {values.shape}, "
+            f"{int(np.count_nonzero(~np.isfinite(values)))} values not finite",
+            f"return {num_steps} x 2 finite numbers: acceleration and steering rate",
+        )
+    return values

@@ -1,0 +1,158 @@
+"""Whether what a planner returned can be executed from one iteration to the next."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.errors import InvalidTrajectoryError
+from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
+
+MIN_SPAN_US = 200_000  # us, three poses at 0.1 s: the tracker cannot be built with fewer
+
+_GOOD, _NOT_INCREASING, _NOT_FINITE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT = range(6)
+
+
+class Fault(NamedTuple):
+    """What is wrong with a plan.
+
+    Attributes:
+        check: Name of the rule: `type`, `shapes`, `times`, `finite`, `covers the next step` or
+            `three poses`.
+        message: What is wrong, with the offending value.
+        hint: What to do about it.
+    """
+
+    check: str
+    message: str
+    hint: str
+
+
+def validate_plan(plan: object, now_us: int, next_us: int) -> None:
+    """Accept a trajectory or command that can be executed from one iteration to the next.
+
+    Args:
+        plan: What the planner returned.
+        now_us: Time stamp of the iteration it was asked at [us].
+        next_us: Time stamp of the next iteration [us].
+
+    Raises:
+        InvalidTrajectoryError: It cannot be executed; the message says why.
+    """
+    fault = find_fault(plan, now_us, next_us)
+    if fault is not None:
+        raise InvalidTrajectoryError(fault.message, hint=fault.hint)
+
+
+def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
+    """The first thing that is wrong with a plan, or None (arguments as of `validate_plan`)."""
+    if isinstance(plan, Command):
+        return _command_fault(plan)
+    if not isinstance(plan, Trajectory):
+        return Fault(
+            "type",
+            f"plan() returned {type(plan).__name__}, not a Trajectory or a Command",
+            "return shiftsim.Trajectory.from_poses(times, poses) or a shiftsim.Command",
+        )
+    times, states = plan.time_us, plan.states
+    if not (_is_array(times, 1, np.int64) and _is_array(states, 2, np.float64)) or (
+        states.shape != (len(times), NUM_STATE)
+    ):
+        return Fault(
+            "shapes",
+            f"time_us is {_describe(times)} and states is {_describe(states)}; "
+            f"need int64 (H,) and float64 (H, {NUM_STATE})",
+            "Trajectory.from_poses builds both from times (H,) [s] and poses (H, 3)",
+        )
+    if plan.relative:
+        now_us, next_us = 0, next_us - now_us
+    code, row, column = _check(_plain(times), _plain(states), now_us, next_us)
+    return None if code == _GOOD else _explain(code, row, column, plan, now_us, next_us)
+
+
+def _command_fault(command: Command) -> Fault | None:
+    try:
+        finite = bool(np.isfinite(command.acceleration) and np.isfinite(command.steering_rate))
+    except (TypeError, ValueError):
+        finite = False
+    if finite:
+        return None
+    return Fault(
+        "finite",
+        f"the command is acceleration {command.acceleration!r}, "
+        f"steering rate {command.steering_rate!r}; both must be finite numbers",
+        "return floats in m/s^2 and rad/s",
+    )
+
+
+def _is_array(value: object, ndim: int, dtype: type) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == ndim and value.dtype == dtype
+
+
+def _plain(array: Any) -> Any:
+    """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
+    return array if array.flags.carray else array.copy()
+
+
+def _describe(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    return type(value).__name__
+
+
+@kernel
+def _check(
+    time_us: IntArray, states: FloatArray, now_us: int, next_us: int
+) -> tuple[int, int, int]:
+    for row in range(1, len(time_us)):
+        if time_us[row] <= time_us[row - 1]:
+            return _NOT_INCREASING, row, 0
+    for row in range(len(states)):
+        for column in range(states.shape[1]):
+            if not np.isfinite(states[row, column]):
+                return _NOT_FINITE, row, column
+    if len(time_us) < 2 or time_us[-1] - time_us[0] < MIN_SPAN_US:
+        return _TOO_SHORT, 0, 0
+    if time_us[0] > now_us:
+        return _STARTS_LATE, 0, 0
+    if time_us[-1] < next_us:
+        return _ENDS_EARLY, 0, 0
+    return _GOOD, 0, 0
+
+
+def _explain(
+    code: int, row: int, column: int, plan: Trajectory, now_us: int, next_us: int
+) -> Fault:
+    times = plan.time_us
+    if code == _NOT_INCREASING:
+        return Fault(
+            "times",
+            f"time {row} of the plan is {times[row]} us, not after time {row - 1} "
+            f"({times[row - 1]} us)",
+            "times must increase strictly",
+        )
+    if code == _NOT_FINITE:
+        return Fault(
+            "finite",
+            f"{STATE_COLUMNS[column]} of state {row} is {plan.states[row, column]}",
+            "every value of every state must be finite",
+        )
+    if code == _TOO_SHORT:
+        span = (times[-1] - times[0]) * 1e-6 if len(times) else 0.0
+        return Fault(
+            "three poses",
+            f"the plan has {len(times)} states over {span:g} s; "
+            "the tracker needs three poses 0.1 s apart",
+            "plan at least 0.2 s ahead, better 1 s and more: the tracker looks 1 s ahead",
+        )
+    kind = "offset" if plan.relative else "time"
+    hint = (
+        "times of from_poses are seconds from now, the first one 0"
+        if plan.relative
+        else "time_us are log time stamps (observation.time_us is now) unless relative=True"
+    )
+    if code == _STARTS_LATE:
+        what = f"the plan starts at {kind} {times[0]} us, after the present ({now_us} us)"
+    else:
+        what = f"the plan ends at {kind} {times[-1]} us, before the next step ({next_us} us)"
+    return Fault("covers the next step", what, hint)

@@ -1,0 +1,125 @@
+"""The interface a planner implements, and what the simulator shows it.
+
+A planner is any object with `reset(scene)` and `plan(observation)`; nothing needs to be subclassed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import (
+    PACIFICA,
+    Command,
+    EgoState,
+    LightStatus,
+    Tracks,
+    TrafficLights,
+    Trajectory,
+    VehicleParameters,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneInfo:
+    """What a planner may know before the first step.
+
+    Attributes:
+        map: The map.
+        route: Route roadblock ids from start to goal.
+        goal: (3,) goal x [m], y [m], heading [rad], or None.
+        dt: Nominal time between iterations [s].
+        vehicle: Dimensions of the ego.
+        token: Id of the scenario.
+        expert: The whole recorded scenario. Only oracles (log-future) may look at it.
+        seed: Seed of the task; what a planner samples is keyed with it and the token.
+    """
+
+    map: VectorMap
+    route: tuple[str, ...]
+    goal: FloatArray | None
+    dt: float
+    token: str
+    expert: Scenario
+    vehicle: VehicleParameters = PACIFICA
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """The last 2.1 s, up to 22 samples, oldest first; the last one is the present.
+
+    Attributes:
+        time_us: (H,) time stamps [us].
+        ego: (H, 11) ego states, columns of `state.STATE_COLUMNS`.
+        tracks: Tracks over the same H samples.
+    """
+
+    time_us: IntArray
+    ego: FloatArray
+    tracks: Tracks
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a planner sees at one iteration.
+
+    Attributes:
+        iteration: Index of the iteration, from 0.
+        time_us: Its log time stamp [us].
+        history: The last samples, the present one included.
+        lights: Traffic lights of this iteration (one row).
+    """
+
+    iteration: int
+    time_us: int
+    history: History
+    lights: TrafficLights
+
+    @property
+    def ego(self) -> EgoState:
+        """The present ego state."""
+        return EgoState(self.time_us, self.history.ego[-1])
+
+    @property
+    def tracks(self) -> Tracks:
+        """The present tracks (one row); mind `valid`."""
+        return self.history.tracks.rows(slice(-1, None))
+
+    @property
+    def traffic_lights(self) -> dict[str, LightStatus]:
+        """Status of the listed lane connectors."""
+        return self.lights.at(0)
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """What the simulator asks of a planner. Subclassing is not required.
+
+    Optional are `close()`, `name`, and `degraded`: a text that says why the plan just returned is a
+    makeshift, empty when it is not. Such steps are counted, or fail a strict run.
+    """
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Prepare for a new scenario: route, goal, map. Called once before the first plan."""
+
+    def plan(self, observation: Observation) -> Trajectory | Command:
+        """Return poses from the current ego pose on, or the command itself (no tracker runs)."""
+
+
+@runtime_checkable
+class BatchPlanner(Planner, Protocol):
+    """A planner that can answer for several scenarios with one forward pass."""
+
+    def fork(self) -> "BatchPlanner":
+        """A planner for one more scenario that shares the network with this one."""
+
+    def plan_batch(
+        self, planners: Sequence["BatchPlanner"], observations: Sequence[Observation]
+    ) -> list[Trajectory | Command | Exception]:
+        """Plans of forks that are in lock step, one per observation.
+
+        An exception in place of a plan ends that scenario and no other.
+        """

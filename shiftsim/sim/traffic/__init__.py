@@ -1,0 +1,84 @@
+"""How everything but the ego moves: replayed from the log, or reactive.
+
+A traffic model owns the tracks of a rollout from iteration 0 on. The simulator hands it one buffer
+of tracks whose rows are the past samples followed by the iterations, filled from the log; the model
+rewrites rows as the rollout proceeds. A model is any object with the two methods of `Traffic`;
+`mixed.Mixed` makes one of several, each for some of the tracks (docs/own_traffic.md).
+"""
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import ConfigError
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks
+
+_MODELS = {
+    "nonreactive": "shiftsim.sim.traffic.replay:LogReplay",
+    "reactive": "shiftsim.sim.traffic.idm.model:IdmTraffic",
+    "constant-velocity": "shiftsim.sim.traffic.constant_velocity:ConstantVelocity",
+    # not nuPlan's, never for benchmarks
+    "reactive-fixed": "shiftsim.sim.traffic.idm.model:FixedIdmTraffic",
+}
+_SHORT = {"nr": "nonreactive", "r": "reactive"}
+
+
+class Traffic(Protocol):
+    """What the simulator asks of a traffic model."""
+
+    def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
+        """Prepare for a new rollout.
+
+        Args:
+            scenario: The scenario.
+            tracks: (B, N, …) tracks of the rollout, filled from the log, writable.
+            row: Row of `tracks` that is iteration 0; earlier rows are history and stay as they are.
+        """
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move everyone from one iteration to the next.
+
+        Args:
+            iteration: The iteration that ends, i.
+            ego: (11,) ego state at iteration i.
+            tracks: The buffer of `start`.
+            row: Row of `tracks` that is iteration i + 1; the model writes it.
+        """
+
+
+def traffic_name(name: str) -> str:
+    """The full name of a traffic mode: `nr` and `r` are accepted.
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+    full = _SHORT.get(name, name)
+    if full not in _MODELS and ":" not in full:
+        raise ConfigError(
+            f"traffic {name!r} unknown",
+            hint=f"available: {', '.join(sorted(_MODELS))}, or package.module:Model of your own",
+        )
+    return full
+
+
+def make_traffic(name: str) -> Traffic:
+    """A traffic model by name, or by `package.module:Model`, called without arguments.
+
+    Raises:
+        ConfigError: The name is unknown, or what it names is not a traffic model.
+    """
+    module, _, attribute = _MODELS.get(full := traffic_name(name), full).partition(":")
+    if full not in _MODELS and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # a model beside the user's files, as for planners
+    model: Traffic = getattr(import_module(module), attribute)()
+    for method in ("start", "step"):
+        if not callable(getattr(model, method, None)):
+            raise ConfigError(
+                f"traffic {name!r} has no method {method!r}",
+                hint="a traffic model has start(scenario, tracks, row) and "
+                "step(iteration, ego, tracks, row), see docs/own_traffic.md",
+            )
+    return model

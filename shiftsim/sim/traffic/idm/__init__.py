@@ -1,0 +1,1 @@
+"""Reactive traffic: nuPlan's IDM agents."""

@@ -1,0 +1,266 @@
+"""Paths of reactive agents: built from baselines, extended along the lane graph, interpolated.
+
+A path is an array of vertices (K, 4): x [m], y [m], heading [rad], progress [m]. Headings are
+unwrapped along the path and wrapped when a pose is read (nuplan-simulation.md §10.1, §10.2).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.polylines import point_on_polyline
+from shiftsim.world.layers import Lists, Polylines
+from shiftsim.world.state import LightStatus
+
+HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
+MAX_ROUTE = 5  # segments an agent remembers, nuPlan
+_SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
+_CURVATURE_SPACING = 2.0  # m between the three points of the estimate, nuPlan
+_STRAIGHT = 1e-6  # m^4, 16 times the squared area below which three points count as aligned
+_GREEN, _RED, _ABSENT = int(LightStatus.GREEN), int(LightStatus.RED), int(LightStatus.ABSENT)
+
+
+class Roads(NamedTuple):
+    """What reactive agents read of a map.
+
+    Attributes:
+        baselines: E centre lines.
+        outgoing: Edges an edge leads to.
+        speed_limits: (E,) [m/s], NaN where the map has none.
+        lights: (E,) whether lights govern the edge.
+        stop_lines: Stop polygons of an edge.
+    """
+
+    baselines: Polylines
+    outgoing: Lists
+    speed_limits: FloatArray
+    lights: BoolArray
+    stop_lines: Lists
+
+
+class Fleet(NamedTuple):
+    """State of the reactive agents, in the order of their construction. A agents.
+
+    Attributes:
+        alive: (A,) whether the agent is still simulated.
+        size: (A, 2) length, width [m].
+        progress: (A,) along the path, not clamped to it [m].
+        speed: (A,) along the path [m/s].
+        target: (A,) speed on a free road [m/s].
+        pose: (A, 3) on the path at the last propagation: x [m], y [m], heading [rad].
+        route: (A, 5) edges of the path, oldest first.
+        route_size: (A,) how many of them.
+        path: (A, K, 4) vertices of the path.
+        path_size: (A,) how many of them.
+    """
+
+    alive: BoolArray
+    size: FloatArray
+    progress: FloatArray
+    speed: FloatArray
+    target: FloatArray
+    pose: FloatArray
+    route: IntArray
+    route_size: IntArray
+    path: FloatArray
+    path_size: IntArray
+
+
+@lean_kernel
+def baseline_room(baselines: Polylines, edge: int) -> int:
+    """Number of vertices of a baseline."""
+    return baselines.ptr[edge + 1] - baselines.ptr[edge]
+
+
+@lean_kernel
+def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int) -> int:
+    """Append the vertices of a baseline to a raw path; returns the new number of vertices."""
+    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
+    for vertex in range(start, stop):
+        other = min(vertex, stop - 2)  # the last vertex repeats the heading before it
+        dx = baselines.xy[other + 1, 0] - baselines.xy[other, 0]
+        dy = baselines.xy[other + 1, 1] - baselines.xy[other, 1]
+        path[size, 0] = baselines.xy[vertex, 0]
+        path[size, 1] = baselines.xy[vertex, 1]
+        path[size, HEADING] = np.arctan2(dy, dx)
+        size += 1
+    return size
+
+
+@lean_kernel
+def finish_path(path: FloatArray, size: int) -> int:
+    """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
+
+    Args:
+        path: (K, 4) raw vertices; their progress is written.
+        size: How many of them count.
+
+    Returns:
+        How many vertices are left, at the start of `path`.
+    """
+    progress = 0.0
+    kept = 0
+    for vertex in range(size - 1):  # nuPlan: the last vertex is always lost (§10.1)
+        x, y = path[vertex, 0], path[vertex, 1]
+        heading = path[vertex, HEADING]
+        dx, dy = path[vertex + 1, 0] - x, path[vertex + 1, 1] - y
+        following = progress + np.sqrt(dx * dx + dy * dy)
+        if abs(following - progress) > _SAME_PROGRESS:
+            if kept:
+                before = path[kept - 1, HEADING]
+                heading = before + wrap_angle(heading - before)
+            path[kept, 0] = x
+            path[kept, 1] = y
+            path[kept, HEADING] = heading
+            path[kept, PROGRESS] = progress
+            kept += 1
+        progress = following
+    return kept
+
+
+@lean_kernel
+def clamp_progress(path: FloatArray, size: int, progress: float) -> float:
+    """Progress limited to the path [m]."""
+    return max(path[0, PROGRESS], min(progress, path[size - 1, PROGRESS]))
+
+
+@lean_kernel
+def first_after(path: FloatArray, size: int, progress: float) -> int:
+    """First vertex of a path whose progress exceeds `progress`; `size` if there is none."""
+    low, high = 0, size
+    while low < high:
+        middle = (low + high) // 2
+        if path[middle, PROGRESS] > progress:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@lean_kernel
+def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
+    """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
+    after = min(max(first_after(path, size, progress), 1), size - 1)
+    span = path[after, PROGRESS] - path[after - 1, PROGRESS]
+    along = progress - path[after - 1, PROGRESS]
+    before = after - 1
+    x = (path[after, 0] - path[before, 0]) / span * along + path[before, 0]
+    y = (path[after, 1] - path[before, 1]) / span * along + path[before, 1]
+    turn = (path[after, HEADING] - path[before, HEADING]) / span
+    return x, y, wrap_angle(turn * along + path[before, HEADING])
+
+
+@lean_kernel
+def initial_curvature(baselines: Polylines, edge: int) -> float:
+    """Absolute curvature of a baseline at its start, of the circle through three points [1/m]."""
+    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
+    length = baselines.arc[stop - 1]
+    second, third = _CURVATURE_SPACING, 2.0 * _CURVATURE_SPACING
+    if length < 2.0 * _CURVATURE_SPACING:
+        second, third = length / 2.0, length
+    ax, ay = point_on_polyline(baselines.xy, baselines.arc, start, stop, 0.0)
+    bx, by = point_on_polyline(baselines.xy, baselines.arc, start, stop, second)
+    cx, cy = point_on_polyline(baselines.xy, baselines.arc, start, stop, third)
+    a = np.hypot(ax - bx, ay - by)
+    b = np.hypot(bx - cx, by - cy)
+    c = np.hypot(cx - ax, cy - ay)
+    square = (a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))
+    if square < _STRAIGHT:
+        return 0.0
+    return np.sqrt(square) / (a * b * c)
+
+
+@lean_kernel
+def choose_successor(roads: Roads, edge: int, status: IntArray) -> int:
+    """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open.
+
+    Args:
+        roads: The map.
+        edge: Last edge of a route.
+        status: (E,) LightStatus codes.
+    """
+    best, chosen = np.inf, -1
+    for entry in range(roads.outgoing.ptr[edge], roads.outgoing.ptr[edge + 1]):
+        following = roads.outgoing.items[entry]
+        # nuPlan: with lights only green is open, without any listed state but red (§10.2)
+        if roads.lights[following]:
+            if status[following] != _GREEN:
+                continue
+        elif status[following] == _RED:
+            continue
+        curvature = initial_curvature(roads.baselines, following)
+        if curvature < best:
+            best, chosen = curvature, following
+    return chosen
+
+
+@lean_kernel
+def extend_route(
+    fleet: Fleet, agent: int, roads: Roads, status: IntArray, min_length: float, headway: float
+) -> int:
+    """Lengthen the path of an agent until it is long enough or no edge is open.
+
+    Args:
+        fleet: The agents.
+        agent: Which one.
+        roads: The map.
+        status: (E,) LightStatus codes.
+        min_length: Path length wanted at standstill [m].
+        headway: Further length per target speed [s].
+
+    Returns:
+        0, or how many vertices a path needs where they do not fit; call again with more room then.
+    """
+    path = fleet.path[agent]
+    while True:
+        size = fleet.path_size[agent]
+        wanted = min_length + fleet.target[agent] * headway
+        if not path[size - 1, PROGRESS] - fleet.progress[agent] < wanted:
+            return 0
+        last = fleet.route[agent, fleet.route_size[agent] - 1]
+        chosen = choose_successor(roads, last, status)
+        if chosen < 0:
+            return 0
+        needed = size + 1 + baseline_room(roads.baselines, chosen)
+        if needed > len(path):
+            return needed
+        raw = _drop_driven(path, size, clamp_progress(path, size, fleet.progress[agent]))
+        raw = append_baseline(roads.baselines, chosen, path, raw)
+        fleet.path_size[agent] = finish_path(path, raw)
+        fleet.progress[agent] = 0.0
+        _remember(fleet.route, fleet.route_size, agent, chosen)
+
+
+@lean_kernel
+def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
+    """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
+    after = first_after(path, size, progress)
+    if after == size:
+        # nuPlan: at its very end a path is left with its last two vertices (§12 Q13)
+        for column in range(3):
+            path[0, column] = path[size - 2, column]
+            path[1, column] = path[size - 1, column]
+        return 2
+    x, y, heading = pose_on_path(path, size, progress)
+    front = path[after - 1, HEADING]
+    path[0, 0], path[0, 1] = x, y
+    path[0, HEADING] = front + wrap_angle(heading - front)
+    kept = 1
+    for vertex in range(after, size):
+        for column in range(3):
+            path[kept, column] = path[vertex, column]
+        kept += 1
+    return kept
+
+
+@lean_kernel
+def _remember(route: IntArray, route_size: IntArray, agent: int, edge: int) -> None:
+    size = route_size[agent]
+    if size == MAX_ROUTE:
+        for index in range(MAX_ROUTE - 1):
+            route[agent, index] = route[agent, index + 1]
+        size -= 1
+    route[agent, size] = edge
+    route_size[agent] = size + 1

@@ -1,0 +1,138 @@
+"""Compile the kernels of a simulation beside other work.
+
+On a fresh install the kernels are compiled once, in about half a minute. `warm_up` starts one
+process per share of them, on a small scene that is part of the package; whoever needs the kernels
+later finds them in the disk cache.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind, Tracks, TrafficLights, VehicleParameters
+
+WORLD = Path(__file__).parent / "reference" / "metric_worlds" / "metric_world_21.json"
+_ROUTE = ("R1", "RC1", "R2")
+
+
+@contextmanager
+def warm_up(*shares: str) -> Iterator[None]:
+    """Compile in the background for as long as the block lasts, and wait for the rest after it.
+
+    A share that fails is left to whoever runs into its cause.
+
+    Args:
+        shares: Names out of `SHARES`; all of them when none is named.
+    """
+    command = "import sys; from shiftsim.verify.warmup import SHARES; SHARES[sys.argv[1]]()"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", command, share],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for share in shares or SHARES
+    ]
+    try:
+        yield
+        for process in processes:
+            process.wait()
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _routes() -> None:
+    """Metrics that find the ego on the map."""
+    from shiftsim.metrics import collision, drivable_area
+    from shiftsim.metrics.route import corner_routes, driven_route, lane_changes
+
+    log, road = _rollout()
+    ego = collision.flat_ego(log.ego, VehicleParameters())
+    route, corners = driven_route(road, ego.centers), corner_routes(road, ego.corners)
+    lane_changes(road, corners)
+    drivable_area.measure(road, ego.corners, route, corners)
+
+
+def _contacts() -> None:
+    """The other metrics."""
+    from shiftsim.metrics import collision, driving_direction, progress, speed_limit
+    from shiftsim.metrics.comfort import comfort_signals
+    from shiftsim.metrics.route import EdgeLists, list_room
+    from shiftsim.metrics.time_to_collision import time_to_collision
+
+    log, road = _rollout()
+    ego = collision.flat_ego(log.ego, VehicleParameters())
+    tracks, is_common = collision.flat_tracks(log.tracks), np.ones(len(log.ego), np.bool_)
+    contacts = collision.first_contacts(ego, tracks)
+    time_to_collision(ego, tracks, contacts, (), is_common, road, log.tracks)
+    comfort_signals(log.time_us, log.ego)
+    progress.measure(road, ego.centers, ego.centers)
+    off_road = EdgeLists(
+        np.zeros((len(log.ego), list_room(road)), np.int64), np.zeros(len(log.ego), np.int64)
+    )
+    speed_limit.overspeed(road, off_road, ego.speeds)
+    driving_direction.lane_progress(road, off_road, ego.centers)
+
+
+def _planners() -> None:
+    """Dynamics, and a planner that follows the route."""
+    from shiftsim.planners.registry import load_planner
+    from shiftsim.sim.loop import simulate
+
+    for planner in ("constant-velocity", "idm"):
+        simulate(scene(), load_planner(planner))
+
+
+SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
+
+
+def _rollout() -> tuple[SimulationLog, VectorMap]:
+    """A drive past a car and a pedestrian, and its map."""
+    from shiftsim.verify.metric_worlds import read_world
+
+    log, road = read_world(json.loads(WORLD.read_text("utf-8")))
+    count = len(log.time_us)
+    poses = np.repeat(log.ego[:, None, :3], 2, axis=1)
+    poses[:, :, 0] += [12.0, 30.0]
+    tracks = Tracks(
+        np.ones((count, 2), np.bool_),
+        poses,
+        np.ones((count, 2, 2)),
+        np.full((count, 2, 2), 2.0),
+        np.array([AgentKind.VEHICLE, AgentKind.PEDESTRIAN], np.int64),
+        ("a", "b"),
+    )
+    return replace(log, tracks=tracks), road
+
+
+def scene() -> Scenario:
+    """A scenario of a dozen iterations: a small map with a route, a car, a pedestrian."""
+    log, road = _rollout()
+    return Scenario(
+        token=log.token,
+        scenario_type="unknown",
+        log_name="warm-up",
+        city=road.name,
+        map=road,
+        time_us=log.time_us,
+        ego=log.ego,
+        tracks=log.tracks,
+        traffic_lights=TrafficLights.empty(len(log.time_us)),
+        iteration_rows=np.arange(12, dtype=np.int64),
+        row_step=1,
+        route=_ROUTE,
+        mission_goal=None,
+        mapping=(1.0, 0.0, 1.0),
+    )

@@ -1,0 +1,259 @@
+"""Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
+
+import difflib
+import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.runs.results import Run
+from shiftsim.runs.rollouts import Task
+from shiftsim.view.page import MAX_ROLLOUTS, Page, asset, fill, json_text, replay_page
+from shiftsim.view.scene import Shown
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which rollouts to show.
+
+    Attributes:
+        planners: Only these; empty for all.
+        noises: Only these; empty for all.
+        seeds: Only these; empty for the first one of each planner and noise.
+    """
+
+    planners: tuple[str, ...] = ()
+    noises: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+
+    def of(self, tasks: Sequence[Task]) -> list[Task]:
+        """The tasks chosen among those of one scenario, by planner, noise and seed."""
+        wanted = [
+            task
+            for task in sorted(tasks)
+            if (not self.planners or _bare(task.planner) in self.planners)
+            and (not self.noises or task.noise in self.noises)
+            and (not self.seeds or task.seed in self.seeds or task.noise == "none")
+        ]
+        if self.seeds:
+            return wanted
+        first = {(task.planner, task.noise): task for task in reversed(wanted)}
+        return [task for task in wanted if first[task.planner, task.noise] == task]
+
+
+def _bare(planner: str) -> str:
+    """A planner's name without the remark that tells runs apart."""
+    return planner.partition(" (")[0]
+
+
+class Gallery:
+    """The stored rollouts of one or several runs on the same store, scenario by scenario."""
+
+    def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
+        """Index the runs.
+
+        Args:
+            runs: Runs whose rollouts are shown together.
+            store: The open store they were made with.
+            choice: Which of their rollouts to show.
+
+        Raises:
+            DataError: A run was made with another store.
+        """
+        self.store = store
+        self.choice = choice or Choice()
+        self._runs: dict[Task, tuple[Run, Task]] = {}
+        for run, name in zip(runs, _names(runs), strict=True):
+            if run.manifest["determining"]["store"] != store.hash:
+                raise DataError(
+                    f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
+                    hint="name the store that its manifest.json names",
+                )
+            for task, place in run.rollout_places.items():
+                if place is not None:
+                    planner = f"{task.planner} ({name})" if name else task.planner
+                    self._runs[task._replace(planner=planner)] = (run, task)
+        self._scores = {run.path: _by_task(run.scores.to_pylist()) for run in runs}
+        self._metrics = {run.path: _grouped(run.metrics.to_pylist()) for run in runs}
+        self._tokens: dict[str, list[Task]] = {}
+        for task in self._runs:
+            self._tokens.setdefault(task.token, []).append(task)
+
+    @property
+    def tokens(self) -> list[str]:
+        """Scenarios with rollouts to show, the lowest score first."""
+        found = [token for token, tasks in self._tokens.items() if self.choice.of(tasks)]
+        return sorted(found, key=lambda token: (self._lowest(token), token))
+
+    def _lowest(self, token: str) -> float:
+        return min(self._cls(task) for task in self.choice.of(self._tokens[token]))
+
+    def _cls(self, task: Task) -> float:
+        run, key = self._runs[task]
+        return float(self._scores[run.path].get(key, {}).get("cls", 1.0))
+
+    def find(self, text: str) -> str:
+        """A scenario by its token or an unambiguous beginning of it.
+
+        Raises:
+            ConfigError: There is none, or there are several.
+        """
+        found = [token for token in self._tokens if token.startswith(text)]
+        if text in self._tokens or len(found) == 1:
+            return text if text in self._tokens else found[0]
+        near = difflib.get_close_matches(text, self._tokens, n=1)
+        raise ConfigError(
+            f"{len(found) or 'no'} scenarios with stored rollouts begin with {text!r}",
+            hint=f"did you mean {near[0]!r}?" if near else f"such as {self.tokens[:3]}",
+        )
+
+    def tasks(self, token: str) -> list[Task]:
+        """The rollouts that the page of a scenario shows.
+
+        Raises:
+            ConfigError: There are none.
+        """
+        found = self.choice.of(self._tokens.get(token, []))
+        if not found:
+            raise ConfigError(
+                f"no stored rollout of scenario {token!r} fits",
+                hint="check --planner, --noise and --seeds; --save-rollouts none keeps none",
+            )
+        return found[:MAX_ROLLOUTS]
+
+    def shown(self, token: str, scenario: Any) -> list[Shown]:
+        """The rollouts of a page with what is known of them."""
+        out = []
+        for task in self.tasks(token):
+            run, key = self._runs[task]
+            row = self._scores[run.path].get(key, {})
+            rows = self._metrics[run.path].get(key, [])
+            log = run.rollout(key, scenario)
+            out.append(Shown(task.planner, task.noise, task.seed, log, row.get("cls"), rows))
+        return out
+
+    def page(self, token: str, *, back: str = "") -> Page:
+        """The replay of one scenario as HTML."""
+        scenario = self.store.read(token)
+        return replay_page(scenario, self.shown(token, scenario), back=back)
+
+    def rows(self, token: str) -> list[dict[str, Any]]:
+        """Rows of the scenario list: labels, scores and violated metrics of every rollout."""
+        return [self._row(task, index) for index, task in enumerate(self.tasks(token))]
+
+    def _row(self, task: Task, index: int) -> dict[str, Any]:
+        run, key = self._runs[task]
+        score = self._scores[run.path].get(key, {})
+        metrics = self._metrics[run.path].get(key, [])
+        firsts = {
+            SHORT_NAMES[row["metric"]]: row["first_violation_s"]
+            for row in metrics
+            if row["metric"] in SHORT_NAMES and row["score"] is not None and row["score"] < 1.0
+        }
+        return {
+            "token": task.token,
+            "type": score.get("scenario_type", ""),
+            "city": score.get("city", ""),
+            "planner": task.planner,
+            "noise": task.noise,
+            "seed": task.seed,
+            "cls": score.get("cls"),
+            "violated": firsts,
+            "index": index,
+            "page": f"replay/{page_name(task.token)}",
+        }
+
+
+def page_name(token: str) -> str:
+    """File name of a scenario's page: its token, other characters than letters and digits coded."""
+    safe = "".join(
+        c if c.isascii() and (c.isalnum() or c in "-_") else f"~{ord(c):x}" for c in token
+    )
+    return f"{safe}.html"
+
+
+def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> str:
+    """The page that lists scenarios, sortable and filterable.
+
+    Args:
+        title: Its heading.
+        rows: Rows of `Gallery.rows`.
+        above: HTML between heading and list; the caller escapes what comes from data.
+    """
+    return fill(
+        asset("list.html"),
+        title=html.escape(title),
+        style=asset("list.css"),
+        above=above,
+        data=f'<script type="application/json" id="data-rows">{json_text(list(rows))}</script>',
+        script=asset("list.js"),
+    )
+
+
+def write_site(
+    folder: Path,
+    galleries: Sequence[Gallery],
+    *,
+    title: str,
+    limit: int = 0,
+    above: str = "",
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Write one page per scenario and `index.html`, which lists them; returns how many pages.
+
+    Args:
+        folder: Where the list goes; the pages go to its subfolder `replay`.
+        galleries: One per store.
+        title: Heading of the list.
+        limit: At most so many pages, the lowest scores first; 0 for all.
+        above: HTML between heading and list; the caller escapes what comes from data.
+        on_progress: Called with the number of pages written and their total.
+    """
+    pages = folder / "replay"
+    pages.mkdir(parents=True, exist_ok=True)
+    found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
+    found = found[:limit] if limit else found
+    rows: list[dict[str, Any]] = []
+    for done, (gallery, token) in enumerate(found):
+        page = gallery.page(token, back="../index.html")
+        (pages / page_name(token)).write_text(page, encoding="utf-8")
+        rows += gallery.rows(token)
+        on_progress(done + 1, len(found))
+    (folder / "index.html").write_text(list_page(title, rows, above=above), encoding="utf-8")
+    return len(found)
+
+
+def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
+    """One gallery per store.
+
+    Args:
+        runs: The runs.
+        stores: The open store of each run.
+        choice: Which rollouts to show.
+    """
+    by_store: dict[str, tuple[Any, list[Run]]] = {}
+    for run, store in zip(runs, stores, strict=True):
+        by_store.setdefault(store.hash, (store, []))[1].append(run)
+    return [Gallery(members, store, choice) for store, members in by_store.values()]
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """What tells the rollouts of each run from those of the others: traffic, or the run's name."""
+    if len(runs) == 1:
+        return [""]
+    traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
+    return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]
+
+
+def _by_task(rows: Sequence[Mapping[str, Any]]) -> dict[Task, Mapping[str, Any]]:
+    return {Task(*(row[name] for name in Task._fields)): row for row in rows}
+
+
+def _grouped(rows: Sequence[Mapping[str, Any]]) -> dict[Task, list[Mapping[str, Any]]]:
+    out: dict[Task, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        out.setdefault(Task(*(row[name] for name in Task._fields)), []).append(row)
+    return out

@@ -1,0 +1,112 @@
+"""The replay page: template, script and packed data in one HTML text."""
+
+import html
+import json
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from shiftsim.sim.log import SimulationLog
+from shiftsim.view.pack import pack
+from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
+from shiftsim.world.scenario import Scenario
+
+_HERE = Path(__file__).parent
+_SCRIPTS = ("codec.js", "world.js", "strips.js", "replay.js")
+MAX_ROLLOUTS = 6
+
+
+class Page(str):
+    """The text of a page; notebooks show it as a frame."""
+
+    __slots__ = ()
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to a file."""
+        file = Path(path)
+        file.write_text(self, encoding="utf-8")
+        return file
+
+    def _repr_html_(self) -> str:
+        return embedded(self)
+
+
+def show(scenario: Scenario, **logs: SimulationLog) -> Page:
+    """A replay of rollouts of one scenario, as `shiftsim.show(scenario, mine=log)`.
+
+    Args:
+        scenario: The scenario that was driven.
+        logs: One to six rollouts by name; underscores stand for hyphens.
+
+    Raises:
+        ValueError: There are no rollouts, or more than six.
+    """
+    shown = [
+        Shown(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)
+        for name, log in logs.items()
+    ]
+    return replay_page(scenario, shown)
+
+
+def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -> Page:
+    """One self-contained HTML page.
+
+    Args:
+        scenario: The scenario that was driven.
+        shown: One to six rollouts of it.
+        back: Relative address of a page to return to, empty for none.
+
+    Raises:
+        ValueError: There are no rollouts, or more than six.
+    """
+    if not 1 <= len(shown) <= MAX_ROLLOUTS:
+        raise ValueError(f"a replay shows 1 to {MAX_ROLLOUTS} rollouts, not {len(shown)}")
+    replay = Replay(scenario, shown)
+    meta = describe_scene(replay) | {"back": back}
+    sections = {"scene": pack(scene_fields(replay))}
+    for index in range(len(shown)):
+        sections[f"rollout{index}"] = pack(rollout_fields(replay, index))
+    data = [_data("meta", "application/json", json_text(meta))]
+    data += [_data(name, "text/plain", text) for name, text in sections.items()]
+    text = fill(
+        asset("replay.html"),
+        title=html.escape(f"{scenario.token} · shiftsim"),
+        style=asset("replay.css"),
+        data="\n".join(data),
+        script="\n".join(asset(name) for name in _SCRIPTS),
+    )
+    return Page(text)
+
+
+@cache
+def asset(name: str, folder: Path = _HERE) -> str:
+    """A file of this folder, or of another one."""
+    return (folder / name).read_text(encoding="utf-8")
+
+
+def fill(template: str, **parts: str) -> str:
+    """The template with every `{{name}}` replaced, in one pass: parts are never scanned again."""
+    pieces = template.split("{{")
+    out = [pieces[0]]
+    for piece in pieces[1:]:
+        name, _, rest = piece.partition("}}")
+        out += [parts[name], rest]
+    return "".join(out)
+
+
+def json_text(value: Any) -> str:
+    """JSON that can stand inside a script element whatever its strings hold."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _data(name: str, kind: str, text: str) -> str:
+    return f'<script type="{kind}" id="data-{name}">{text}</script>'
+
+
+def embedded(page: str, height: int = 640) -> str:
+    """A page as a frame inside a notebook."""
+    source = html.escape(page, quote=True)
+    style = f"width:100%;height:{height}px;border:0"
+    return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{source}"></iframe>'

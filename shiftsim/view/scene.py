@@ -1,0 +1,293 @@
+"""What a replay shows: map clippings, tracks, lights and rollouts of one scenario, as arrays.
+
+Positions are relative to a whole-metre origin near the scene, so that quantised values are small.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.report.palette import looks
+from shiftsim.sim.log import SimulationLog
+from shiftsim.view.pack import Quantised
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AX, PACIFICA, Tracks, speeds
+
+Fields: TypeAlias = dict[str, Quantised | np.ndarray]
+
+MARGIN = 100.0  # m of map around everything the ego does
+_METRES, _RADIANS, _SPEED, _SECONDS = 0.01, 0.001, 0.01, 0.001
+_MAP_STEP = 0.05  # m
+_TOLERANCE = 0.05  # m, of simplified map lines
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One rollout in a replay.
+
+    Attributes:
+        planner: Its planner.
+        noise: Name of the noise.
+        seed: Seed of the noise.
+        log: The rollout.
+        cls: Its score in [0, 1]; None where it was not scored.
+        metrics: Rows of `metrics.parquet`.
+    """
+
+    planner: str
+    noise: str
+    seed: int
+    log: SimulationLog
+    cls: float | None = None
+    metrics: Sequence[Mapping[str, Any]] = ()
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A scenario and the rollouts of it that are shown together."""
+
+    scenario: Scenario
+    shown: Sequence[Shown]
+
+    @cached_property
+    def box(self) -> FloatArray:
+        """(4,) min x, min y, max x, max y of the map that is shown [m]."""
+        paths = [self.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in self.shown)]
+        points = np.concatenate(paths)
+        return np.concatenate([points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN])
+
+    @cached_property
+    def origin(self) -> FloatArray:
+        """(2,) whole metres that positions are relative to."""
+        return np.rint((self.box[:2] + self.box[2:]) / 2.0)
+
+    @cached_property
+    def own_tracks(self) -> bool:
+        """Whether the traffic differs from the recording, as reactive traffic does."""
+        recorded = self.scenario.tracks.rows(self.scenario.iteration_rows[:-1])
+        return any(
+            not np.array_equal(item.log.tracks.valid, recorded.valid)
+            or not np.array_equal(item.log.tracks.poses, recorded.poses, equal_nan=True)
+            for item in self.shown
+        )
+
+
+def scene_fields(replay: Replay) -> Fields:
+    """Map, expert, lights and recorded tracks: what all rollouts of a scenario share.
+
+    Tracks are left out when every rollout carries its own.
+    """
+    origin = replay.origin
+    layers = map_lines(replay.scenario, replay.box)
+    layers["lights"] = _light_lines(replay.scenario)
+    fields: Fields = {}
+    for name, lines in layers.items():
+        xy = np.concatenate(lines) if lines else np.zeros((0, 2))
+        fields[f"{name}.xy"] = Quantised(xy - origin, _MAP_STEP)
+        fields[f"{name}.count"] = Quantised(np.array([len(line) for line in lines], float), 1.0)
+    log = replay.shown[0].log
+    fields["time"] = Quantised((log.time_us - log.time_us[0]) * 1e-6, _SECONDS)
+    fields |= _poses("expert", log.expert_ego[:, None, :3], origin)
+    fields["expert.speed"] = Quantised(speeds(log.expert_ego), _SPEED)
+    fields["lights.status"] = (log.traffic_lights.status + 1).astype(np.uint8)
+    if not replay.own_tracks:
+        fields |= _track_fields(log.tracks, origin)
+    return fields
+
+
+def rollout_fields(replay: Replay, index: int) -> Fields:
+    """What belongs to one rollout."""
+    origin = replay.origin
+    log = replay.shown[index].log
+    fields = _poses("ego", log.ego[:, None, :3], origin)
+    fields["speed"] = Quantised(speeds(log.ego), _SPEED)
+    fields["accel"] = Quantised(log.ego[:, AX].copy(), _SPEED)
+    fields["plan"] = Quantised(log.plans[:, :, :2] - log.ego[:, None, :2], _METRES)
+    fields["noise"] = Quantised(log.noise, _RADIANS)
+    fields["degraded"] = log.degraded
+    if replay.own_tracks:
+        fields |= _track_fields(log.tracks, origin)
+    return fields
+
+
+def describe_scene(replay: Replay) -> dict[str, Any]:
+    """Everything that is text or a single number, as JSON values."""
+    scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
+    styles = looks(item.planner for item in shown)
+    return {
+        "token": scenario.token,
+        "type": scenario.scenario_type,
+        "city": scenario.city,
+        "log": scenario.log_name,
+        "vehicle": [PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center],
+        "ownTracks": own,
+        "tracks": None if own else _track_names(shown[0].log.tracks),
+        "rollouts": [
+            {
+                "planner": item.planner,
+                "noise": item.noise,
+                "seed": item.seed,
+                "cls": item.cls,
+                "colour": styles[item.planner].colour,
+                "marker": styles[item.planner].marker,
+                "violations": _violations(item.metrics),
+                "scores": _scores(item.metrics),
+                "degraded": int(item.log.degraded.sum()),
+                "tracks": _track_names(item.log.tracks) if own else None,
+            }
+            for item in shown
+        ],
+    }
+
+
+def _poses(name: str, poses: FloatArray, origin: FloatArray) -> Fields:
+    """(T, N, 3) poses as positions and continuous headings."""
+    heading = poses[:, :, 2].copy()
+    known = ~np.isnan(heading)
+    for column in range(heading.shape[1]):
+        rows = known[:, column]
+        heading[rows, column] = np.unwrap(heading[rows, column])
+    return {
+        f"{name}.xy": Quantised(poses[:, :, :2] - origin, _METRES),
+        f"{name}.heading": Quantised(heading, _RADIANS),
+    }
+
+
+def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
+    """Tracks that are there at some time; values of absent samples repeat the one before."""
+    used = _used(tracks)
+    valid = tracks.valid[:, used]
+    rows = np.where(valid, np.arange(len(valid))[:, None], 0)
+    rows = np.maximum.accumulate(rows, axis=0)
+    rows = np.maximum(rows, valid.argmax(axis=0)[None, :])  # before its first sample: that one
+    columns = np.arange(valid.shape[1])[None, :]
+    poses = tracks.poses[:, used][rows, columns]
+    first = valid.argmax(axis=0)
+    sizes = tracks.sizes[:, used][first, columns[0]]
+    return {
+        "tracks.valid": valid,
+        "tracks.kind": tracks.kinds[used].astype(np.uint8),
+        "tracks.size": Quantised(sizes, _METRES),
+        **_poses("tracks", np.array(poses), origin),
+    }
+
+
+def _used(tracks: Tracks) -> np.ndarray:
+    return np.flatnonzero(tracks.valid.any(axis=0))
+
+
+def _track_names(tracks: Tracks) -> list[str]:
+    return [tracks.tokens[i] for i in _used(tracks)]
+
+
+def _violations(metrics: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """First violations of scored metrics, by time."""
+    out = [
+        {
+            "metric": row["metric"],
+            "short": SHORT_NAMES[row["metric"]],
+            "multiplier": row["metric"] in MULTIPLIERS,
+            "t": row["first_violation_s"],
+            "value": _finite(row["first_violation_value"]),
+            "threshold": _finite(row["threshold"]),
+            "unit": row["unit"],
+            "partner": row["partner_token"],
+            "score": row["score"],
+        }
+        for row in metrics
+        if row["metric"] in SHORT_NAMES
+        and row["first_violation_s"] is not None
+        and row["score"] is not None
+        and row["score"] < 1.0
+    ]
+    return sorted(out, key=lambda item: item["t"])
+
+
+def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Scores by short name."""
+    return {
+        SHORT_NAMES[row["metric"]]: row["score"]
+        for row in metrics
+        if row["metric"] in SHORT_NAMES and row["score"] is not None
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no infinity."""
+    return value if value is not None and np.isfinite(value) else None
+
+
+def map_lines(scenario: Scenario, box: FloatArray) -> dict[str, list[FloatArray]]:
+    """Rings (for even-odd filling) and lines of the map inside the box, by layer."""
+    road = scenario.map
+    areas = {
+        "drivable": road.drivable_areas,
+        "walkway": road.walkways,
+        "crosswalk": road.crosswalks,
+        "stop": road.stop_polygons,
+    }
+    out = {name: _rings(_near(layer, box), box) for name, layer in areas.items()}
+    blocks = [road.blocks.index[name] for name in scenario.route if name in road.blocks.index]
+    out["route"] = _rings(_near(road.blocks, box, np.array(sorted(set(blocks)), np.int64)), box)
+    edges = _indices_near(road.edges.polygons.bounds, box)
+    sides = [lines.at(e) for e in edges for lines in (road.left_boundaries, road.right_boundaries)]
+    out["boundary"] = _lines(sides, box)
+    out["centre"] = _lines([road.baselines.at(e) for e in edges], box)
+    return out
+
+
+def _indices_near(bounds: FloatArray, box: FloatArray) -> np.ndarray:
+    return np.flatnonzero(
+        (bounds[:, 0] <= box[2])
+        & (bounds[:, 1] <= box[3])
+        & (bounds[:, 2] >= box[0])
+        & (bounds[:, 3] >= box[1])
+    )
+
+
+def _near(layer: Any, box: FloatArray, among: np.ndarray | None = None) -> list[shapely.Polygon]:
+    found = _indices_near(layer.polygons.bounds, box)
+    if among is not None:
+        found = np.intersect1d(found, among)
+    return [layer.shape(int(i)) for i in found]
+
+
+def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]:
+    """Outlines of the union, so that overlapping polygons do not show their seams."""
+    if not polygons:
+        return []
+    clipped = shapely.clip_by_rect(np.array(polygons, object), *box)
+    whole = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
+    parts = shapely.get_parts(shapely.simplify(whole, _TOLERANCE))
+    return [
+        shapely.get_coordinates(ring)
+        for part in parts
+        if part.geom_type == "Polygon"
+        for ring in (part.exterior, *part.interiors)
+    ]
+
+
+def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
+    """Lines inside the box, each once: neighbouring lanes share a boundary."""
+    made = [shapely.LineString(line) for line in lines if len(line) > 1]
+    if not made:
+        return []
+    clipped = shapely.clip_by_rect(np.array(made, object), *box)
+    parts = shapely.get_parts(shapely.simplify(clipped, _TOLERANCE))
+    found = {part.normalize().wkb: part for part in parts if part.geom_type == "LineString"}
+    return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]
+
+
+def _light_lines(scenario: Scenario) -> list[FloatArray]:
+    """Centre lines of the connectors that lights govern, in the order of the lights."""
+    road = scenario.map
+    return [
+        road.baselines.at(road.edges.index[name]) if name in road.edges.index else np.zeros((0, 2))
+        for name in scenario.traffic_lights.connector_ids
+    ]

@@ -1,0 +1,219 @@
+"""Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import ConfigError, MissingExtraError
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.report.palette import looks
+from shiftsim.view.scene import Replay, Shown, map_lines
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import PACIFICA, AgentKind, Tracks, center_poses
+
+STILLS = (".pdf", ".png", ".svg")
+FILMS = (".mp4", ".gif")
+_PAD = 12.0  # m around the driven paths
+_FPS = 10
+_DPI = 150
+_LAYERS = {  # what is drawn first lies below
+    "walkway": "#ece6d8",
+    "drivable": "#dcdcd8",
+    "route": "#b9d2be",
+    "crosswalk": "#f7f4ea",
+}
+_AGENTS = {
+    AgentKind.VEHICLE: "#8797a8",
+    AgentKind.PEDESTRIAN: "#a8791e",
+    AgentKind.BICYCLE: "#8a5f9e",
+}
+_OTHER, _LOG = "#8f8f8f", "#6e6e6e"
+
+
+def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: float) -> None:
+    """A still of one moment, or a film of the whole rollout, by the ending of the file's name.
+
+    Args:
+        path: `.pdf`, `.png`, `.svg`, or `.mp4`, `.gif`.
+        scenario: The scenario that was driven.
+        shown: Rollouts of it; noisy ones are dashed.
+        at: Time of a still from the start [s].
+
+    Raises:
+        ConfigError: The ending or the time is none of those possible.
+        MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
+    """
+    times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
+    if path.suffix.lower() not in STILLS + FILMS:
+        raise ConfigError(
+            f"{str(path)!r} ends in {path.suffix!r}",
+            hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
+        )
+    if not 0.0 <= at <= times[-1] + 1e-9:
+        raise ConfigError(f"time {at} s is not within 0 … {times[-1]:.1f} s", hint="--at SECONDS")
+    pyplot = _matplotlib()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, axes = _canvas(pyplot, Replay(scenario, shown))
+    try:
+        if path.suffix.lower() in FILMS:
+            _film(path, figure, axes, shown)
+        else:
+            row = int(np.argmin(np.abs(times - at)))
+            _moment(axes, shown, row)
+            _heading(axes, scenario, float(times[row]))
+            figure.savefig(path, dpi=_DPI, metadata=_metadata(path))
+    finally:
+        pyplot.close(figure)
+
+
+def _matplotlib() -> Any:
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        matplotlib.rcParams["svg.hashsalt"] = (
+            "shiftsim"  # ids in SVG files are then always the same
+        )
+        from matplotlib import pyplot
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
+        ) from error
+    return pyplot
+
+
+def _metadata(path: Path) -> dict[str, Any] | None:
+    """No time stamps: the same picture has the same bytes."""
+    return {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
+
+
+def _canvas(pyplot: Any, replay: Replay) -> tuple[Any, Any]:
+    """Axes with the map, as large as the driven paths need."""
+    paths = [replay.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in replay.shown)]
+    points = np.concatenate(paths)
+    low, high = points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    half = np.maximum(half, half.max() * 0.5)  # never a mere strip
+    extent = np.array([*(middle - half), *(middle + half)])
+    width = 7.0
+    height = width * half[1] / half[0]
+    if height > 7.0:
+        width, height = 7.0 * width / height, 7.0
+    figure, axes = pyplot.subplots(figsize=(max(width, 4.0), height + 0.9), layout="constrained")
+    _draw_map(axes, map_lines(replay.scenario, extent))
+    axes.set_xlim(extent[0], extent[2])
+    axes.set_ylim(extent[1], extent[3])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    _scale_bar(axes, extent)
+    return figure, axes
+
+
+def _draw_map(axes: Any, layers: dict[str, list[FloatArray]]) -> None:
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    for name, colour in _LAYERS.items():
+        if layers[name]:
+            outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
+            axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="none", zorder=1))
+    axes.add_collection(
+        LineCollection(layers["boundary"], colors="#a9a9a3", linewidths=0.5, zorder=1.5)
+    )
+
+
+def _scale_bar(axes: Any, extent: FloatArray) -> None:
+    width = extent[2] - extent[0]
+    length = next(v for v in (100, 50, 20, 10, 5, 2, 1) if v <= max(width / 4.0, 1.0))
+    x, y = extent[0] + 0.04 * width, extent[1] + 0.04 * (extent[3] - extent[1])
+    axes.plot([x, x + length], [y, y], color="black", linewidth=2, zorder=9)
+    axes.text(x + length / 2.0, y, f"{length} m\n", ha="center", va="bottom", fontsize=8, zorder=9)
+
+
+def _heading(axes: Any, scenario: Scenario, time: float) -> None:
+    words = (scenario.token, scenario.scenario_type, scenario.city, f"{time:.1f} s")
+    axes.set_title("  ".join(words).replace("$", r"\$"), fontsize=9)
+
+
+def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
+    """Everything that moves at one sample; returns what was drawn."""
+    styles = looks(item.planner for item in shown)
+    drawn = _draw_agents(axes, shown[0].log.tracks, row)
+    expert = shown[0].log.expert_ego
+    dotted = {"color": _LOG, "linewidth": 1, "linestyle": ":", "zorder": 4}
+    drawn += axes.plot(expert[:, 0], expert[:, 1], label="recorded driver", **dotted)
+    for item in shown:
+        look, ego = styles[item.planner], item.log.ego
+        clean = item.noise == "none"
+        label = item.planner if clean else f"{item.planner} {item.noise}"
+        drawn += axes.plot(
+            ego[:, 0],
+            ego[:, 1],
+            color=look.colour,
+            linewidth=1.8,
+            linestyle="-" if clean else (0, (5, 3)),
+            marker=look.marker,
+            markersize=6,
+            markeredgecolor="white",
+            markeredgewidth=0.5,
+            markevery=(min(10, len(ego) - 1), 30),
+            zorder=6,
+            label=label,
+        )
+        drawn += _draw_boxes(
+            axes,
+            center_poses(ego[row : row + 1, :3]),
+            np.array([[PACIFICA.length, PACIFICA.width]]),
+            look.colour,
+            zorder=7,
+        )
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
+    axes.legend(fontsize=8, frameon=False, **place)
+    return drawn
+
+
+def _draw_agents(axes: Any, tracks: Tracks, row: int) -> list[Any]:
+    drawn: list[Any] = []
+    for kind in np.unique(tracks.kinds):
+        there = tracks.valid[row] & (tracks.kinds == kind)
+        colour = _AGENTS.get(AgentKind(int(kind)), _OTHER)
+        drawn += _draw_boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], colour)
+    return drawn
+
+
+def _draw_boxes(
+    axes: Any, poses: FloatArray, sizes: FloatArray, colour: str, zorder: float = 3
+) -> list[Any]:
+    """(N, 3) centre poses and (N, 2) lengths and widths as filled boxes."""
+    from matplotlib.collections import PolyCollection
+
+    if not len(poses):
+        return []
+    corners = boxes_to_corners(poses, sizes)
+    edge: dict[str, Any] = {"edgecolors": "#30363c", "linewidths": 0.6}
+    boxes = PolyCollection(list(corners), facecolors=colour, zorder=zorder, **edge)
+    return [axes.add_collection(boxes, autolim=False)]
+
+
+def _film(path: Path, figure: Any, axes: Any, shown: Sequence[Shown]) -> None:
+    """All samples, one after the other."""
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    writer: Any = PillowWriter(fps=_FPS)
+    if path.suffix.lower() == ".mp4":
+        if not FFMpegWriter.isAvailable():
+            raise MissingExtraError("mp4 needs ffmpeg", hint="install ffmpeg, or write a .gif")
+        writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
+    times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
+    with writer.saving(figure, str(path), _DPI * 2 // 3):
+        for row, time in enumerate(times):
+            drawn = _moment(axes, shown, row)
+            axes.set_title(f"{shown[0].log.token}  {time:.1f} s", fontsize=9)
+            writer.grab_frame()
+            for artist in drawn:
+                artist.remove()

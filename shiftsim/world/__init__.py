@@ -1,0 +1,1 @@
+"""What exists: states, maps, layers of a map, scenarios."""

@@ -1,0 +1,368 @@
+"""Flat geometry of a map layer: polygons with holes, a grid over them, polylines, ragged lists.
+
+Kernels take the NamedTuples of this file as they are. Point queries cost one grid look-up and a few
+exact point-in-polygon tests; results come in the order of the layer, as nuPlan's tables do.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.polylines import arc_lengths
+from shiftsim.geometry.predicates import orientation
+from shiftsim.geometry.rings import (
+    EXTERIOR,
+    INTERIOR,
+    locate_in_polygon,
+    polygon_distance,
+    segments_intersect,
+)
+
+_MIN_CELL, _MAX_CELL = 4.0, 64.0  # m
+_CELLS_PER_POLYGON = 4
+
+
+class Lists(NamedTuple):
+    """Ragged integer lists: list i is `items[ptr[i] : ptr[i + 1]]`."""
+
+    ptr: IntArray
+    items: IntArray
+
+    def at(self, index: int) -> IntArray:
+        """List number `index`."""
+        return self.items[self.ptr[index] : self.ptr[index + 1]]
+
+
+class Polylines(NamedTuple):
+    """Many polylines: line i has the vertices `xy[ptr[i] : ptr[i + 1]]`.
+
+    Attributes:
+        xy: (V, 2) vertices [m].
+        ptr: (M + 1,) first vertex of each line.
+        arc: (V,) arc length at each vertex from the start of its line [m].
+    """
+
+    xy: FloatArray
+    ptr: IntArray
+    arc: FloatArray
+
+    def at(self, index: int) -> FloatArray:
+        """(K, 2) vertices of line `index` [m]."""
+        return self.xy[self.ptr[index] : self.ptr[index + 1]]
+
+    def length(self, index: int) -> float:
+        """Length of line `index` [m]."""
+        return float(self.arc[self.ptr[index + 1] - 1])
+
+
+class Polygons(NamedTuple):
+    """Many polygons with holes, and a uniform grid that lists the polygons near each cell.
+
+    Attributes:
+        xy: (V, 2) vertices of all rings; the closing vertex is not repeated [m].
+        ring_ptr: (R + 1,) first vertex of each ring.
+        poly_ptr: (M + 1,) first ring of each polygon; the first ring is the shell.
+        bounds: (M, 4) min x, min y, max x, max y [m].
+        grid: (3,) x and y of the grid's corner, cell size [m].
+        shape: (2,) number of cells along x and y.
+        cell_ptr: (cells + 1,) first entry of each cell in `cell_items`, cell = ix * shape[1] + iy.
+        cell_items: Polygon indices, ascending within a cell.
+    """
+
+    xy: FloatArray
+    ring_ptr: IntArray
+    poly_ptr: IntArray
+    bounds: FloatArray
+    grid: FloatArray
+    shape: IntArray
+    cell_ptr: IntArray
+    cell_items: IntArray
+
+
+def _frozen(array: Any) -> Any:
+    """The array, read-only: maps never change, and kernels see one type of array for all maps."""
+    array.flags.writeable = False
+    return array
+
+
+def make_lists(rows: Iterable[Sequence[int]]) -> Lists:
+    """Ragged lists from Python lists."""
+    kept = [np.asarray(row, np.int64) for row in rows]
+    ptr = np.zeros(len(kept) + 1, np.int64)
+    np.cumsum([len(row) for row in kept], out=ptr[1:])
+    items = np.concatenate(kept) if kept else np.zeros(0, np.int64)
+    return Lists(_frozen(ptr), _frozen(items))
+
+
+def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
+    """Polylines from (K, 2) vertex arrays [m]; an empty array stands for a missing line."""
+    ptr = np.zeros(len(lines) + 1, np.int64)
+    np.cumsum([len(line) for line in lines], out=ptr[1:])
+    parts = [np.asarray(line, np.float64).reshape(-1, 2) for line in lines]
+    xy = np.ascontiguousarray(np.concatenate(parts)) if parts else np.zeros((0, 2))
+    return Polylines(_frozen(xy), _frozen(ptr), _frozen(arc_lengths(xy, ptr)))
+
+
+def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
+    """Polygons from lists of rings (shell first, then holes), each ring (V, 2) [m]."""
+    rings = [_open_ring(ring) for polygon in polygons for ring in polygon]
+    ring_ptr = np.zeros(len(rings) + 1, np.int64)
+    np.cumsum([len(ring) for ring in rings], out=ring_ptr[1:])
+    poly_ptr = np.zeros(len(polygons) + 1, np.int64)
+    np.cumsum([len(polygon) for polygon in polygons], out=poly_ptr[1:])
+    xy = np.ascontiguousarray(np.concatenate(rings)) if rings else np.zeros((0, 2))
+    return index_polygons(xy, ring_ptr, poly_ptr)
+
+
+def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Polygons:
+    """Add bounds and the grid to flat polygons (arrays as in `Polygons`)."""
+    count = len(poly_ptr) - 1
+    bounds = np.empty((count, 4))
+    if count:
+        starts = ring_ptr[poly_ptr[:-1]]
+        bounds[:, :2] = np.minimum.reduceat(xy, starts)
+        bounds[:, 2:] = np.maximum.reduceat(xy, starts)
+    low = bounds[:, :2].min(axis=0) if count else np.zeros(2)
+    high = bounds[:, 2:].max(axis=0) if count else np.zeros(2)
+    area = float(np.prod(np.maximum(high - low, 1.0)))
+    cell = float(
+        np.clip(np.sqrt(area / (_CELLS_PER_POLYGON * max(count, 1))), _MIN_CELL, _MAX_CELL)
+    )
+    shape = (np.floor((high - low) / cell).astype(np.int64) + 1).astype(np.int64)
+    first = np.floor((bounds[:, :2] - low) / cell).astype(np.int64)
+    last = np.minimum(np.floor((bounds[:, 2:] - low) / cell).astype(np.int64), shape - 1)
+    cell_ptr, cell_items = _fill_cells(first, last, shape)
+    grid = np.array([low[0], low[1], cell])
+    arrays = (xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)
+    return Polygons(*(_frozen(array) for array in arrays))
+
+
+def _open_ring(ring: FloatArray) -> FloatArray:
+    xy = np.asarray(ring, np.float64)[:, :2]
+    return xy[:-1] if len(xy) > 1 and (xy[0] == xy[-1]).all() else xy
+
+
+@kernel
+def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntArray, IntArray]:
+    cells = shape[0] * shape[1]
+    ptr = np.zeros(cells + 1, np.int64)
+    for poly in range(len(first)):
+        for ix in range(first[poly, 0], last[poly, 0] + 1):
+            for iy in range(first[poly, 1], last[poly, 1] + 1):
+                ptr[ix * shape[1] + iy + 1] += 1
+    for cell in range(cells):
+        ptr[cell + 1] += ptr[cell]
+    items = np.empty(ptr[-1], np.int64)
+    fill = ptr[:-1].copy()
+    for poly in range(len(first)):
+        for ix in range(first[poly, 0], last[poly, 0] + 1):
+            for iy in range(first[poly, 1], last[poly, 1] + 1):
+                cell = ix * shape[1] + iy
+                items[fill[cell]] = poly
+                fill[cell] += 1
+    return ptr, items
+
+
+@lean_kernel
+def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
+    """Write the polygons that hold a point in their interior into `out`, ascending.
+
+    Args:
+        polygons: The layer.
+        x: Point [m].
+        y: Point [m].
+        out: Room for the indices; those that do not fit are counted but not written.
+
+    Returns:
+        How many polygons hold the point.
+    """
+    fx = np.floor((x - polygons.grid[0]) / polygons.grid[2])
+    fy = np.floor((y - polygons.grid[1]) / polygons.grid[2])
+    if not (0.0 <= fx < polygons.shape[0] and 0.0 <= fy < polygons.shape[1]):
+        return 0  # also where a coordinate is NaN
+    cell = int(fx) * polygons.shape[1] + int(fy)
+    found = 0
+    for entry in range(polygons.cell_ptr[cell], polygons.cell_ptr[cell + 1]):
+        poly = polygons.cell_items[entry]
+        if contains(polygons, poly, x, y):
+            if found < len(out):
+                out[found] = poly
+            found += 1
+    return found
+
+
+@lean_kernel
+def contains(polygons: Polygons, poly: int, x: float, y: float) -> bool:
+    """Whether polygon `poly` holds a point in its interior; the boundary does not count."""
+    if (
+        x < polygons.bounds[poly, 0]
+        or y < polygons.bounds[poly, 1]
+        or x > polygons.bounds[poly, 2]
+        or y > polygons.bounds[poly, 3]
+    ):
+        return False
+    first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
+    return locate_in_polygon(polygons.xy, polygons.ring_ptr, first, last, x, y) == INTERIOR
+
+
+@kernel
+def in_any(polygons: Polygons, x: float, y: float) -> bool:
+    """Whether any polygon holds a point in its interior."""
+    return containing(polygons, x, y, np.empty(0, np.int64)) > 0
+
+
+@lean_kernel
+def distance_to(polygons: Polygons, poly: int, x: float, y: float) -> float:
+    """Distance from a point to polygon `poly`, 0 inside [m]."""
+    first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
+    return polygon_distance(polygons.xy, polygons.ring_ptr, first, last, x, y)
+
+
+@lean_kernel
+def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, float]:
+    """The polygon nearest to a point and its distance [m]; (-1, inf) when none is within `limit`.
+
+    The first one in the order of the layer on ties.
+    """
+    return nearest_of(polygons, 0, len(polygons.bounds), x, y, limit)
+
+
+@lean_kernel
+def nearest_of(
+    polygons: Polygons, first: int, stop: int, x: float, y: float, limit: float
+) -> tuple[int, float]:
+    """As `nearest`, among the polygons `first` … `stop` - 1."""
+    best, found = np.inf, -1
+    for poly in range(first, stop):
+        dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
+        dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
+        reach = min(best, limit)
+        if dx * dx + dy * dy > reach * reach:
+            continue
+        distance = distance_to(polygons, poly, x, y)
+        if distance < best and distance <= limit:
+            best, found = distance, poly
+    return found, best
+
+
+@lean_kernel
+def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
+    """Whether polygon `poly` shares a point with a convex ring (V, 2), counter-clockwise [m]."""
+    first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
+    xy, ring_ptr = polygons.xy, polygons.ring_ptr
+    for vertex in range(ring_ptr[first], ring_ptr[last]):
+        if _in_convex(ring, xy[vertex, 0], xy[vertex, 1]):
+            return True
+    for corner in range(len(ring)):
+        x, y = ring[corner, 0], ring[corner, 1]
+        if locate_in_polygon(xy, ring_ptr, first, last, x, y) != EXTERIOR:
+            return True
+    for chain in range(first, last):
+        before = ring_ptr[chain + 1] - 1
+        for vertex in range(ring_ptr[chain], ring_ptr[chain + 1]):
+            for corner in range(len(ring)):
+                if segments_intersect(xy[before], xy[vertex], ring[corner - 1], ring[corner]):
+                    return True
+            before = vertex
+    return False
+
+
+@lean_kernel
+def _in_convex(ring: FloatArray, x: float, y: float) -> bool:
+    """Whether a point lies in a convex ring (V, 2), counter-clockwise, or on it."""
+    for corner in range(len(ring)):
+        ax, ay = ring[corner - 1, 0], ring[corner - 1, 1]
+        if orientation(ax, ay, ring[corner, 0], ring[corner, 1], x, y) < 0:
+            return False
+    return True
+
+
+@kernel
+def meeting(polygons: Polygons, ring: FloatArray) -> IntArray:
+    """Polygons that share a point with a convex ring (V, 2), counter-clockwise, ascending."""
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for corner in range(len(ring)):
+        low_x, high_x = min(low_x, ring[corner, 0]), max(high_x, ring[corner, 0])
+        low_y, high_y = min(low_y, ring[corner, 1]), max(high_y, ring[corner, 1])
+    bounds = polygons.bounds
+    out = np.empty(len(bounds), np.int64)
+    found = 0
+    for poly in range(len(bounds)):
+        if (
+            bounds[poly, 0] <= high_x
+            and bounds[poly, 2] >= low_x
+            and bounds[poly, 1] <= high_y
+            and bounds[poly, 3] >= low_y
+            and meets_convex(polygons, poly, ring)
+        ):
+            out[found] = poly
+            found += 1
+    return out[:found].copy()
+
+
+@kernel
+def square_around(x: float, y: float, half_width: float) -> FloatArray:
+    """(4, 2) corners of an axis-parallel square, counter-clockwise [m]."""
+    low_x, low_y, high_x, high_y = x - half_width, y - half_width, x + half_width, y + half_width
+    corners = (high_x, high_y, low_x, high_y, low_x, low_y, high_x, low_y)
+    return np.array(corners).reshape(4, 2)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Map objects of one kind: their ids and polygons.
+
+    Attributes:
+        ids: M object ids, in the order of the source.
+        polygons: Their areas.
+        index: Position of an id in `ids`.
+    """
+
+    ids: tuple[str, ...]
+    polygons: Polygons
+    index: dict[str, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "index", {name: i for i, name in enumerate(self.ids)})
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def rings(self, index: int) -> list[FloatArray]:
+        """Rings (V, 2) of one polygon, shell first, not closed [m]."""
+        flat = self.polygons
+        return [
+            flat.xy[flat.ring_ptr[r] : flat.ring_ptr[r + 1]]
+            for r in range(flat.poly_ptr[index], flat.poly_ptr[index + 1])
+        ]
+
+    def shape(self, index: int) -> shapely.Polygon:
+        """One polygon as a shapely object, for drawing and for slow exact work."""
+        shell, *holes = self.rings(index)
+        return shapely.Polygon(shell, holes)
+
+    def containing(self, x: float, y: float) -> IntArray:
+        """Indices of the polygons that hold a point in their interior, ascending."""
+        out = np.empty(16, np.int64)
+        count = containing(self.polygons, x, y, out)
+        if count > len(out):
+            out = np.empty(count, np.int64)
+            containing(self.polygons, x, y, out)
+        return out[:count]
+
+    def within_box(self, x: float, y: float, half_width: float) -> IntArray:
+        """Indices of the polygons that share a point with an axis-parallel square around (x, y)."""
+        return meeting(self.polygons, square_around(x, y, half_width))
+
+
+def make_layer(ids: Iterable[str], polygons: Sequence[shapely.Polygon]) -> Layer:
+    """A layer from ids and shapely polygons of the same order [m]."""
+    rings = [
+        [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
+        for polygon in polygons
+    ]
+    return Layer(tuple(ids), make_polygons(rings))

@@ -1,0 +1,66 @@
+"""Scenario: one logged situation, ready to be simulated.
+
+Rows are the log's own samples (20 Hz); iterations are the rows the simulation visits (10 Hz). Rows
+before the first iteration feed the history a planner sees, rows after the last one feed planners
+and learned targets that look into the recorded future (nuplan-simulation.md §1).
+"""
+
+from dataclasses import dataclass
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import Tracks, TrafficLights
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One logged scene with its route and map. R rows, T iterations. Arrays are read-only.
+
+    Attributes:
+        token: Id of the scenario.
+        scenario_type: Its tag, such as `starting_left_turn`; `unknown` without one.
+        log_name: Recording it was cut from.
+        city: Map name.
+        map: The map.
+        time_us: (R,) time stamps of the rows, strictly increasing [us].
+        ego: (R, 11) recorded ego states, columns of `state.STATE_COLUMNS`.
+        tracks: Recorded tracks over the rows.
+        traffic_lights: Recorded lights over the rows.
+        iteration_rows: (T,) row of each iteration, strictly increasing.
+        row_step: Distance in rows between iterations, 2 for 20 Hz logs and a 10 Hz simulation.
+        route: Route roadblock ids from start to goal, as the source lists them.
+        mission_goal: (3,) goal x [m], y [m], heading [rad], or None.
+        mapping: Duration [s], offset [s] and subsample ratio the scenario was cut with.
+        is_short: Whether the log ended before the duration did.
+    """
+
+    token: str
+    scenario_type: str
+    log_name: str
+    city: str
+    map: VectorMap
+    time_us: IntArray
+    ego: FloatArray
+    tracks: Tracks
+    traffic_lights: TrafficLights
+    iteration_rows: IntArray
+    row_step: int
+    route: tuple[str, ...]
+    mission_goal: FloatArray | None
+    mapping: tuple[float, float, float]
+    is_short: bool = False
+
+    @property
+    def num_iterations(self) -> int:
+        """Number of simulation iterations T; a rollout stores T - 1 samples."""
+        return len(self.iteration_rows)
+
+    @property
+    def iteration_times(self) -> IntArray:
+        """(T,) time stamps of the iterations [us]."""
+        return self.time_us[self.iteration_rows]
+
+    @property
+    def expert(self) -> FloatArray:
+        """(T, 11) recorded ego states at the iterations."""
+        return self.ego[self.iteration_rows]

@@ -1,0 +1,35 @@
+"""Whether an installation computes what it should."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from shiftsim.cli import diagnosis as doctor
+from shiftsim.errors import ShiftsimError
+
+
+@pytest.mark.slow
+def test_a_wrong_number_is_found(tmp_path, monkeypatch):
+    shutil.copytree(doctor.REFERENCE, tmp_path, dirs_exist_ok=True)
+    with np.load(tmp_path / "dynamics" / "bicycle_steps.npz") as stored:
+        arrays = {name: stored[name].copy() for name in stored.files}
+    changed = next(name for name in arrays if arrays[name].dtype == np.float64)
+    arrays[changed].reshape(-1)[3] += 1e-3
+    np.savez(tmp_path / "dynamics" / "bicycle_steps.npz", **arrays)
+    monkeypatch.setattr(doctor, "REFERENCE", tmp_path)
+
+    found = doctor.examine()
+
+    assert not found.is_well
+    assert 0 < len(found.mismatches) < found.cases
+    assert 1 <= found.workers <= found.cores
+    text = "\n".join(found.lines())
+    for word in ("MISMATCH", "suggested workers", "numba", "torch: "):
+        assert word in text
+
+
+def test_missing_references_are_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor, "REFERENCE", tmp_path)
+    with pytest.raises(ShiftsimError, match="dynamics"):
+        doctor.examine()

@@ -1,0 +1,501 @@
+"""Export to nuPlan's formats: what comes back is what went out, and nuPlan's queries find it."""
+
+import json
+import sqlite3
+import struct
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from stores import write_toy_store
+
+from shiftsim.data.nuplan.convert import convert_nuplan
+from shiftsim.data.nuplan.export import export_nuplan
+from shiftsim.data.nuplan.export_log import cut_of
+from shiftsim.data.nuplan.export_map import write_nuplan_map
+from shiftsim.data.nuplan.map import read_map
+from shiftsim.data.store.reading import open_store
+from shiftsim.errors import ConversionError
+from shiftsim.metrics import compute_metrics
+from shiftsim.sim.loop import simulate
+from shiftsim.world.layers import make_lists
+
+FROM_START = (15.0, 0.0, 0.5)
+# the scenes with lights, with static objects and jittered stamps, and with a car park
+SCENES = ("s02_curve_objects", "s04_left_turn", "s09_carpark_exit")
+TOLERANCE = 1e-6  # m; longitude and latitude of the maps keep 1e-8
+
+
+def round_trip(reference, folder, mapping, scenes):
+    """Two stores: from the reference, and from its export."""
+    listed = json.loads((reference / "scenes.json").read_text())
+    entries = listed if isinstance(listed, list) else listed.get("scenes", listed)
+    entries = entries.values() if isinstance(entries, dict) else entries
+    tokens = [entry["token"] for entry in entries]
+    for scene in scenes:
+        convert_nuplan(
+            reference / "logs" / f"{scene}.db",
+            reference / "maps",
+            folder / "first",
+            tokens=tokens,
+            mapping=mapping,
+        )
+    store = open_store(folder / "first")
+    report = export_nuplan(store, folder / "out")
+    done = convert_nuplan(
+        report.logs, report.maps, folder / "second", tokens=report.tokens.values(), mapping=mapping
+    )
+    assert done.failed == {}
+    assert len(store) == len(scenes) == len(done.converted)
+    return store, open_store(folder / "second"), report
+
+
+@pytest.fixture(scope="module")
+def trip(nuplan_reference, tmp_path_factory):
+    return round_trip(nuplan_reference, tmp_path_factory.mktemp("trip"), FROM_START, SCENES)
+
+
+@pytest.fixture(scope="module")
+def log(trip):
+    """A connection to the exported log with traffic lights."""
+    with closing(sqlite3.connect(next(trip[2].logs.glob("*s04*.db")))) as connection:
+        yield connection
+
+
+def assert_same_scenario(one, other):
+    assert (one.token, one.scenario_type, one.city) == (
+        other.token,
+        other.scenario_type,
+        other.city,
+    )
+    assert one.route == other.route
+    assert one.mapping == other.mapping
+    np.testing.assert_array_equal(one.time_us, other.time_us)
+    np.testing.assert_array_equal(one.iteration_rows, other.iteration_rows)
+    np.testing.assert_allclose(one.ego, other.ego, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.mission_goal, other.mission_goal, rtol=0, atol=1e-9)
+    assert one.tracks.tokens == other.tracks.tokens
+    for name in ("valid", "poses", "velocities", "sizes", "kinds"):
+        np.testing.assert_array_equal(getattr(one.tracks, name), getattr(other.tracks, name))
+    assert one.traffic_lights.connector_ids == other.traffic_lights.connector_ids
+    np.testing.assert_array_equal(one.traffic_lights.status, other.traffic_lights.status)
+
+
+def assert_same_scores(one, other):
+    scores = [
+        compute_metrics(simulate(scene, None, controller="log-playback"), scene.map)
+        for scene in (one, other)
+    ]
+    assert scores[0].score == pytest.approx(scores[1].score, abs=1e-6)
+    for first, second in zip(scores[0].rows, scores[1].rows, strict=True):
+        assert first.score == pytest.approx(second.score, abs=1e-6)
+        assert first.violation is None or first.violation[:3] == second.violation[:3]
+
+
+def assert_same_map(one, other):
+    assert (one.epsg, one.num_lanes, one.num_roadblocks) == (
+        other.epsg,
+        other.num_lanes,
+        other.num_roadblocks,
+    )
+    for name in (
+        "speed_limits",
+        "lane_index",
+        "left_lane",
+        "right_lane",
+        "block_of",
+        "has_traffic_lights",
+        "intersection_of",
+        "turn_type",
+        "is_bike",
+        "intersection_kinds",
+        "stop_kinds",
+    ):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name in ("incoming", "outgoing", "block_edges", "block_incoming", "block_outgoing"):
+        for part in ("ptr", "items"):
+            first, second = (getattr(getattr(road, name), part) for road in (one, other))
+            np.testing.assert_array_equal(first, second, err_msg=name)
+    for name in ("baselines", "left_boundaries", "right_boundaries"):
+        first, second = (getattr(road, name) for road in (one, other))
+        np.testing.assert_array_equal(first.ptr, second.ptr)
+        np.testing.assert_allclose(first.xy, second.xy, rtol=0, atol=TOLERANCE)
+    for name in ("edges", "blocks", "intersections", "stop_polygons", "crosswalks", "walkways"):
+        first, second = (getattr(road, name) for road in (one, other))
+        assert first.ids == second.ids
+        np.testing.assert_allclose(first.polygons.xy, second.polygons.xy, rtol=0, atol=TOLERANCE)
+    areas = [
+        shapely.union_all([road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))])
+        for road in (one, other)
+    ]
+    assert shapely.symmetric_difference(*areas).area < 1e-3  # m^2, along 1e-8 m of border
+
+
+def test_scenarios_and_scores_come_back(trip):
+    first, second, report = trip
+    assert report.renamed == {}
+    for token in first.tokens:
+        assert_same_scenario(first.read(token), second.read(token))
+        assert_same_scores(first.read(token), second.read(token))
+
+
+def test_maps_come_back_with_their_ids_and_links(trip):
+    first, second, _ = trip
+    for city in first.cities:
+        one, other = first.map(city), second.map(city)
+        assert_same_map(one, other)
+        assert one.boundary_ids == other.boundary_ids
+        assert one.drivable_areas.ids == other.drivable_areas.ids
+        assert one.car_parks.ids == other.car_parks.ids
+        np.testing.assert_array_equal(one.stop_lines.items, other.stop_lines.items)
+
+
+def test_scenes_cut_with_an_offset_come_back_by_the_table_of_nuplan(nuplan_reference, tmp_path):
+    first, second, report = round_trip(nuplan_reference, tmp_path, None, SCENES[1:2])
+    (token,) = first.tokens
+    assert list(report.mappings) == [("starting_left_turn", (15.0, -3.0, 0.5))]
+    assert_same_scenario(first.read(token), second.read(token))
+
+
+def test_an_export_has_the_same_bytes_again(trip, tmp_path):
+    first, _, report = trip
+    again = export_nuplan(first, tmp_path)
+    folder = report.token_file.parent
+    names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    assert names == sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file())
+    assert all((folder / name).read_bytes() == (tmp_path / name).read_bytes() for name in names)
+    assert again.token_file.read_text().split() == list(first.tokens)
+
+
+# What nuPlan's own readers ask a log, nuplan-formats.md §2.
+
+SENSOR = "JOIN lidar AS l ON pc.lidar_token = l.token WHERE l.channel = 'MergedPointCloud'"
+ANCHOR = "(SELECT lidar_pc_token FROM scenario_tag LIMIT 1)"
+
+
+def test_the_log_names_its_map(log, trip):
+    assert log.execute("SELECT map_version, location FROM log").fetchall() == [
+        ("us-ma-boston", "us-ma-boston")
+    ]
+    index = json.loads((trip[2].maps / "nuplan-maps-v1.0.json").read_text())
+    version = index["us-ma-boston"]["version"]
+    assert (trip[2].maps / "us-ma-boston" / version / "map.gpkg").is_file()
+
+
+def test_tokens_are_blobs_of_eight_bytes(log):
+    for table in ("log", "lidar", "lidar_pc", "ego_pose", "scene", "category", "track"):
+        query = f"SELECT COUNT(*), SUM(typeof(token) = 'blob' AND length(token) = 8) FROM {table}"
+        count, good = log.execute(query).fetchone()
+        assert count == good > 0
+        assert log.execute(f"SELECT COUNT(DISTINCT token) FROM {table}").fetchone() == (count,)
+
+
+def test_the_rows_of_the_sensor_are_an_ordered_clock(log, trip):
+    rows = log.execute(
+        f"SELECT pc.token, pc.next_token, pc.prev_token, pc.timestamp FROM lidar_pc AS pc {SENSOR}"
+        " ORDER BY pc.timestamp"
+    ).fetchall()
+    scene = trip[0].read(next(t for t in trip[0].tokens if "a004" in t))
+    assert [row[3] for row in rows] == scene.time_us.tolist()
+    assert [row[1] for row in rows] == [row[0] for row in rows[1:]] + [None]
+    assert [row[2] for row in rows] == [None] + [row[0] for row in rows[:-1]]
+
+
+def test_all_rows_are_in_the_middle_of_five_scenes(log):
+    ordered = [row[0] for row in log.execute("SELECT token FROM scene ORDER BY name ASC")]
+    used = {row[0] for row in log.execute("SELECT DISTINCT scene_token FROM lidar_pc")}
+    assert len(ordered) == 5
+    assert used == {ordered[2]}
+
+
+def test_scenarios_are_found_by_type_and_with_a_valid_goal(log):
+    found = log.execute(
+        "WITH ordered AS (SELECT token, ROW_NUMBER() OVER (ORDER BY name ASC) AS place FROM scene),"
+        " valid AS (SELECT s.token FROM scene AS s JOIN ordered AS o ON o.token = s.token"
+        "  JOIN ego_pose AS g ON g.token = s.goal_ego_pose_token"
+        "  WHERE o.place >= 3 AND o.place < (SELECT COUNT(*) - 1 FROM ordered))"
+        " SELECT lower(hex(pc.token)), MAX(st.type) FROM lidar_pc AS pc"
+        " JOIN valid ON pc.scene_token = valid.token"
+        " JOIN scenario_tag AS st ON st.lidar_pc_token = pc.token"
+        " WHERE st.type IN ('starting_left_turn') GROUP BY pc.token"
+    ).fetchall()
+    assert found == [("a004065c00000032", "starting_left_turn")]
+
+
+def test_the_ego_is_the_rear_axle_with_motion_in_its_own_frame(log, trip):
+    rows = log.execute(
+        "SELECT e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.acceleration_x, e.acceleration_y,"
+        " e.epsg FROM ego_pose AS e JOIN lidar_pc AS pc ON pc.ego_pose_token = e.token"
+        " ORDER BY pc.timestamp"
+    ).fetchall()
+    scene = trip[0].read("a004065c00000032")
+    values = np.array(rows)
+    np.testing.assert_array_equal(values[:, :2], scene.ego[:, :2])
+    np.testing.assert_array_equal(values[:, 6:10], scene.ego[:, 3:7])
+    heading = 2.0 * np.arctan2(values[:, 5], values[:, 2])
+    np.testing.assert_allclose(np.cos(heading - scene.ego[:, 2]), 1.0)
+    np.testing.assert_array_equal(values[:, 3:5], 0.0)
+    assert set(values[:, 10]) == {32619}
+
+
+def test_the_objects_of_a_row_have_centre_size_type_and_map_velocity(log, trip):
+    rows = log.execute(
+        "SELECT c.name, b.x, b.y, b.yaw, b.length, b.width, b.vx, b.vy, lower(hex(t.token))"
+        " FROM lidar_box AS b JOIN track AS t ON t.token = b.track_token"
+        " JOIN category AS c ON c.token = t.category_token"
+        f" WHERE b.lidar_pc_token = {ANCHOR} ORDER BY b.rowid"
+    ).fetchall()
+    scene = trip[0].read("a004065c00000032")
+    row = int(scene.iteration_rows[0])
+    valid = scene.tracks.valid[row]
+    expected = np.column_stack(
+        [scene.tracks.poses[row], scene.tracks.sizes[row], scene.tracks.velocities[row]]
+    )[valid]
+    np.testing.assert_array_equal([r[1:8] for r in rows], expected)
+    tokens = np.array(scene.tracks.tokens)[valid]
+    assert [r[8] for r in rows] == tokens.tolist()
+    assert {r[0] for r in rows} <= {"vehicle", "bicycle", "pedestrian"}
+
+
+def test_boxes_of_a_track_are_chained_in_time(log):
+    broken = log.execute(
+        "SELECT COUNT(*) FROM lidar_box AS b JOIN lidar_box AS n ON n.token = b.next_token"
+        " JOIN lidar_pc AS p ON p.token = b.lidar_pc_token"
+        " JOIN lidar_pc AS q ON q.token = n.lidar_pc_token"
+        " WHERE n.prev_token != b.token OR n.track_token != b.track_token"
+        " OR q.timestamp <= p.timestamp"
+    ).fetchone()
+    ends = log.execute("SELECT COUNT(*) FROM lidar_box WHERE next_token IS NULL").fetchone()
+    assert broken == (0,)
+    assert ends == log.execute("SELECT COUNT(*) FROM track").fetchone()
+
+
+def test_lights_route_and_goal_are_found_at_the_anchor(log, trip):
+    scene = trip[0].read("a004065c00000032")
+    lights = log.execute(
+        "SELECT lane_connector_id, status FROM traffic_light_status"
+        f" WHERE lidar_pc_token = {ANCHOR}"
+    ).fetchall()
+    listed = scene.traffic_lights.at(int(scene.iteration_rows[0]))
+    assert {str(c): s for c, s in lights} == {c: s.name.lower() for c, s in listed.items()} != {}
+    route, goal_x, goal_y = log.execute(
+        "SELECT s.roadblock_ids, g.x, g.y FROM scene AS s"
+        " JOIN lidar_pc AS pc ON pc.scene_token = s.token"
+        f" JOIN ego_pose AS g ON g.token = s.goal_ego_pose_token WHERE pc.token = {ANCHOR}"
+    ).fetchone()
+    assert tuple(route.split(" ")) == scene.route
+    assert (goal_x, goal_y) == tuple(scene.mission_goal[:2])
+
+
+def test_past_and_future_rows_are_counted_from_the_anchor(log):
+    base = (
+        "SELECT COUNT(*) FROM lidar_pc WHERE timestamp {} "
+        f"(SELECT timestamp FROM lidar_pc WHERE token = {ANCHOR})"
+    )
+    assert log.execute(base.format("<")).fetchone()[0] >= 42  # 2.1 s before
+    assert log.execute(base.format(">")).fetchone()[0] >= 300  # 15 s after
+
+
+def test_queries_by_row_and_by_time_have_an_index(log):
+    for table, column in (
+        ("lidar_pc", "timestamp"),
+        ("lidar_box", "lidar_pc_token"),
+        ("scenario_tag", "lidar_pc_token"),
+        ("traffic_light_status", "lidar_pc_token"),
+    ):
+        plan = log.execute(
+            f"EXPLAIN QUERY PLAN SELECT * FROM {table} WHERE {column} = 1"
+        ).fetchall()
+        assert "USING INDEX" in plan[0][3]
+
+
+def test_sensors_that_nobody_reads_are_empty_tables(log):
+    assert log.execute("SELECT COUNT(*) FROM camera").fetchone() == (0,)
+    assert log.execute("SELECT COUNT(*) FROM image").fetchone() == (0,)
+
+
+def test_tables_and_columns_are_those_of_a_nuplan_log(log, nuplan_reference):
+    with closing(sqlite3.connect(nuplan_reference / "logs/s04_left_turn.db")) as genuine:
+        tables = {
+            r[0] for r in genuine.execute("SELECT name FROM sqlite_master WHERE type='table'")
+        }
+        for table in tables:
+            query = f"SELECT name, type FROM pragma_table_info('{table}')"
+            assert log.execute(query).fetchall() == genuine.execute(query).fetchall()
+    assert tables == {
+        r[0] for r in log.execute("SELECT name FROM sqlite_master WHERE type='table'")
+    }
+
+
+# The map as nuPlan reads it, nuplan-formats.md §3.
+
+
+@pytest.fixture(scope="module")
+def gpkg(trip):
+    with closing(sqlite3.connect(trip[2].maps / "us-ma-boston/1.0.0/map.gpkg")) as connection:
+        yield connection
+
+
+def test_the_map_is_a_geopackage(gpkg):
+    assert gpkg.execute("PRAGMA application_id").fetchone() == (1196444487,)
+    assert gpkg.execute("PRAGMA user_version").fetchone() == (10200,)
+    systems = gpkg.execute("SELECT srs_id, organization, definition FROM gpkg_spatial_ref_sys")
+    found = {row[0]: row[1:] for row in systems}
+    assert found[-1] == ("NONE", "undefined")
+    assert found[0] == ("NONE", "undefined")
+    assert found[4326][0] == "EPSG"
+    assert found[4326][1].startswith('GEOGCS["WGS 84"')
+
+
+def test_every_layer_is_described_and_bounded(gpkg):
+    rows = gpkg.execute(
+        "SELECT c.table_name, c.last_change, c.srs_id, g.column_name, g.geometry_type_name, g.z,"
+        " g.m"
+        " FROM gpkg_contents AS c JOIN gpkg_geometry_columns AS g ON g.table_name = c.table_name"
+        " WHERE c.data_type = 'features'"
+    ).fetchall()
+    assert {(row[2], row[3], row[5], row[6]) for row in rows} == {(4326, "geom", 0, 0)}
+    assert len({row[1] for row in rows}) == 1
+    for name, *_, kind, _, _ in rows:
+        query = "SELECT min_x, max_x, min_y, max_y FROM gpkg_contents WHERE table_name = ?"
+        bounds = gpkg.execute(query, [name]).fetchone()
+        blobs = [row[0] for row in gpkg.execute(f'SELECT geom FROM "{name}"')]
+        heads = [struct.unpack("<2sBBi4d", blob[:40]) for blob in blobs]
+        assert {head[:4] for head in heads} <= {(b"GP", 0, 3, 4326)}
+        shapes = shapely.from_wkb([blob[40:] for blob in blobs])
+        assert {shape.geom_type.upper() for shape in shapes} <= {kind}
+        for head, shape in zip(heads, shapes, strict=True):
+            low_x, low_y, high_x, high_y = shape.bounds
+            assert head[4:] == (low_x, high_x, low_y, high_y)
+            assert bounds[0] <= low_x <= high_x <= bounds[1] < -70.0  # longitude first
+    contents = "SELECT data_type, srs_id FROM gpkg_contents WHERE table_name = 'meta'"
+    assert gpkg.execute(contents).fetchone() == ("attributes", None)
+    meta = dict(gpkg.execute("SELECT key, value FROM meta"))
+    assert meta["projectedCoordSystem"] == "epsg:32619"
+    assert meta["geographicCoordSystem"] == "epsg:4326"
+
+
+def test_layers_and_columns_are_those_of_a_nuplan_map(gpkg, nuplan_reference):
+    path = next((nuplan_reference / "maps/us-ma-boston").glob("*/map.gpkg"))
+    with closing(sqlite3.connect(path)) as genuine:
+        for (table,) in genuine.execute("SELECT table_name FROM gpkg_contents").fetchall():
+            query = f"SELECT name FROM pragma_table_info('{table}')"
+            assert set(gpkg.execute(query)) == set(genuine.execute(query)), table
+
+
+def test_links_of_the_map_join(gpkg):
+    for column in ("exit_lane_fid", "entry_lane_fid"):
+        query = (
+            "SELECT COUNT(*) FROM lane_connectors AS c"
+            f" JOIN lanes_polygons AS l ON l.lane_fid = c.{column}"
+            " JOIN lane_groups_polygons AS g ON g.fid = l.lane_group_fid"
+        )
+        total = gpkg.execute("SELECT COUNT(*) FROM lane_connectors").fetchone()
+        assert gpkg.execute(query).fetchone() == total
+    queries = (
+        "SELECT COUNT(*) FROM lanes_polygons WHERE lane_fid != fid",
+        "SELECT COUNT(*) FROM lane_connectors WHERE traffic_light_stop_line_fids IS NULL",
+        "SELECT COUNT(*) FROM baseline_paths"
+        " WHERE (lane_fid IS NULL) = (lane_connector_fid IS NULL)",
+        "SELECT COUNT(*) FROM gen_lane_connectors_scaled_width_polygons WHERE"
+        " lane_connector_fid NOT IN (SELECT fid FROM lane_connectors)",
+        "SELECT COUNT(*) FROM lanes_polygons WHERE left_boundary_fid NOT IN"
+        " (SELECT fid FROM boundaries) OR right_boundary_fid NOT IN (SELECT fid FROM boundaries)",
+        "SELECT COUNT(*) FROM lane_group_connectors WHERE from_lane_group_fid NOT IN"
+        " (SELECT fid FROM lane_groups_polygons) OR to_lane_group_fid NOT IN"
+        " (SELECT fid FROM lane_groups_polygons)",
+        "SELECT COUNT(*) FROM lane_connectors WHERE lane_group_connector_fid NOT IN"
+        " (SELECT fid FROM lane_group_connectors)",
+        "SELECT COUNT(*) FROM lane_connectors WHERE intersection_fid NOT IN"
+        " (SELECT fid FROM intersections)",
+        "SELECT COUNT(*) FROM lanes_polygons AS a JOIN lanes_polygons AS b ON a.fid < b.fid AND"
+        " a.lane_group_fid = b.lane_group_fid AND a.lane_index = b.lane_index",
+    )
+    assert [gpkg.execute(query).fetchone()[0] for query in queries] == [0] * len(queries)
+    for layer in ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas"):
+        query = f"SELECT COUNT(*) FROM {layer} WHERE geom IS NULL"
+        assert gpkg.execute(query).fetchone() == (0,)
+
+
+# Other stores.
+
+
+def test_a_store_with_tokens_and_durations_of_its_own_says_what_to_use_instead(tmp_path):
+    store = open_store(write_toy_store(tmp_path / "toy", count=2))
+    report = export_nuplan(store, tmp_path / "out")
+    assert set(report.renamed) == set(store.tokens)
+    assert report.token_file.read_text().split() == sorted(report.renamed.values())
+    (mapping,) = {mapping for _, mapping in report.mappings}
+    convert_nuplan(
+        report.logs, report.maps, tmp_path / "back", tokens=report.tokens.values(), mapping=mapping
+    )
+    for token in store.tokens:
+        one, other = store.read(token), open_store(tmp_path / "back").read(report.tokens[token])
+        assert_same_scenario(replace(one, token=other.token, mapping=mapping), other)
+        assert_same_scores(one, other)
+
+
+def test_only_the_tokens_asked_for_are_written(trip, tmp_path):
+    report = export_nuplan(trip[0], tmp_path, tokens=trip[0].tokens[:1])
+    assert len(list(report.logs.glob("*.db"))) == 1
+    assert len(report.cities) == 1
+    assert report.missing_maps == sorted(set(report.missing_maps) - set(report.cities))
+
+
+def test_maps_already_in_the_folder_stay_listed_and_are_never_replaced(trip, tmp_path):
+    index = tmp_path / "maps/nuplan-maps-v1.0.json"
+    index.parent.mkdir()
+    index.write_text('{"elsewhere": {"version": "9.1"}}')
+    export_nuplan(trip[0], tmp_path, tokens=trip[0].tokens[:1])
+    assert "elsewhere" in json.loads(index.read_text())
+    index.write_text(json.dumps({city: {"version": "9.1"} for city in trip[0].cities}))
+    with pytest.raises(ConversionError, match=r"lists another map .*9\.1"):
+        export_nuplan(trip[0], tmp_path)
+
+
+def test_a_map_that_nuplan_cannot_hold_is_refused_by_name(trip, tmp_path):
+    road = trip[0].map(trip[0].cities[0])
+    renamed = replace(road, edges=replace(road.edges, ids=("lane-1", *road.edges.ids[1:])))
+    with pytest.raises(ConversionError, match="'lane-1' cannot be exported"):
+        write_nuplan_map(tmp_path / "map.gpkg", renamed, "1")
+    links = [road.outgoing.at(edge).tolist() for edge in range(len(road.edges))]
+    direct = replace(road, outgoing=make_lists([[1], *links[1:]]))
+    with pytest.raises(ConversionError, match="without a connector"):
+        write_nuplan_map(tmp_path / "map.gpkg", direct, "1")
+
+
+def test_pieces_of_one_area_are_one_row(trip, tmp_path):
+    road = trip[0].map("sg-one-north")
+    walks = road.walkways
+    doubled = replace(road, walkways=replace(walks, ids=(walks.ids[0],) * len(walks.ids)))
+    write_nuplan_map(tmp_path / "map.gpkg", doubled, "1")
+    assert read_map(tmp_path / "map.gpkg", "x").walkways.ids == doubled.walkways.ids
+
+
+def test_iterations_that_no_mapping_gives_are_refused(trip):
+    scene = trip[0].read(trip[0].tokens[0])
+    odd = replace(scene, iteration_rows=np.delete(scene.iteration_rows, 5))
+    with pytest.raises(ConversionError, match="not every n-th row"):
+        cut_of(odd)
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_scenarios_made_from_drone_recordings_come_back(tmp_path):
+    from shiftsim.data.demo.store import demo_store
+
+    whole = open_store(demo_store(tmp_path / "whole"))
+    chosen = whole.tokens[:: max(1, len(whole) // 4)]
+    report = export_nuplan(whole, tmp_path / "out", tokens=chosen)
+    convert_nuplan(report.logs, report.maps, tmp_path / "back", tokens=chosen, mapping=FROM_START)
+    back = open_store(tmp_path / "back")
+    for token in chosen:
+        one, other = whole.read(token), back.read(token)
+        numbers = tuple(
+            f"{int(name):016x}" if name.isdecimal() else name for name in one.tracks.tokens
+        )
+        assert_same_scenario(replace(one, tracks=replace(one.tracks, tokens=numbers)), other)
+        assert_same_scores(one, other)
+        assert_same_map(one.map, other.map)

@@ -1,0 +1,95 @@
+"""Scenario filters: nuPlan's YAML files and plain token lists."""
+
+from pathlib import Path
+
+import pytest
+
+from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter, read_flat_yaml
+from shiftsim.errors import ConfigError
+
+FILTER = """
+_target_: nuplan.planning.scenario_builder.scenario_filter.ScenarioFilter
+_convert_: 'all'
+
+scenario_types: # List of scenario types to include
+  - starting_left_turn
+  - changing_lane
+scenario_tokens:
+  - '026c317cfdcf519a'
+  - "1111111111111111"
+  - 2222222222222222  # digits only, without quotes
+log_names: ${splitter.log_splits.val}
+map_names: null
+num_scenarios_per_type: 25
+limit_total_scenarios: null
+timestamp_threshold_s: 15
+expand_scenarios: false
+remove_invalid_goals: true
+shuffle: false
+"""
+
+
+def write(folder: Path, text: str, name: str = "filter.yaml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_genuine_filter_is_read(tmp_path: Path) -> None:
+    assert read_filter(write(tmp_path, FILTER)) == ScenarioFilter(
+        tokens=frozenset(["026c317cfdcf519a", "1111111111111111", "2222222222222222"]),
+        types=frozenset(["starting_left_turn", "changing_lane"]),
+        remove_invalid_goals=True,
+    )
+
+
+def test_a_token_list_may_have_comments(tmp_path: Path) -> None:
+    path = write(tmp_path, "# mine\n026c317cfdcf519a # a\n\n1111111111111111\n", "tokens.txt")
+    assert read_filter(path).tokens == frozenset(["026c317cfdcf519a", "1111111111111111"])
+
+
+def test_inline_lists_and_indented_items_are_read() -> None:
+    values = read_flat_yaml(Path("f"), "a: [x, 'y', 3]\nb:\n- 1.5\n- true\nc: []\n")
+    assert values == {"a": ["x", "y", 3], "b": [1.5, True], "c": []}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a:\n  b: 1\n",
+        "a: {b: 1}\n",
+        "a: [1, 2\n",
+        "a: &x 1\n",
+        "a: !!python/object:os.system x\n",
+        "- a\n",
+        "a: 'b\n",
+        "a: |\n  text\n",
+        "a: 1\na: 2\n",
+    ],
+)
+def test_anything_beyond_flat_yaml_is_refused_with_its_line(text: str) -> None:
+    with pytest.raises(ConfigError, match="line"):
+        read_flat_yaml(Path("f.yaml"), text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "num_scenarios_per_type: 10\n",
+        "expand_scenarios: true\n",
+        "ego_start_speed_threshold: 1.0\n",
+        "something_new: 1\n",
+        "scenario_tokens:\n  - abc\n",
+        "scenario_types: left\n",
+    ],
+)
+def test_what_is_not_supported_is_named(text: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"filter\.yaml"):
+        read_filter(write(tmp_path, text))
+
+
+def test_a_missing_file_and_an_empty_list_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="not readable"):
+        read_filter(tmp_path / "nothing.yaml")
+    with pytest.raises(ConfigError, match="no token"):
+        read_filter(write(tmp_path, "", "tokens.txt"))

@@ -1,0 +1,209 @@
+"""nuPlan logs: what is offered, how it is cut, and what is refused."""
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import places
+import pytest
+
+from shiftsim.data.nuplan.log import open_log, read_ego
+from shiftsim.data.nuplan.map import read_map
+from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
+from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scenario
+from shiftsim.errors import ConfigError, ConversionError, DataError
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind
+
+GOLDEN = places.GOLDEN / "nuplan_format"
+TOKEN = "000000012a05f23c"
+FROM_START = (15.0, -3.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def road() -> VectorMap:
+    return read_map(GOLDEN / "maps" / "fixture-town" / "1.0.0" / "map.gpkg", "fixture-town")
+
+
+@pytest.fixture
+def log_path(tmp_path: Path) -> Path:
+    return Path(shutil.copy(GOLDEN / "logs" / "fixture_log_0001.db", tmp_path / "log.db"))
+
+
+def edit(path: Path, *statements: str) -> None:
+    connection = sqlite3.connect(path)
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+def read(path: Path, road: VectorMap, flaws: dict[str, int] | None = None) -> Scenario:
+    return read_scenario(path, TOKEN, road, FROM_START, flaws)
+
+
+def test_only_the_middle_scene_of_five_is_offered(log_path: Path) -> None:
+    assert len(list_scenarios(log_path)) == 360
+
+
+def test_a_log_with_four_scenes_offers_nothing(log_path: Path) -> None:
+    edit(log_path, "DELETE FROM scene WHERE name = 'scene-004'")
+    assert list_scenarios(log_path) == []
+
+
+def test_types_tokens_and_goals_choose_scenarios(log_path: Path) -> None:
+    assert [
+        s.token for s in list_scenarios(log_path, types=frozenset(["near_multiple_vehicles"]))
+    ] == [TOKEN]
+    assert [s.scenario_type for s in list_scenarios(log_path, tokens=frozenset([TOKEN]))] == [
+        "near_multiple_vehicles"
+    ]
+    edit(log_path, "UPDATE scene SET goal_ego_pose_token = NULL")
+    assert list_scenarios(log_path, remove_invalid_goals=True) == []
+
+
+def test_window_follows_duration_offset_and_ratio(log_path: Path) -> None:
+    with open_log(log_path) as log:
+        window = cut_window(log, TOKEN, (15.0, 0.0, 0.5))
+    assert window.iteration_rows.tolist() == list(range(60, 360, 2))
+    assert (window.first_row, window.last_row) == (0, 360)
+    assert window.is_short
+
+
+def test_rows_are_kept_three_seconds_before_and_eight_after(log_path: Path) -> None:
+    with open_log(log_path) as log:
+        window = cut_window(log, TOKEN, (2.0, 2.0, 0.5))
+    assert window.iteration_rows.tolist() == list(range(100, 141, 2))
+    assert (window.first_row, window.last_row) == (40, 302)
+
+
+def test_nuplan_table_names_73_types_with_their_own_window() -> None:
+    assert len(NAMED_TYPES) == 73
+    assert mapping_of("starting_left_turn") == (15.0, -3.0, 0.5)
+    assert mapping_of("unknown") == (20.0, 0.0, 0.5)
+
+
+@pytest.mark.parametrize("text", ["15,0", "a,b,c", "15,0,0", "0,0,0.5", "15,0,2", "nan,0,0.5", ""])
+def test_a_senseless_mapping_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="mapping"):
+        parse_mapping(text)
+
+
+def test_mapping_is_read_from_text() -> None:
+    assert parse_mapping("15,-3,0.5") == (15.0, -3.0, 0.5)
+
+
+def test_scenario_arrays_are_read_only(log_path: Path, road: VectorMap) -> None:
+    scene = read(log_path, road)
+    assert not scene.ego.flags.writeable
+    assert not scene.tracks.poses.flags.writeable
+    with pytest.raises(ValueError, match="read-only"):
+        scene.ego[0, 0] = 0.0
+
+
+def test_static_objects_have_no_velocity(log_path: Path, road: VectorMap) -> None:
+    tracks = read(log_path, road).tracks
+    static = tracks.kinds > AgentKind.BICYCLE
+    assert np.isnan(tracks.velocities[:, static]).all()
+    assert np.isfinite(tracks.velocities[:, ~static][tracks.valid[:, ~static]]).all()
+
+
+def test_heading_has_the_sign_of_nuplans_quaternion_library(log_path: Path) -> None:
+    half = 0.05
+    w, x, y = (float(v) for v in (np.cos(half), 0.6 * np.sin(half), 0.8 * np.sin(half)))
+    edit(log_path, f"UPDATE ego_pose SET qw = {w!r}, qx = {x!r}, qy = {y!r}, qz = 0")
+    with open_log(log_path) as log:
+        heading = read_ego(log, 0, 1)[0, 2]
+    assert heading == pytest.approx(np.arctan2(-2 * x * y, 1 - 2 * y * y), abs=1e-15)
+
+
+def test_a_track_listed_twice_in_a_frame_is_counted_and_the_last_kept(
+    log_path: Path, road: VectorMap
+) -> None:
+    edit(
+        log_path,
+        "INSERT INTO lidar_box SELECT x'ff', lidar_pc_token, track_token, next_token, prev_token,"
+        " x + 1, y, z, width, length, height, vx, vy, vz, yaw, confidence FROM lidar_box LIMIT 1",
+    )
+    flaws: dict[str, int] = {}
+    changed = read(log_path, road, flaws).tracks
+    assert flaws == {"track listed twice in a frame: the last one is kept": 1}
+    original = read_scenario(
+        GOLDEN / "logs" / "fixture_log_0001.db", TOKEN, road, FROM_START
+    ).tracks
+    assert np.nansum(changed.poses - original.poses) == pytest.approx(1.0)
+
+
+BROKEN = {
+    "merged point cloud": ("UPDATE lidar SET channel = 'other'", "MergedPointCloud"),
+    "table": ("DROP TABLE lidar_box", "'lidar_box' is missing"),
+    "column": ("ALTER TABLE ego_pose DROP COLUMN qw", "no column 'qw'"),
+    "category": ("UPDATE category SET name = 'unicorn'", "unknown category 'unicorn'"),
+    "pose": ("UPDATE ego_pose SET x = NULL", "not finite"),
+    "box pose": ("UPDATE lidar_box SET yaw = NULL", "not finite"),
+    "text": ("UPDATE lidar_box SET x = 'abc'", "no number"),
+    "zero length": ("UPDATE lidar_box SET length = 0", "no length or width"),
+    "duplicate stamps": ("UPDATE lidar_pc SET timestamp = 1600000000000000", "occurs twice"),
+    "unordered": (
+        "UPDATE lidar_pc SET next_token = (SELECT token FROM lidar_pc ORDER BY timestamp LIMIT 1)",
+        "earlier time stamp",
+    ),
+    "ego pose": ("DELETE FROM ego_pose", "unknown ego_pose"),
+    "no map": ("DELETE FROM log", "names no map"),
+    "two rows": ("DELETE FROM lidar_pc WHERE timestamp != 1600000003000000", "1 iterations"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_log_gives_one_error_that_names_the_file(
+    case: str, log_path: Path, road: VectorMap
+) -> None:
+    statement, message = BROKEN[case]
+    edit(log_path, statement)
+    with pytest.raises(DataError, match=message) as caught:
+        read(log_path, road)
+    assert str(log_path) in str(caught.value)
+    assert caught.value.hint
+
+
+def test_an_unknown_token_is_named(log_path: Path, road: VectorMap) -> None:
+    with pytest.raises(ConversionError, match="0123456789abcdef"):
+        read_scenario(log_path, "0123456789abcdef", road)
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000, 200_000])
+def test_a_truncated_log_gives_one_error(size: int, log_path: Path, road: VectorMap) -> None:
+    log_path.write_bytes(log_path.read_bytes()[:size])
+    with pytest.raises(DataError, match=r"log\.db"):
+        read(log_path, road)
+
+
+def test_a_missing_log_is_named(tmp_path: Path, road: VectorMap) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read(tmp_path / "nothing.db", road)
+
+
+def test_a_view_in_place_of_a_table_is_refused(log_path: Path, road: VectorMap) -> None:
+    edit(
+        log_path,
+        "ALTER TABLE lidar_box RENAME TO hidden",
+        "CREATE VIEW lidar_box AS SELECT * FROM hidden",
+    )
+    with pytest.raises(DataError, match="'lidar_box' is missing"):
+        read(log_path, road)
+
+
+def test_a_log_is_never_written_to(log_path: Path, road: VectorMap) -> None:
+    edit(log_path, "CREATE TRIGGER t AFTER INSERT ON log BEGIN DELETE FROM lidar_box; END")
+    before = log_path.read_bytes()
+    log_path.chmod(0o444)
+    read(log_path, road)
+    assert log_path.read_bytes() == before
+    assert [p.name for p in log_path.parent.iterdir()] == ["log.db"]
+
+
+def test_pickled_columns_are_never_read(log_path: Path, road: VectorMap) -> None:
+    edit(log_path, "UPDATE lidar SET translation = x'8004', rotation = NULL")
+    assert read(log_path, road).num_iterations == 151

@@ -1,0 +1,83 @@
+"""Stores behind a URL; the local file system stands for any that pyarrow knows."""
+
+import shutil
+
+import numpy as np
+import pytest
+from stores import write_toy_store
+
+import shiftsim
+from shiftsim.data.store.reading import open_store
+from shiftsim.errors import DataError
+
+TOKEN = "0001cafe"
+
+
+@pytest.fixture
+def remote(tmp_path, monkeypatch):
+    """Folder and URL of a store, with an empty cache."""
+    monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path / "cache"))
+    folder = write_toy_store(tmp_path / "bucket" / "toy")
+    (folder / "splits").mkdir()
+    (folder / "splits" / "small.toml").write_text(f'tokens = ["{TOKEN}"]')
+    return folder, f"file://{folder}"
+
+
+def test_a_store_behind_a_url_holds_the_same_scenarios(remote):
+    folder, url = remote
+    here, there = open_store(folder), open_store(url)
+    assert (there.tokens, there.hash, there.source) == (here.tokens, here.hash, url)
+    np.testing.assert_array_equal(there.read(TOKEN).ego, here.read(TOKEN).ego)
+
+
+def test_only_what_is_needed_is_copied_and_then_kept(remote):
+    folder, url = remote
+    store = open_store(url)
+    assert not (store.path / "recordings").exists()
+    store.read(TOKEN)
+    assert [path.name for path in (store.path / "recordings").iterdir()] == ["log-1"]
+    shutil.rmtree(folder / "recordings")
+    open_store(url).read(TOKEN)
+    with pytest.raises(DataError, match="cannot be read"):
+        open_store(url).read("0002cafe")
+
+
+def test_a_file_that_was_damaged_on_the_way_is_refused(remote):
+    folder, url = remote
+    ego = next((folder / "recordings").glob("*1/ego*"))
+    ego.write_bytes(ego.read_bytes()[:-1] + b"x")
+    with pytest.raises(DataError, match="damaged, or changed"):
+        open_store(url).read(TOKEN)
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.thorough)])
+def test_a_run_on_a_url_gives_the_bytes_of_one_on_the_folder(remote, tmp_path, workers):
+    folder, url = remote
+    runs = [
+        shiftsim.run(
+            "constant-velocity",
+            store=str(store),
+            workers=workers,
+            bundle=True,
+            out=str(tmp_path / name),
+        )
+        for store, name in ((folder, "here"), (url, "there"))
+    ]
+    for name in ("scores.parquet", "metrics.parquet"):
+        assert (runs[0].path / name).read_bytes() == (runs[1].path / name).read_bytes()
+    assert runs[1].manifest["store"] == url
+    assert runs[0].manifest["bundle"] == runs[1].manifest["bundle"]
+
+
+def test_splits_of_a_store_behind_a_url_are_found_by_name(remote, tmp_path):
+    _, url = remote
+    out = str(tmp_path / "run")
+    run = shiftsim.run("constant-velocity", store=url, split="small", workers=1, out=out)
+    assert run.scores["token"].to_pylist() == [TOKEN]
+
+
+@pytest.mark.parametrize("url", ["nothing://here/store", "file:///no/such/store"])
+def test_a_url_that_leads_nowhere_is_named(url, monkeypatch, tmp_path):
+    monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path))
+    with pytest.raises(DataError, match=url):
+        open_store(url)

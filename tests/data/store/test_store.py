@@ -1,0 +1,336 @@
+"""The scenario store: what is written comes back to the last bit, and damage is named."""
+
+import dataclasses
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import places
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from shiftsim.data.nuplan.convert import convert_nuplan
+from shiftsim.data.nuplan.map import read_map
+from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
+from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store.check import check_store
+from shiftsim.data.store.reading import StoreWriter, open_store, schema
+from shiftsim.errors import DataError
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import Tracks, TrafficLights
+
+GOLDEN = places.GOLDEN / "nuplan_format"
+LOG = GOLDEN / "logs" / "fixture_log_0001.db"
+TOKEN = "000000012a05f23c"
+
+
+@pytest.fixture(scope="module")
+def road() -> VectorMap:
+    return read_map(GOLDEN / "maps" / "fixture-town" / "1.0.0" / "map.gpkg", "fixture-town")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    path = tmp_path / "store"
+    convert_nuplan(LOG, GOLDEN / "maps", path, tokens=[TOKEN], mapping=(10.0, 0.0, 0.5))
+    return path
+
+
+def assert_same(a: object, b: object, where: str = "") -> None:
+    if dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, np.ndarray):
+        assert isinstance(b, np.ndarray)
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), where
+        assert a.flags.c_contiguous == b.flags.c_contiguous, where
+        assert not a.flags.writeable, where
+        assert not b.flags.writeable, where
+    elif isinstance(a, tuple) and hasattr(a, "_fields"):
+        for left, right in zip(a, b, strict=True):  # type: ignore[call-overload]
+            assert_same(left, right, where)
+    else:
+        assert a == b, where
+
+
+def make_recording(num_rows: int, num_tracks: int, rng: np.random.Generator) -> Recording:
+    """Tracks that wander near UTM coordinates; each is absent for a while."""
+    heading = np.cumsum(rng.normal(0, 0.02, (num_rows, num_tracks)), axis=0)
+    speed = rng.uniform(0, 14, num_tracks) + rng.normal(0, 0.2, heading.shape)
+    velocity = speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    start = np.array([587_000.0, 4_475_000.0]) + rng.uniform(-50, 50, (num_tracks, 2))
+    poses = np.concatenate([start + np.cumsum(velocity * 0.05, 0), heading[..., None]], -1)
+    size = rng.uniform([3.0, 1.5], [5.0, 2.2], (num_tracks, 2))
+    sizes = np.broadcast_to(size, (num_rows, num_tracks, 2)).copy()
+    valid = np.ones((num_rows, num_tracks), np.bool_)
+    for track in range(0, num_tracks, 3):
+        valid[: int(rng.integers(0, num_rows)), track] = False
+    for values in (poses, velocity, sizes):
+        values[~valid] = np.nan
+    tokens = tuple(f"{i:016x}" for i in range(num_tracks))
+    tracks = Tracks(valid, poses, velocity, sizes, np.zeros(num_tracks, np.int64), tokens)
+    lights = TrafficLights(("38", "34"), rng.integers(-1, 4, (num_rows, 2)).astype(np.int8))
+    return Recording("drive", "fixture-town", np.arange(num_rows) * 50_000, tracks, lights)
+
+
+def make_window(token: str, first: int, last: int, ego: str = "ego") -> Window:
+    return Window(
+        token=token,
+        scenario_type="unknown",
+        log_name="drive",
+        ego=ego,
+        first_row=first,
+        last_row=last,
+        iteration_rows=np.arange(first, last, 2),
+        row_step=2,
+        route=("1", "31"),
+        mission_goal=None,
+        mapping=(10.0, 0.0, 0.5),
+        metadata={"note": "x"},
+    )
+
+
+def write_store(path: Path, road: VectorMap, recording: Recording, *windows: Window) -> None:
+    num_rows = len(recording.time_us)
+    with StoreWriter(path) as writer:
+        writer.add_map(road)
+        writer.add_recording(recording)
+        for name in sorted({window.ego for window in windows}):
+            writer.add_ego(EgoTrace("drive", name, 0, np.full((num_rows, 11), 0.25)))
+        for window in windows:
+            writer.add_window(window)
+
+
+def test_store_gives_the_scenario_that_the_log_gives(store: Path, road: VectorMap) -> None:
+    direct = read_scenario(LOG, TOKEN, road, (10.0, 0.0, 0.5))
+    expected = dataclasses.replace(direct, log_name="fixture_log_0001")
+    assert_same(open_store(store).read(TOKEN), expected)
+
+
+@pytest.mark.golden
+def test_store_gives_what_the_logs_give_for_overlapping_windows(
+    nuplan_reference: Path, tmp_path: Path
+) -> None:
+    log = nuplan_reference / "logs" / "s07_parked_in_lane.db"
+    tokens = [entry.token for entry in list_scenarios(log)][::40]
+    report = convert_nuplan(
+        log, nuplan_reference / "maps", tmp_path / "s", tokens=tokens, mapping=(3.0, 0.0, 0.5)
+    )
+    assert sorted(report.converted) == sorted(tokens)
+    opened = open_store(tmp_path / "s")
+    assert len(list((tmp_path / "s" / "recordings").iterdir())) == 1
+    for token in tokens:
+        scene = opened.read(token)
+        assert_same(scene, read_scenario(log, token, scene.map, (3.0, 0.0, 0.5)))
+
+
+def test_equal_conversions_give_equal_bytes(store: Path, tmp_path: Path) -> None:
+    convert_nuplan(LOG, GOLDEN / "maps", tmp_path / "b", tokens=[TOKEN], mapping=(10.0, 0.0, 0.5))
+    names = sorted(p.relative_to(store) for p in store.rglob("*") if p.is_file())
+    assert names == sorted(
+        p.relative_to(tmp_path / "b") for p in (tmp_path / "b").rglob("*") if p.is_file()
+    )
+    assert all((store / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
+
+
+def test_converting_again_changes_nothing(store: Path) -> None:
+    before = {p: p.read_bytes() for p in store.rglob("*") if p.is_file()}
+    report = convert_nuplan(LOG, GOLDEN / "maps", store, tokens=[TOKEN], mapping=(10.0, 0.0, 0.5))
+    assert (report.unchanged, report.converted) == ([TOKEN], [])
+    assert before == {p: p.read_bytes() for p in store.rglob("*") if p.is_file()}
+
+
+def test_scenarios_are_added_to_a_store(store: Path) -> None:
+    other = list_scenarios(LOG)[100].token
+    before = open_store(store)
+    convert_nuplan(LOG, GOLDEN / "maps", store, tokens=[other], mapping=(5.0, 0.0, 0.5))
+    after = open_store(store)
+    assert after.tokens == tuple(sorted([TOKEN, other]))
+    assert after.hash != before.hash
+    assert_same(after.read(TOKEN), before.read(TOKEN))
+
+
+def test_a_token_that_no_log_offers_is_reported(store: Path) -> None:
+    report = convert_nuplan(LOG, GOLDEN / "maps", store, tokens=["00000000000000ff"])
+    assert "fixture_log_0001.db" in report.failed["00000000000000ff"]
+
+
+def test_one_broken_scenario_stops_no_other(tmp_path: Path) -> None:
+    log = Path(shutil.copy(LOG, tmp_path / "log.db"))
+    connection = sqlite3.connect(log)
+    connection.execute(
+        "UPDATE ego_pose SET x = NULL WHERE token ="
+        " (SELECT ego_pose_token FROM lidar_pc ORDER BY timestamp DESC LIMIT 1)"
+    )
+    connection.commit()
+    connection.close()
+    rows = [entry.token for entry in list_scenarios(log)]
+    report = convert_nuplan(
+        log, GOLDEN / "maps", tmp_path / "s", tokens=[rows[0], rows[200]], mapping=(2.0, 0.0, 0.5)
+    )
+    assert report.converted == [rows[0]]
+    assert "not finite" in report.failed[rows[200]]
+
+
+def test_windows_share_a_recording_and_leave_out_their_ego(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    recording = make_recording(300, 6, rng)
+    ego = recording.tracks.tokens[1]
+    write_store(
+        tmp_path / "s",
+        road,
+        recording,
+        make_window("a", 0, 200),
+        make_window("b", 130, 300, ego),
+    )
+    store = open_store(tmp_path / "s")
+    assert store.read("a").tracks.num_tracks >= 5
+    late = store.read("b")
+    assert ego not in late.tracks.tokens
+    assert late.time_us[0] == 130 * 50_000
+    assert late.iteration_rows[0] == 0
+    kept = [recording.tracks.tokens.index(token) for token in late.tracks.tokens]
+    np.testing.assert_array_equal(late.tracks.poses, recording.tracks.poses[130:300, kept])
+    np.testing.assert_array_equal(late.tracks.sizes, recording.tracks.sizes[130:300, kept])
+
+
+def test_eighteen_seconds_with_100_agents_fit_in_one_and_a_half_megabytes(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    recording = make_recording(360, 100, rng)
+    recording.tracks.valid[:] = True
+    recording.tracks.poses[np.isnan(recording.tracks.poses)] = 0.1
+    write_store(tmp_path / "s", road, recording, make_window("a", 0, 360))
+    folder = tmp_path / "s" / "recordings" / "drive"
+    assert sum(path.stat().st_size for path in folder.iterdir()) <= 1_500_000
+
+
+def test_a_window_reads_only_its_part_of_a_long_recording(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_store(tmp_path / "s", road, make_recording(2000, 3, rng), make_window("a", 1000, 1200))
+    store = open_store(tmp_path / "s")
+    asked: list[list[int]] = []
+    tracks = store._recording("drive").tracks
+    read = tracks.read
+    monkeypatch.setattr(tracks, "read", lambda blocks: asked.append(blocks) or read(blocks))
+    store.read("a")
+    first, last = 1000 // schema.BLOCK_ROWS, 1199 // schema.BLOCK_ROWS
+    assert asked == [list(range(first, last + 1))]
+
+
+def test_an_empty_recording_is_fine(tmp_path: Path, road: VectorMap) -> None:
+    recording = Recording(
+        "drive", "fixture-town", np.arange(50) * 50_000, Tracks.empty(50), TrafficLights.empty(50)
+    )
+    write_store(tmp_path / "s", road, recording, make_window("a", 0, 50))
+    scene = open_store(tmp_path / "s").read("a")
+    assert scene.tracks.num_tracks == 0
+    assert scene.traffic_lights.status.shape == (50, 0)
+
+
+def test_a_map_is_read_once_per_store(store: Path) -> None:
+    opened = open_store(store)
+    assert opened.read(TOKEN).map is opened.map("fixture-town")
+
+
+def test_a_sound_store_has_no_problems(store: Path) -> None:
+    assert check_store(store) == []
+
+
+def test_check_finds_changed_missing_and_foreign_files(store: Path) -> None:
+    tracks = next(store.rglob("tracks.parquet"))
+    data = bytearray(tracks.read_bytes())
+    data[100] ^= 1
+    tracks.write_bytes(data)
+    next(store.rglob("ego-*.parquet")).unlink()
+    (store / "notes.txt").write_text("x")
+    found = {problem.where.split("/")[-1]: problem for problem in check_store(store)}
+    assert set(found) == {"tracks.parquet", "ego-ego.parquet", "notes.txt"}
+    assert not found["notes.txt"].is_error
+
+
+def test_check_names_what_is_implausible(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    recording = make_recording(100, 4, rng)
+    recording.tracks.poses[50, 1] = np.nan
+    recording.time_us[20] = recording.time_us[19]
+    bad = dataclasses.replace(make_window("a", 0, 100), route=("1", "nowhere"))
+    write_store(tmp_path / "s", road, recording, bad)
+    found = " | ".join(problem.what for problem in check_store(tmp_path / "s"))
+    assert "time stamps do not increase" in found
+    assert "pose is not finite" in found
+    assert "'nowhere'" in found
+
+
+def test_a_missing_store_and_an_unknown_token_are_named(store: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not a scenario store"):
+        open_store(tmp_path / "nothing")
+    with pytest.raises(DataError, match="'abc'"):
+        open_store(store).read("abc")
+
+
+def test_another_version_is_refused(store: Path) -> None:
+    manifest = json.loads((store / "store.json").read_text())
+    (store / "store.json").write_text(json.dumps({**manifest, "version": 99}))
+    with pytest.raises(DataError, match="version 99") as caught:
+        open_store(store)
+    assert "convert" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "scenarios.parquet",
+        "frames.parquet",
+        "tracks.parquet",
+        "ego-ego.parquet",
+        "fixture-town.parquet",
+    ],
+)
+@pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "column"])
+def test_a_damaged_file_gives_one_error_that_names_it(name: str, damage: str, store: Path) -> None:
+    path = next(store.rglob(name))
+    DAMAGES[damage](path)
+    with pytest.raises(DataError, match=name) as caught:
+        open_store(store).read(TOKEN)
+    assert caught.value.hint
+
+
+def _drop_column(path: Path) -> None:
+    file = pq.ParquetFile(path)
+    table = file.read()
+    notes = file.metadata.metadata
+    table = table.drop_columns([table.column_names[1]]).replace_schema_metadata(notes)
+    pq.write_table(table, path)
+
+
+DAMAGES = {
+    "missing": Path.unlink,
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "column": _drop_column,
+}
+
+
+def test_a_foreign_folder_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("mine")
+    with pytest.raises(DataError, match="not empty"):
+        StoreWriter(tmp_path)
+
+
+def test_a_window_without_its_recording_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="lacks"), StoreWriter(tmp_path / "s") as writer:
+        writer.add_window(make_window("a", 0, 50))
+    assert not (tmp_path / "s" / "store.json").exists()
+
+
+def test_columns_carry_their_units(store: Path) -> None:
+    tracks = pq.read_schema(next(store.rglob("tracks.parquet")))
+    assert {"x_m", "heading_rad", "vx_mps"} <= set(tracks.names)
+    assert pa.types.is_float64(tracks.field("x_m").type)

@@ -1,0 +1,278 @@
+from collections import deque
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+from worlds import cruise_scenario, standing_tracks, straight_road
+
+from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.planners.idm.corridor import (
+    CLEAR,
+    HIT,
+    OPEN,
+    UNKNOWN,
+    Occupants,
+    find_lead,
+    find_sides,
+)
+from shiftsim.planners.idm.path import _search
+from shiftsim.planners.idm.planner import Idm
+from shiftsim.verify.observing import observe, scene_info
+from shiftsim.world.layers import make_lists
+from shiftsim.world.state import VX, AgentKind, TrafficLights
+
+NUM_ROWS = 60 + 300 + 1 + 160  # of the toy scenario
+
+
+def started(scenario) -> Idm:
+    planner = Idm()
+    planner.reset(scene_info(scenario))
+    return planner
+
+
+def roll_out(scenario, ego=None):
+    planner = started(scenario)
+    state = scenario.expert[0] if ego is None else ego
+    return planner.roll_out(observe(scenario, 0, state))
+
+
+def with_objects(*poses, kind=AgentKind.VEHICLE, **options):
+    tracks = standing_tracks(NUM_ROWS, np.array(poses), [kind] * len(poses))
+    return cruise_scenario(tracks=tracks, **options)
+
+
+def test_a_slow_ego_on_a_free_road_follows_the_formula():
+    centers, speeds = roll_out(cruise_scenario(speed=8.0))
+    # the ego's centre starts at 11.461; the path ends at 419, one vertex early
+    gap = 419.0 - 11.461 - 2.588
+    desired = 1.0 + 8.0 * 1.5 + 8.0 * 8.0 / (2.0 * np.sqrt(3.0))
+    accel = 1.0 - (8.0 / 15.0) ** 4 - (desired / gap) ** 2
+    assert speeds[1] == pytest.approx(8.0 + 0.5 * accel, abs=1e-12)
+    np.testing.assert_allclose(centers[:2, 0], [11.461, 15.461], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(centers[:, 1], 0.0)
+
+
+def test_the_path_keeps_to_the_lane_it_starts_in_and_loses_its_last_vertex():
+    scenario = cruise_scenario(start=(10.0, 3.5, 0.0))
+    planner = started(scenario)
+    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    assert [scenario.map.edges.ids[e] for e in planner.route_plan.edges] == ["10", "20", "30"]
+    assert planner.route_plan.found
+    assert planner.path.end == 419.0
+    assert planner.path.line_arc[-1] == 420.0
+
+
+def test_a_plan_starts_on_the_path_not_at_the_ego():
+    ego = cruise_scenario().expert[0].copy()
+    ego[1] = 0.8
+    centers, _ = roll_out(cruise_scenario(), ego)
+    np.testing.assert_allclose(centers[0], [11.461, 0.0, 0.0], rtol=0, atol=1e-9)
+
+
+def test_a_standing_vehicle_ahead_stops_the_ego_before_it():
+    centers, speeds = roll_out(with_objects((40.0, 0.0, 0.0)))
+    assert speeds[-1] < 1.0
+    assert centers[-1, 0] + 2.588 < 40.0 - 2.25
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        (40.0, 3.5, 0.0),  # the other lane
+        (51.5, 0.0, 0.0),  # its centre is more than 40 m away
+        (5.0, 0.0, 0.0),  # behind
+    ],
+)
+def test_what_is_beside_behind_or_far_away_changes_nothing(pose):
+    free, _ = roll_out(cruise_scenario())
+    centers, _ = roll_out(with_objects(pose))
+    np.testing.assert_array_equal(centers, free)
+
+
+def test_an_object_that_touches_the_ego_from_behind_brakes_it_fully():
+    # nuPlan: idm-planner.md §5 I4
+    _, speeds = roll_out(with_objects((8.0, 0.0, 0.0), kind=AgentKind.GENERIC_OBJECT))
+    assert speeds[1] == 8.0 - 0.5 * 3.0
+
+
+def test_a_red_light_counts_as_a_standing_object_and_green_does_not():
+    scenario = cruise_scenario(start=(170.0, 0.0, 0.0))
+    status = np.full((NUM_ROWS, 2), 2, np.int8)
+    red = replace(scenario, traffic_lights=TrafficLights(("21", "unknown"), status))
+    green = replace(scenario, traffic_lights=TrafficLights(("21",), 0 * status[:, :1]))
+    assert roll_out(red)[1][-1] < 2.0
+    np.testing.assert_array_equal(roll_out(green)[1], roll_out(scenario)[1])
+
+
+def test_the_target_is_the_limit_or_the_default_but_never_below_the_start_speed():
+    for limit, speed, target in ((15.0, 8.0, 15.0), (None, 8.0, 10.0), (5.0, 8.0, 8.0)):
+        scenario = cruise_scenario(speed=speed, road=straight_road(limit))
+        planner = started(scenario)
+        planner.plan(observe(scenario, 0, scenario.expert[0]))
+        assert planner.target_velocity == target
+
+
+def test_a_reset_forgets_the_path_and_the_target_of_the_scenario_before():
+    planner = Idm()
+    fast = cruise_scenario(road=straight_road(20.0))
+    other = cruise_scenario(road=straight_road(None), start=(10.0, 3.5, 0.0))
+    plans = []
+    for scenario in (other, fast, other):
+        planner.reset(scene_info(scenario))
+        plans.append(planner.plan(observe(scenario, 0, scenario.expert[0])).states)
+    np.testing.assert_array_equal(plans[0], plans[2])
+
+
+def test_a_start_outside_the_route_takes_the_nearest_lane():
+    scenario = cruise_scenario(start=(-20.0, -6.0, 0.0))
+    planner = started(scenario)
+    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    assert scenario.map.edges.ids[planner.route_plan.edges[0]] == "11"
+
+
+@pytest.mark.parametrize("route", [("1", "2", "2", "3"), ("1", "3"), ("1", "2", "3", "1")])
+def test_a_route_that_cannot_be_driven_block_by_block_falls_back(route):
+    scenario = replace(cruise_scenario(), route=route)
+    planner = started(scenario)
+    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    assert not planner.route_plan.found
+
+
+@pytest.mark.parametrize(
+    ("route", "message"),
+    [
+        ((), "has 0 roadblocks"),
+        (("1",), "has 1 roadblocks"),
+        (("1", "x", "3"), "no roadblock 'x', number 1"),
+        (("1", "2", "x"), "no roadblock 'x', number 2"),
+    ],
+)
+def test_a_route_nuplan_would_fail_on_is_refused(route, message):
+    with pytest.raises(PlannerError, match=message):
+        started(replace(cruise_scenario(), route=route))
+
+
+def test_an_unknown_block_in_the_middle_of_a_route_is_passed_over():
+    scenario = replace(cruise_scenario(), route=("1", "2", "x", "3"))
+    planner = started(scenario)
+    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    assert not planner.route_plan.found  # the depth does not fit any more
+
+
+@given(x=st.floats(-1e5, 1e5), y=st.floats(-5e6, 5e6), speed=st.floats(0.0, 20.0))
+def test_moving_the_world_does_not_change_the_speeds(x, y, speed):
+    near = with_objects((45.0, 0.4, 0.1), speed=speed)
+    far = with_objects(
+        (45.0 + x, 0.4 + y, 0.1),
+        speed=speed,
+        road=straight_road(offset=(x, y)),
+        start=(10.0 + x, y, 0.0),
+    )
+    # gaps are differences of coordinates of up to 5e6 m, spaced by 1e-9 m
+    np.testing.assert_allclose(roll_out(far)[1], roll_out(near)[1], rtol=0, atol=1e-6)
+
+
+def naive_search(road, start, goal_block, goal_depth, allowed):
+    """The queue without a visited set, word for word as in idm-planner.md §3."""
+    queue, parents, end, depth = deque([(start, 1)]), {}, (start, 1), 1
+    found = False
+    while queue:
+        edge, depth = queue.popleft()
+        if depth > goal_depth:
+            break
+        if road.block_of[edge] == goal_block and depth == goal_depth:
+            end, found = (edge, depth), True
+            break
+        for after in road.outgoing.at(edge).tolist():
+            if after in allowed:
+                queue.append((after, depth + 1))
+                parents[after, depth + 1] = (edge, depth)
+                end = (after, depth + 1)
+    path = [end[0]]
+    while end in parents:
+        end = parents[end]
+        path.append(end[0])
+    return path[::-1], found
+
+
+@st.composite
+def graphs(draw):
+    count = draw(st.integers(2, 8))
+    ids = st.integers(0, count - 1)
+    rows = draw(st.lists(st.lists(ids, max_size=3), min_size=count, max_size=count))
+    blocks = draw(st.lists(st.integers(0, 3), min_size=count, max_size=count))
+    road = SimpleNamespace(outgoing=make_lists(rows), block_of=np.array(blocks))
+    return road, draw(ids), draw(st.integers(0, 3)), draw(st.integers(1, 6)), draw(st.sets(ids))
+
+
+@given(graphs())
+def test_the_search_by_levels_equals_the_queue_without_a_visited_set(case):
+    path, found = naive_search(*case)
+    plan = _search(*case)
+    assert (plan.edges, plan.found) == (path, found)
+
+
+def occupants_of(poses, sizes) -> Occupants:
+    boxes = boxes_to_corners(poses, sizes)
+    radii = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
+    nothing = np.zeros(len(poses))
+    return Occupants(
+        boxes.reshape(-1, 2),
+        np.arange(len(poses) + 1) * 4,
+        np.column_stack([poses[:, :2], radii]),
+        nothing,
+        nothing,
+    )
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (587_430.0, 4_475_309.0)])
+def test_distances_decide_as_the_buffered_path_does(rng, offset):
+    half_width, num_open, count = 1.1485, 0, 0
+    for _ in range(60):
+        turns = np.cumsum(rng.normal(0.0, rng.choice([0.0, 0.05, 0.8]), 30))
+        steps = rng.uniform(0.2, 2.0, 30)
+        line = np.cumsum(np.c_[steps * np.cos(turns), steps * np.sin(turns)], axis=0) + offset
+        center = np.array([*line[0], turns[0]])
+        footprint = boxes_to_corners(center, np.array([5.176, 2.297]))
+        index = rng.integers(0, 30, 150)
+        poses = np.c_[line[index] + rng.normal(0.0, 3.0, (150, 2)), rng.uniform(-3, 3, 150)]
+        sizes = rng.uniform(0.2, 5.0, (150, 2))
+        occupants = occupants_of(poses, sizes)
+        sides = np.full(150, UNKNOWN)
+        find_sides(line, half_width, footprint, occupants, sides)
+        corridor = shapely.LineString(line).buffer(half_width, cap_style="square")
+        corridor = corridor.union(shapely.Polygon(footprint))
+        truth = shapely.intersects(shapely.polygons(boxes_to_corners(poses, sizes)), corridor)
+        np.testing.assert_array_equal(sides[sides != OPEN] == HIT, truth[sides != OPEN])
+        num_open += int((sides == OPEN).sum())
+        count += 150
+    assert 0 < num_open < 0.05 * count
+
+
+def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
+    footprint = boxes_to_corners(np.array([0.0, 0.0, 0.3]), np.array([5.176, 2.297]))
+    poses = np.c_[rng.uniform(-12, 12, (500, 2)), rng.uniform(-3, 3, 500)]
+    sizes = rng.uniform(0.2, 5.0, (500, 2))
+    occupants = occupants_of(poses, sizes)
+    polygons = shapely.polygons(boxes_to_corners(poses, sizes))
+    truth = shapely.distance(polygons, shapely.Polygon(footprint))
+    for index in range(500):
+        sides = np.full(500, CLEAR)
+        sides[index] = HIT
+        found, gap = find_lead(footprint, occupants, sides)
+        assert found == index
+        assert gap == pytest.approx(truth[index], abs=1e-12)
+
+
+def test_speed_backwards_and_standing_still_give_finite_plans():
+    for speed in (-0.5, 0.0):
+        ego = cruise_scenario().expert[0].copy()
+        ego[VX] = speed
+        centers, speeds = roll_out(cruise_scenario(), ego)
+        assert np.isfinite(centers).all()
+        assert speeds[-1] > 0.0

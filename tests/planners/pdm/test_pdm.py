@@ -1,0 +1,258 @@
+"""PDM-Closed on a straight road, and its kernels against slow obvious versions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straight_road
+
+from shiftsim.errors import ConfigError, PlannerError
+from shiftsim.planners.idm.corridor import HIT
+from shiftsim.planners.pdm.corridor import corridor_polygon, fill_corridor, make_corridor
+from shiftsim.planners.pdm.forecast import make_occupants, ring_of, select_tracks
+from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
+from shiftsim.planners.pdm.path import make_path, project
+from shiftsim.planners.pdm.planner import PdmClosed
+from shiftsim.planners.proposals.areas import admit, covering, index_ranks, make_areas
+from shiftsim.planners.proposals.tracker import fit_speed
+from shiftsim.planners.registry import load_planner
+from shiftsim.verify.observing import observe, scene_info
+from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
+
+NUM_ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`
+VEHICLE, PEDESTRIAN, CONE = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.TRAFFIC_CONE
+
+
+def one_step(scenario, lights=None, **arguments):
+    planner = PdmClosed(**arguments)
+    planner.reset(scene_info(scenario))
+    seen = observe(scenario, 0, scenario.expert[0])
+    return planner, planner.step(seen if lights is None else replace(seen, lights=lights))
+
+
+def scenario_with(poses, kinds, **options):
+    tracks = standing_tracks(NUM_ROWS, np.array(poses, float).reshape(-1, 3), kinds)
+    return cruise_scenario(tracks=tracks, **options)
+
+
+def test_an_empty_road_is_driven_at_the_limit_on_the_centerline():
+    _, step = one_step(cruise_scenario())
+    assert (step.best, step.braked) == (4, False)
+    np.testing.assert_allclose(step.poses[:, 1:], 0.0, atol=1e-9)
+    # nuPlan: every proposal brakes in its first 0.1 s, then it speeds up (pdm-closed.md §11 Q3)
+    advance = np.diff(step.poses[:, 0])
+    assert advance[0] == pytest.approx(0.8)
+    assert advance[1] == pytest.approx(0.1 * (8.0 - 0.3))
+    assert (np.diff(advance[1:]) > 0.0).all()
+
+
+def test_a_standing_vehicle_is_not_reached():
+    _, step = one_step(scenario_with([[80.0, 0.0, 0.0]], [VEHICLE], start=(40.0, 0.0, 0.0)))
+    assert not step.braked
+    assert step.poses[-1, 0] + 4.049 < 80.0 - 2.25
+
+
+def test_the_emergency_brake_replaces_a_plan_that_hits_at_low_speed():
+    scenario = scenario_with([[20.0, 0.0, 0.0]], [VEHICLE], speed=4.9, start=(13.0, 0.0, 0.0))
+    _, step = one_step(scenario)
+    assert step.braked
+    # v = 4.9 m/s: 1.1 (4.9 - 4.05) along the heading
+    np.testing.assert_allclose(step.poses[:, 0], 13.0 + 0.935 * 0.1 * np.arange(81), atol=1e-9)
+
+
+def test_a_red_connector_is_stopped_for_and_a_green_one_is_not():
+    scenario = cruise_scenario(start=(170.0, 0.0, 0.0))
+    ends = []
+    for status in (LightStatus.RED, LightStatus.GREEN):
+        lights = TrafficLights(("21",), np.array([[status]], np.int8))
+        ends.append(one_step(scenario, lights)[1].poses[-1, 0] + 4.049)
+    assert ends[0] < 200.0 < ends[1]
+
+
+def test_an_object_that_touches_the_ego_is_ignored_from_then_on():
+    scenario = scenario_with([[16.0, 0.5, 0.0]], [VEHICLE])
+    planner, step = one_step(scenario)
+    assert planner.collided == ["0" * 16]
+    assert np.isinf(step.scores.collision_index).all()
+    again = planner.step(observe(scenario, 1, scenario.expert[1]))
+    assert planner.seen.tokens == []
+    assert again.best == 4
+
+
+def test_a_far_object_changes_nothing():
+    _, alone = one_step(cruise_scenario())
+    _, step = one_step(scenario_with([[-200.0, 0.0, 0.0]], [VEHICLE]))
+    np.testing.assert_array_equal(alone.driven, step.driven)
+
+
+@settings(max_examples=8)
+@given(st.permutations(range(5)), st.integers(0, 2**32 - 1))
+def test_the_order_of_pedestrians_and_cones_does_not_matter(order, seed):
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(20, 55, 5), rng.uniform(-3, 6, 5), rng.uniform(-3, 3, 5)])
+    kinds = [PEDESTRIAN, PEDESTRIAN, CONE, CONE, PEDESTRIAN]
+    order = list(order)
+    _, step = one_step(scenario_with(poses, kinds))
+    _, other = one_step(scenario_with(poses[order], [kinds[i] for i in order]))
+    np.testing.assert_array_equal(step.scores.total, other.scores.total)
+    np.testing.assert_array_equal(step.poses, other.poses)
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**32 - 1))
+def test_moving_the_whole_world_moves_the_plan(seed):
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(30, 60, 3), rng.uniform(-3, 6, 3), rng.uniform(-3, 3, 3)])
+    shift = (512.0, -2048.0)
+    moved = poses + np.array([*shift, 0.0])
+    kinds = [VEHICLE, PEDESTRIAN, CONE]
+    _, step = one_step(scenario_with(poses, kinds))
+    there = scenario_with(
+        moved, kinds, road=straight_road(offset=shift), start=(10.0 + shift[0], shift[1], 0.0)
+    )
+    _, other = one_step(there)
+    np.testing.assert_allclose(other.scores.total, step.scores.total, atol=1e-9)
+    np.testing.assert_allclose(other.poses - [*shift, 0.0], step.poses, atol=1e-9)
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.5, -2.2, 3.0]))
+def test_turning_the_whole_world_turns_the_plan(seed, angle):
+    # random objects are neither exactly ahead, where bearings may be NaN, nor at equal distances
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(30, 60, 3), rng.uniform(-3, 6, 3), rng.uniform(-3, 3, 3)])
+    scenario = scenario_with(poses, [VEHICLE, PEDESTRIAN, CONE])
+    scenario.tracks.velocities[:, :2] = rng.uniform(-3.0, 3.0, (2, 2))
+    shift = np.array([512.0, -2048.0])
+
+    _, step = one_step(scenario)
+    _, other = one_step(moved(scenario, angle, shift))
+
+    assert (other.best, other.braked) == (step.best, step.braked)
+    np.testing.assert_allclose(other.scores.total, step.scores.total, atol=1e-9)
+    expected = moved_poses(step.poses, angle, shift)
+    np.testing.assert_allclose(other.poses[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(np.sin(other.poses[:, 2] - expected[:, 2]), 0.0, atol=1e-9)
+
+
+def test_errors_name_what_to_mend():
+    with pytest.raises(PlannerError, match="before reset"):
+        PdmClosed().plan(observe(cruise_scenario(), 0, np.zeros(11)))
+    scenario = replace(cruise_scenario(), route=("1", "nowhere"))
+    with pytest.raises(PlannerError, match="no roadblock 'nowhere'"):
+        PdmClosed().reset(scene_info(scenario))
+    with pytest.raises(PlannerError, match="is empty"):
+        PdmClosed().reset(scene_info(replace(scenario, route=())))
+    with pytest.raises(ConfigError, match="not a list of numbers"):
+        load_planner("pdm-closed", {"speed_fractions": "fast"})
+    with pytest.raises(ConfigError, match="map_radius"):
+        PdmParameters(map_radius=0.0)
+
+
+def test_parameters_are_plain_data():
+    planner = load_planner("pdm-closed", {"speed_fractions": "0.5,1", "lateral_offsets": ""})
+    scenario = cruise_scenario()
+    planner.reset(scene_info(scenario))
+    step = planner.step(observe(scenario, 0, scenario.expert[0]))
+    assert step.driven.shape == (2, 41, 11)
+    assert planner.parameters == PdmParameters(speed_fractions=(0.5, 1.0), lateral_offsets=())
+
+
+def test_the_speed_limit_of_zero_gives_a_plan_without_numbers_that_are_not_finite():
+    planner = PdmClosed()
+    scenario = cruise_scenario(road=straight_road(speed_limit=0.0))
+    planner.reset(scene_info(scenario))
+    plan = planner.plan(observe(scenario, 0, scenario.expert[0]))
+    assert np.isfinite(plan.states).all()
+
+
+def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
+    poses = np.cumsum(rng.uniform(-0.1, 1.0, (41, 3)) * [1.0, 1.0, 0.1], axis=0)
+    dt, penalty = 0.1, 1e-4
+    # unknowns v_0, a_0 … a_38; rows of R are a_0 … a_36 and the last difference
+    unknowns = np.hstack([np.ones((40, 1)), dt * np.tri(40, 39, -1)])
+    rows = [dt * np.cos(poses[:-1, 2])[:, None] * unknowns]
+    rows += [dt * np.sin(poses[:-1, 2])[:, None] * unknowns]
+    matrix = np.vstack(rows)
+    right = np.concatenate([np.diff(poses[:, 0]), np.diff(poses[:, 1])])
+    regular = np.zeros((38, 40))
+    regular[np.arange(37), np.arange(1, 38)] = 1.0
+    regular[37, 38], regular[37, 39] = -1.0, 1.0
+    solved = np.linalg.solve(matrix.T @ matrix + penalty * regular.T @ regular, matrix.T @ right)
+    out = np.empty(40)
+    fit_speed(poses, dt, penalty, out)
+    np.testing.assert_allclose(out, unknowns @ solved, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_occupants_of_a_corridor_are_those_its_polygon_touches(seed):
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rng.normal(0.0, 0.05, 60))
+    steps = np.column_stack([np.cos(heading), np.sin(heading)])
+    path = make_path(np.column_stack([np.cumsum(steps, axis=0), heading]))
+    poses = np.column_stack([rng.uniform(0, 60, (40, 1)), rng.uniform(-8, 8, 40), heading[:40]])
+    poses[:, :2] = path.xy[rng.integers(0, 60, 40)] + rng.uniform(-4, 4, (40, 2))
+    tracks = standing_tracks(1, poses, [VEHICLE] * 40)
+    tracks.velocities[:] = rng.normal(0.0, 3.0, (1, 40, 2))
+    occupants = make_occupants(tracks, np.arange(40), [])
+    corridor = make_corridor(10.3, 42.0, 1.1485, 40)
+    fill_corridor(path, corridor, occupants, 0, 21)
+    polygon = corridor_polygon(path, corridor)
+    for forecast in range(21):
+        touches = [
+            polygon.intersects(shapely.Polygon(ring_of(occupants, i, forecast))) for i in range(40)
+        ]
+        np.testing.assert_array_equal(corridor.sides[forecast] == HIT, touches)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_projection_is_the_nearest_point_of_the_line(seed):
+    rng = np.random.default_rng(seed)
+    xy = np.cumsum(rng.normal(0.0, 1.0, (50, 2)), axis=0)
+    path = make_path(np.column_stack([xy, np.zeros(50)]))
+    line = shapely.LineString(xy)
+    for point in rng.uniform(-12, 12, (20, 2)):
+        progress, distance, _ = project(path, *point, int(rng.integers(0, 7)))
+        assert distance == pytest.approx(line.distance(shapely.Point(point)), abs=1e-9)
+        at = line.interpolate(progress)
+        assert at.distance(shapely.Point(point)) == pytest.approx(distance, abs=1e-9)
+
+
+def test_areas_and_their_order_are_those_of_the_map():
+    road = straight_road()
+    areas = make_areas(road, [1, 3])
+    admitted = admit(road, areas, 195.0, 0.0, 10.0)
+    ids = [road.edges.ids[i] for i in admitted]
+    assert ids == ["10", "11", "20", "21"]
+    found = np.empty(8, np.int64)
+    for x, y, expected in (
+        (195.0, 0.0, ["11"]),
+        (200.0, 0.0, ["11", "21"]),
+        (195.0, 1.75, ["10", "11"]),
+        (195.0, 5.3, []),
+    ):
+        under = found[: covering(areas, admitted, x, y, found)]
+        assert [road.edges.ids[i] for i in under] == expected
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_ranks_are_the_order_in_which_a_spatial_index_yields_boxes(seed):
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(0, 100, (60, 2))
+    bounds = np.hstack([low, low + rng.uniform(1, 30, (60, 2))])
+    tree = shapely.STRtree(shapely.box(*bounds.T), node_capacity=10)
+    yielded = tree.query(shapely.box(30, 30, 60, 60), predicate="intersects")
+    assert (np.diff(index_ranks(bounds)[yielded]) > 0).all()
+
+
+def test_the_nearest_of_each_kind_are_seen_static_objects_first():
+    poses = [[float(x), 0.0, 0.0] for x in range(1, 61)]
+    tracks = standing_tracks(1, np.array(poses), [VEHICLE] * 55 + [CONE] * 5)
+    chosen = select_tracks(tracks, 0.0, 0.0, {f"{2:016x}"}, replace(DEFAULT, map_radius=58.0))
+    assert chosen.tolist() == [55, 56, 57, *(i for i in range(51) if i != 2)]

@@ -1,0 +1,58 @@
+"""Why a score is what it is."""
+
+import pytest
+
+from shiftsim.metrics.score import closed_loop_score
+from shiftsim.report.explain import explain_lines, select_tasks, why
+
+
+def metric(name, score, role, weight=None, **first):
+    row = {"metric": name, "score": score, "role": role, "weight": weight}
+    empty = {"first_violation_iteration": None, "first_violation_s": None, "partner_token": None}
+    return row | empty | first
+
+
+def test_a_score_of_zero_names_every_cause_with_time_and_partner():
+    hit = {"first_violation_iteration": 43, "first_violation_s": 4.3, "partner_token": "17"}
+    rows = [
+        metric("no_ego_at_fault_collisions", 0.0, "multiplier", **hit),
+        metric("drivable_area_compliance", 1.0, "multiplier"),
+        metric("ego_is_making_progress", 0.0, "multiplier"),
+    ]
+    assert why(0.0, rows) == (
+        "score 0 because no_ego_at_fault_collisions is 0 (4.3 s, track 17) and "
+        "ego_is_making_progress is 0"
+    )
+
+
+def test_a_score_is_taken_apart_into_its_terms():
+    rows = [
+        metric("driving_direction_compliance", 0.5, "multiplier"),
+        metric("ego_progress_along_expert_route", 0.8, "weighted", 5.0),
+        metric("ego_is_comfortable", 0.0, "weighted", 2.0),
+        metric("speed_limit_compliance", None, "weighted", 4.0),
+    ]
+    score = 0.5 * 5.0 * 0.8 / 7.0
+    assert why(score, rows) == f"{score:.4f} = 0.5 × (5·0.8 + 2·0) / 7"
+
+
+def test_a_score_that_is_zero_without_a_multiplier_says_so():
+    rows = [metric("ego_is_comfortable", 0.0, "weighted", 2.0)]
+    assert why(0.0, rows) == "score 0 because every weighted metric is 0"
+
+
+def test_the_terms_of_every_real_score_give_that_score(clean_run):
+    for token in set(clean_run.tasks["token"].to_pylist()):
+        for task in select_tasks(clean_run, token):
+            scores = {row["metric"]: row["score"] for row in task["metrics"] if row["role"]}
+            assert closed_loop_score(scores) == pytest.approx(task["cls"], abs=1e-12)
+            assert task["why"].startswith(f"{task['cls']:.4f} = " if task["cls"] else "score 0")
+
+
+def test_every_metric_has_a_line_with_value_threshold_and_weight(clean_run):
+    (task,) = select_tasks(clean_run, "0001cafe", planner="constant-velocity", noise="none")
+    text = "\n".join(explain_lines(task))
+    for row in task["metrics"]:
+        assert row["metric"] in text
+    assert "threshold 0.95 s" in text
+    assert text.count("weight ") == 4

@@ -1,0 +1,126 @@
+"""Planners that misbehave, for tests of the runner."""
+
+import os
+import time
+from pathlib import Path
+
+from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.learned.base import LearnedPlanner
+
+BAD = "0001cafe"
+
+
+class Failing(ConstantVelocity):
+    """Raises in one scenario."""
+
+    def reset(self, scene):
+        super().reset(scene)
+        if scene.token == BAD:
+            raise RuntimeError("cannot drive here")
+
+
+class Dying(ConstantVelocity):
+    """Ends its process in one scenario."""
+
+    def reset(self, scene):
+        super().reset(scene)
+        if scene.token == BAD:
+            os._exit(11)
+
+
+class Interrupting(ConstantVelocity):
+    """Presses Ctrl-C in one scenario."""
+
+    def reset(self, scene):
+        super().reset(scene)
+        if scene.token == BAD:
+            raise KeyboardInterrupt
+
+
+class Sloppy(ConstantVelocity):
+    """Answers with something that is no plan."""
+
+    def plan(self, observation):
+        return [1, 2, 3]
+
+
+class NoPlan:
+    """Has no method plan()."""
+
+    def reset(self, scene):
+        pass
+
+
+class Greedy:
+    """Cannot be made."""
+
+    def __init__(self):
+        raise ValueError("no weights")
+
+
+class Slow(ConstantVelocity):
+    """Needs a tenth of a second more."""
+
+    def reset(self, scene):
+        super().reset(scene)
+        time.sleep(0.1)
+
+
+class Hanging(ConstantVelocity):
+    """Never answers in one scenario, and cannot be asked to stop."""
+
+    def plan(self, observation):
+        while self.token == BAD:
+            pass
+        return super().plan(observation)
+
+    def reset(self, scene):
+        super().reset(scene)
+        self.token = scene.token
+
+
+class Moody(ConstantVelocity):
+    """Fails, or drives, as a file says."""
+
+    def reset(self, scene):
+        super().reset(scene)
+        if scene.token == BAD and Path(os.environ["MOOD"]).read_text() == "bad":
+            raise RuntimeError("not today")
+
+
+class Together(LearnedPlanner):
+    """Answers for several scenarios at once, and misbehaves in one where told to.
+
+    Its plan depends on nothing but its own scenario; the calls and the size of the largest batch
+    are noted in a file.
+    """
+
+    def __init__(self, trouble: str = "", notes: str = ""):
+        self.trouble, self.notes = trouble, notes
+
+    def reset(self, scene):
+        self.inner = ConstantVelocity()
+        self.inner.reset(scene)
+        self.token = scene.token
+        if self.trouble == "reset" and scene.token == BAD:
+            raise RuntimeError("cannot drive here")
+
+    def features(self, observation):
+        if self.token == BAD and observation.iteration == 5:
+            if self.trouble == "features":
+                raise RuntimeError("cannot look here")
+            if self.trouble == "death":
+                os._exit(11)
+            self.degraded = "lost" if self.trouble == "lost" else ""
+        return observation
+
+    def infer(self, features):
+        if self.notes:
+            with open(self.notes, "a") as file:
+                file.write(f"{len(features)}\n")
+        if self.trouble == "pass" and len(features) > 1:
+            raise RuntimeError("out of memory")
+        return features
+
+    def decode(self, output, observation):
+        return self.inner.plan(observation)

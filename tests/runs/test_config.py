@@ -1,0 +1,85 @@
+"""Settings are checked when they are read."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from shiftsim.errors import ConfigError
+from shiftsim.runs.config import make_config, parse_argument, read_toml, store_path, write_toml
+
+GOOD = {"planners": ["idm", "my.module:Mine"], "noise": ["ou-high"], "seeds": [0, 2]}
+
+
+def test_settings_survive_toml():
+    arguments = {"idm": {"min_gap": 1.5, "name": 'a "quoted" \\ name', "on": True, "list": [1, 2]}}
+    config = make_config({**GOOD, "planner_args": arguments, "limit": 3, "out": "runs/ü"})
+    assert make_config(tomllib.loads(write_toml(config))) == config
+
+
+@pytest.mark.parametrize(
+    ("values", "message", "hint"),
+    [
+        ({}, "no planner", "--planner"),
+        ({"planner": ["idm"]}, "setting 'planner' unknown", "did you mean 'planners'?"),
+        ({**GOOD, "noize": ["none"]}, "setting 'noize' unknown", "did you mean 'noise'?"),
+        ({"planners": "idm"}, "must be a list of str", ""),
+        ({"planners": []}, "planners is empty", ""),
+        ({"planners": ["idm", "idm"]}, "listed twice", ""),
+        ({**GOOD, "seeds": [1.5]}, "must be a list of int", ""),
+        ({**GOOD, "seeds": [True]}, "must be a list of int", ""),
+        ({**GOOD, "seeds": [-1]}, "from 0 on", ""),
+        ({**GOOD, "limit": "3"}, "limit is '3'; it must be int", ""),
+        ({**GOOD, "limit": -3}, "cannot be negative", ""),
+        ({**GOOD, "allow_partial": 1}, "must be bool", ""),
+        ({**GOOD, "save_rollouts": "al"}, "save_rollouts 'al' unknown", "did you mean 'all'?"),
+        ({**GOOD, "planner_args": {"idn": {}}}, "'idn' unknown", "did you mean 'idm'?"),
+        ({**GOOD, "planner_args": {"idm": 3}}, "a table of arguments per planner", ""),
+    ],
+)
+def test_a_wrong_setting_is_named(values, message, hint):
+    with pytest.raises(ConfigError) as caught:
+        make_config(values, where="run.toml")
+    assert str(caught.value).startswith("run.toml: ")
+    assert message in str(caught.value)
+    assert hint in caught.value.hint
+
+
+def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path):
+    broken = tmp_path / "broken.toml"
+    broken.write_text("planners = [")
+    with pytest.raises(ConfigError, match=r"broken\.toml' is not TOML"):
+        read_toml(broken)
+    with pytest.raises(ConfigError, match=r"cannot read .*absent\.toml"):
+        read_toml(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "planners", "expected"),
+    [
+        ("gap=1.5", ("idm",), ("idm", "gap", 1.5)),
+        ("idm.gap=2", ("idm", "simple"), ("idm", "gap", 2)),
+        ("file=a/b.csv", ("scripted",), ("scripted", "file", "a/b.csv")),
+        ("on=true", ("idm",), ("idm", "on", True)),
+        ("m:P.k=v=w", ("m:P", "idm"), ("m:P", "k", "v=w")),
+    ],
+)
+def test_planner_arguments_are_read_as_toml_values(text, planners, expected):
+    assert parse_argument(text, planners) == expected
+
+
+@pytest.mark.parametrize("text", ["gap", "=1", "gap=1"])
+def test_planner_arguments_must_say_what_and_whose(text):
+    with pytest.raises(ConfigError, match="planner argument"):
+        parse_argument(text, ("idm", "simple"))
+
+
+def test_stores_are_found_by_name_or_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert store_path("mini") == Path("shiftsim-data/mini")
+    assert store_path("some/where") == Path("some/where")
+    monkeypatch.setenv("SHIFTSIM_DATA", "/data")
+    assert store_path("mini") == Path("/data/mini")
+    (tmp_path / "mini").mkdir()
+    (tmp_path / "mini" / "store.json").write_text("{}")
+    assert store_path("mini") == Path("mini")

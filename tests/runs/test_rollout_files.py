@@ -1,0 +1,189 @@
+"""Rollouts share files and row groups, and every one is found again."""
+
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shiftsim.errors import DataError
+from shiftsim.runs import rollout_files
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.results import TaskResult
+from shiftsim.runs.rollout_files import PartWriter, Place, RolloutReader, without_key
+from shiftsim.runs.rollouts import STATES, TRACKS, Task, encode_batches
+
+MANIFEST = {"format": 4, "state": "finished"}
+
+
+def made_up(length, *, value=0.0, tracks=None):
+    """A rollout of so many samples, with so many tracks."""
+    columns = []
+    for field in STATES if tracks is None else [*STATES, *TRACKS]:
+        if pa.types.is_list(field.type):
+            width = {"plan_poses": 33, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
+            size = width if field.name == "plan_poses" else width * tracks
+            item = bool if pa.types.is_boolean(field.type.value_type) else float
+            columns.append(pa.array([[item(value)] * size] * length, field.type))
+        else:
+            columns.append(pa.array([value] * length).cast(field.type))
+    schema = STATES if tracks is None else pa.schema([*STATES, *TRACKS])
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def key(number):
+    return Task("p", "none" if number % 2 else "ou-high", number % 3, f"{number:04x}")
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 7), min_size=1, max_size=20),
+    tracks=st.sampled_from([None, 0, 2]),
+    per_group=st.integers(1, 4),
+    per_file=st.integers(1, 9),
+)
+def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_group, per_file):
+    folder = tmp_path_factory.mktemp("rollouts")
+    rollouts = {
+        key(i): made_up(length, value=float(i), tracks=tracks) for i, length in enumerate(lengths)
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout_files, "_MAX_GROUP", (per_group, 1 << 30))
+        patch.setattr(rollout_files, "_MAX_FILE", (per_file, 1 << 30))
+        writer = PartWriter(folder)
+        places = {task: writer.add(task, rows) for task, rows in rollouts.items()}
+        writer.close()
+    files = sorted(folder.iterdir())
+    assert len(files) == -(-len(lengths) // per_file)
+    assert all(pq.ParquetFile(file).metadata.row_group(0).num_rows for file in files)
+    reader = RolloutReader()
+    for task, place in places.items():
+        rows = reader.read(place)
+        assert without_key(rows).equals(rollouts[task])
+        assert rows["iteration"].to_pylist() == list(range(len(rows)))
+        named = pq.read_table(place.file, columns=[*Task._fields, "time_us"]).to_pylist()
+        own = [row for row in named if Task(*(row[n] for n in Task._fields)) == task]
+        assert len(own) == place.rows
+
+
+def test_a_row_group_is_cut_where_it_gets_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(rollout_files, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
+    writer = PartWriter(tmp_path)
+    for number in range(7):
+        place = writer.add(key(number), made_up(5))
+    writer.close()
+    metadata = pq.ParquetFile(place.file).metadata
+    assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [15, 15, 5]
+
+
+def test_a_file_that_is_not_finished_leaves_nothing(tmp_path):
+    writer = PartWriter(tmp_path)
+    for number in range(40):
+        writer.add(key(number), made_up(3))
+    assert [path.name for path in tmp_path.iterdir()] == [".part-00000.parquet.tmp"]
+    writer.discard()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("place", [(0, 9), (3, 3), (4, 1), (400, 1)])
+def test_rows_that_a_file_does_not_have_are_an_error(tmp_path, place):
+    writer = PartWriter(tmp_path)
+    file = writer.add(key(0), made_up(4)).file
+    writer.close()
+    assert len(RolloutReader().read(Place(file, 1, 3))) == 3
+    with pytest.raises(DataError, match=r"part-00000\.parquet' cannot be read"):
+        RolloutReader().read(Place(file, *place))
+
+
+def under_way(folder, results, *, resume):
+    writer = RunWriter(folder, MANIFEST, resume=resume)
+    for task, rows in results.items():
+        scores = {"cls": 1.0, "thresholds": "nuplan", "metric_version": "1"}
+        metrics = [{"metric": "m", "thresholds": "nuplan", "metric_version": "1"}]
+        writer.add(
+            TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode_batches([rows]))
+        )
+    return writer
+
+
+def finished(folder, results, *, resume):
+    return under_way(folder, results, resume=resume).finish(MANIFEST, map(key, range(6)))
+
+
+def test_a_rollout_that_is_made_again_replaces_the_first(tmp_path):
+    first = {key(i): made_up(3 + i, value=float(i)) for i in range(4)}
+    later = {key(i): made_up(5, value=float(10 + i)) for i in (3, 4, 5)}
+    finished(tmp_path / "run", first, resume=False)
+    run = finished(tmp_path / "run", later, resume=True)
+    for task, rows in (first | later).items():
+        assert without_key(run.rollout_rows(task)).equals(rows)
+    stored = pa.concat_tables(map(pq.read_table, (run.path / "rollouts").iterdir()))
+    assert len(stored) == sum(map(len, (first | later).values()))
+    assert not list(run.path.glob("unfinished*"))
+
+
+def test_files_of_an_earlier_attempt_stay_as_they_are(tmp_path):
+    run = finished(tmp_path / "run", {key(i): made_up(3) for i in range(3)}, resume=False)
+    (file,) = (run.path / "rollouts").iterdir()
+    before = file.stat()
+    run = finished(tmp_path / "run", {key(i): made_up(3) for i in range(3, 6)}, resume=True)
+    assert (file.stat().st_ino, file.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    names = pc.unique(run.tasks["rollout"]).to_pylist()
+    assert sorted(names) == [path.name for path in sorted((run.path / "rollouts").iterdir())]
+    assert len(names) == 2
+
+
+@pytest.mark.parametrize("moment", ["replace", "unlink"])
+def test_ending_is_begun_anew_after_a_kill_at_any_step(tmp_path, monkeypatch, moment):
+    """Every renaming and every removal is the last thing that happens, one after the other."""
+
+    class Killed(BaseException):
+        pass
+
+    original = getattr(Path, moment)
+    first = {key(i): made_up(3 + i, value=float(i)) for i in range(4)}
+    later = {key(i): made_up(5, value=float(10 + i)) for i in (3, 4, 5)}
+    expected = finished(tmp_path / "whole", first | later, resume=False)
+    for step in range(1, 20):
+        folder = tmp_path / f"run-{step}"
+        finished(folder, first, resume=False)
+        calls = count(1)
+
+        def killing(self, *args, calls=calls, last=step, **values):
+            original(self, *args, **values)
+            if next(calls) == last:
+                raise Killed
+
+        writer = under_way(folder, later, resume=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, moment, killing)
+            with suppress(Killed):
+                writer.finish(MANIFEST, map(key, range(6)))
+                break
+        writer.close()
+        run = finished(folder, {}, resume=True)
+        for name in ("scores.parquet", "metrics.parquet"):
+            assert (run.path / name).read_bytes() == (expected.path / name).read_bytes()
+        for task, rows in (first | later).items():
+            assert without_key(run.rollout_rows(task)).equals(rows)
+        names = {path.name for path in (run.path / "rollouts").iterdir()}
+        assert names == set(run.tasks["rollout"].to_pylist())
+    assert step > 3
+
+
+def test_the_rollouts_of_a_scenario_lie_together(tmp_path):
+    tasks = [Task(planner, "none", 0, token) for planner in "ba" for token in ("y", "x")]
+    writer = under_way(tmp_path / "run", dict.fromkeys(tasks, made_up(3)), resume=False)
+    run = writer.finish(MANIFEST, tasks)
+    ordered = sorted(tasks, key=lambda task: run.rollout_places[task])
+    assert [(task.token, task.planner) for task in ordered] == [
+        ("x", "a"),
+        ("x", "b"),
+        ("y", "a"),
+        ("y", "b"),
+    ]

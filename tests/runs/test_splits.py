@@ -1,0 +1,108 @@
+"""Splits name scenarios."""
+
+import pytest
+
+from shiftsim.errors import ConfigError
+from shiftsim.runs.splits import choose_scenarios, find_split, read_split, token_hash, write_split
+
+TOKENS = ("a1", "b2", "c3")
+
+
+def test_the_store_itself_is_a_split(tmp_path):
+    store = tmp_path / "mini"
+    assert find_split("", store, TOKENS).tokens == TOKENS
+    assert find_split("mini", store, TOKENS).name == "mini"
+
+
+def test_a_split_of_the_store_is_found_by_name(tmp_path):
+    (tmp_path / "splits").mkdir()
+    (tmp_path / "splits" / "small.toml").write_text('tokens = ["a1"]')
+    assert find_split("small", tmp_path, TOKENS).tokens == ("a1",)
+    with pytest.raises(ConfigError, match="split 'smal' unknown") as caught:
+        find_split("smal", tmp_path, TOKENS)
+    assert "did you mean 'small'" in caught.value.hint
+
+
+def test_a_list_of_tokens_is_a_split(tmp_path):
+    path = tmp_path / "list.txt"
+    path.write_text("a1\nb2\n")
+    assert read_split(path).tokens == ("a1", "b2")
+    assert read_split(path).name == "list"
+
+
+def test_the_hash_does_not_depend_on_the_order():
+    assert token_hash(["a", "b"]) == token_hash(["b", "a"]) != token_hash(["a", "c"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "lists no tokens"),
+        ("tokens = []", "lists no tokens"),
+        ("tokens = [1]", "lists no tokens"),
+        ('tokens = ["a", "b", "a"]', "lists 'a' twice"),
+        ('tokens = ["a"]\ncount = 2', "says count = 2, but it is 1"),
+        ('tokens = ["a"]\nhash = "00"', "says hash"),
+    ],
+)
+def test_a_split_that_contradicts_itself_is_refused(tmp_path, text, message):
+    path = tmp_path / "split.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_split(path)
+
+
+ROWS = [
+    {"token": "c", "type": "left", "city": "town"},
+    {"token": "a", "type": "left", "city": "town"},
+    {"token": "b", "type": "right", "city": "port"},
+    {"token": "d", "type": "right", "city": "town"},
+]
+
+
+@pytest.mark.parametrize(
+    ("asked", "tokens"),
+    [
+        ({"wanted": {}}, ("a", "b", "c", "d")),
+        ({"wanted": {"type": ["left"], "city": []}}, ("a", "c")),
+        ({"wanted": {"type": ["left", "right"], "city": ["port"]}}, ("b",)),
+        ({"wanted": {}, "per_type": 1}, ("a", "b")),
+        ({"wanted": {"city": ["town"]}, "limit": 2}, ("a", "c")),
+    ],
+)
+def test_scenarios_are_chosen_by_type_city_and_number(asked, tokens):
+    assert choose_scenarios(ROWS, "abcd", **asked) == tokens
+    assert choose_scenarios(ROWS[::-1], "abcd", **asked) == tokens
+
+
+def test_only_usable_scenarios_are_chosen_and_counted():
+    assert choose_scenarios(ROWS, "bc", wanted={}, per_type=1) == ("b", "c")
+
+
+def test_a_value_that_no_scenario_has_is_refused():
+    with pytest.raises(ConfigError, match="type 'lef' unknown") as caught:
+        choose_scenarios(ROWS, "abcd", wanted={"type": ["lef"]})
+    assert "left" in caught.value.hint
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".txt"])
+def test_a_written_split_is_read_back(tmp_path, suffix):
+    path = tmp_path / "new" / f'my "own"{suffix}'
+    written = write_split(path, TOKENS)
+    assert read_split(path) == written
+    assert written.tokens == TOKENS
+
+
+def test_a_split_that_was_cut_off_is_refused(tmp_path):
+    path = tmp_path / "half.toml"
+    write_split(path, TOKENS)
+    path.write_text(path.read_text().replace(f'    "{TOKENS[-1]}",\n', ""))
+    with pytest.raises(ConfigError, match="says count"):
+        read_split(path)
+
+
+@pytest.mark.parametrize(("name", "tokens"), [("a.csv", TOKENS), ("a.toml", ())])
+def test_nothing_is_written_that_could_not_be_read(tmp_path, name, tokens):
+    with pytest.raises(ConfigError):
+        write_split(tmp_path / name, tokens)
+    assert not (tmp_path / name).exists()

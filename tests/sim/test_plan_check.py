@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+
+from shiftsim.errors import InvalidTrajectoryError
+from shiftsim.sim.plan_check import validate_plan
+from shiftsim.world.state import NUM_STATE, Command, Trajectory
+
+NOW, NEXT = 1_600_000_000_000_000, 1_600_000_000_100_000
+
+
+def trajectory(times_us, relative=True) -> Trajectory:
+    times = np.asarray(times_us, np.int64)
+    return Trajectory(times, np.zeros((len(times), NUM_STATE)), relative)
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        trajectory([0, 100_000, 200_000]),
+        trajectory([NOW - 30_000, NEXT, NEXT + 200_000], relative=False),
+        trajectory([NOW, NOW + 500_000], relative=False),
+        Command(-1.0, 0.2),
+    ],
+)
+def test_plans_that_cover_the_next_step_are_accepted(plan):
+    validate_plan(plan, NOW, NEXT)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (None, "returned NoneType"),
+        (np.zeros((3, 3)), "returned ndarray"),
+        (trajectory([0, 100_000, 100_000]), "time 2 of the plan is 100000 us"),
+        (trajectory([0, 100_000]), "2 states over 0.1 s"),
+        (trajectory([]), "0 states"),
+        (trajectory([100_000, 200_000, 300_000]), "starts at offset 100000 us"),
+        (trajectory([NOW - 900_000, NOW], relative=False), f"ends at time {NOW} us"),
+        (trajectory([0, 100_000, 200_000], relative=False), "ends at time 200000 us"),
+        (Trajectory(np.arange(3), np.zeros((3, 3))), r"float64 \(3, 3\)"),
+        (Trajectory(np.arange(3), np.zeros((4, NUM_STATE))), r"float64 \(4, 11\)"),
+        (Trajectory(np.arange(3.0), np.zeros((3, NUM_STATE))), r"float64 \(3,\)"),
+        (Trajectory([0, 1, 2], np.zeros((3, NUM_STATE))), "time_us is list"),
+        (Command(float("nan"), 0.0), "acceleration nan"),
+        (Command("fast", 0.0), "acceleration 'fast'"),
+    ],
+)
+def test_a_plan_that_cannot_be_executed_says_why(plan, message):
+    with pytest.raises(InvalidTrajectoryError, match=message) as caught:
+        validate_plan(plan, NOW, NEXT)
+    assert caught.value.hint
+
+
+def test_a_value_that_is_not_finite_is_named_with_its_column_and_row():
+    plan = trajectory([0, 100_000, 200_000])
+    plan.states[1, 2] = np.nan
+    with pytest.raises(InvalidTrajectoryError, match="heading of state 1 is nan"):
+        validate_plan(plan, NOW, NEXT)

@@ -1,0 +1,128 @@
+"""Buffers of paths have the vertices that GEOS gives them."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import offsets, seeds
+
+from shiftsim.sim.traffic.idm.buffer import buffer_curve, curve_room
+from shiftsim.sim.traffic.idm.shapes import (
+    APART,
+    MEETING,
+    PIECE,
+    UNSURE,
+    bound_pieces,
+    num_pieces,
+    ring_bounds,
+    ring_gap,
+    touches_corridor,
+)
+
+
+def outline(line: np.ndarray, distance: float) -> np.ndarray:
+    out = np.zeros((curve_room(len(line)), 2))
+    count = buffer_curve(line, len(line), distance, np.zeros(len(line), np.bool_), out)
+    return out[:count]
+
+
+def crooked_line(seed: int, offset: tuple[float, float]) -> np.ndarray:
+    """A path as lanes make them: bends, kinks and very short segments."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 40))
+    heading = np.cumsum(rng.normal(0, rng.choice([0.0, 0.005, 0.02, 0.1]), count))
+    heading[count // 2 :] += rng.choice([0.0, 0.0, 0.3, -0.8, 1.5])
+    step = rng.choice([0.3, 1.0, 3.0]) * rng.uniform(0.3, 1.0, count)
+    step[rng.integers(count)] *= rng.choice([1.0, 0.01])
+    xy = np.cumsum(np.c_[step * np.cos(heading), step * np.sin(heading)], axis=0)
+    return np.ascontiguousarray(xy + offset)
+
+
+def test_a_straight_line_is_buffered_to_its_rectangle() -> None:
+    corners = outline(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)
+
+    np.testing.assert_allclose(corners, [[4, 1], [4, -1], [0, -1], [0, 1]])
+
+
+@given(seed=seeds, offset=offsets, distance=st.floats(0.3, 1.2))
+def test_curve_and_geos_buffer_agree(
+    seed: int, offset: tuple[float, float], distance: float
+) -> None:
+    line = crooked_line(seed, offset)
+
+    curve = outline(line, distance)
+
+    area = shapely.LineString(line).buffer(distance, cap_style="flat")
+    ring = shapely.LinearRing(curve)
+    assert shapely.distance(ring, shapely.points(shapely.get_coordinates(area))).max() < 1e-8
+    assert shapely.distance(area, shapely.points(curve)).max() < 1e-8
+
+
+def test_curve_that_does_not_fit_is_reported() -> None:
+    line = crooked_line(1, (0.0, 0.0))
+
+    assert buffer_curve(line, len(line), 1.0, np.zeros(len(line), np.bool_), np.zeros((30, 2))) < 0
+
+
+@given(seed=seeds, other=seeds, shift=st.floats(-12, 12))
+def test_gap_between_outlines_is_the_distance_of_their_areas(
+    seed: int, other: int, shift: float
+) -> None:
+    first, second = crooked_line(seed, (0.0, 0.0)), crooked_line(other, (3.0, shift))
+    curves = outline(first, 1.0), outline(second, 1.1)
+
+    gap = ring_gap(curves[0], len(curves[0]), curves[1], len(curves[1]), np.inf)
+
+    areas = [
+        shapely.LineString(line).buffer(distance, cap_style="flat")
+        for line, distance in ((first, 1.0), (second, 1.1))
+    ]
+    assert gap == pytest.approx(areas[0].distance(areas[1]), abs=1e-8)
+    assert (gap == 0.0) == areas[0].intersects(areas[1])
+
+
+def test_gap_inside_a_larger_ring_is_zero() -> None:
+    box = np.array([[5.0, 5.0], [-5.0, 5.0], [-5.0, -5.0], [5.0, -5.0]])
+
+    assert ring_gap(0.1 * box, 4, box, 4, np.inf) == 0.0
+    assert ring_gap(box, 4, 0.1 * box, 4, np.inf) == 0.0
+
+
+def test_gap_beyond_the_limit_is_the_limit() -> None:
+    box = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+
+    far = box + np.array([7.0, 0.0])
+    assert ring_gap(box, 4, far, 4, 3.0) == 3.0
+    assert ring_gap(box, 4, far, 4, 9.0) == 5.0
+
+
+@given(seed=seeds, x=st.floats(-8, 40), y=st.floats(-8, 8), turn=st.floats(-3, 3))
+def test_quick_corridor_answers_are_those_of_the_exact_buffer(
+    seed: int, x: float, y: float, turn: float
+) -> None:
+    line = crooked_line(seed, (0.0, 0.0))
+    box = np.array([[2.2, 1.0], [-2.2, 1.0], [-2.2, -1.0], [2.2, -1.0]])
+    spin = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    ring = np.ascontiguousarray(box @ spin + [x, y])
+    bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    ring_bounds(ring, 4, bounds)
+    pieces = np.zeros((len(line) // PIECE + 1, 4))
+    bound_pieces(line, len(line), pieces)
+
+    answer = touches_corridor(line, len(line), pieces, 1.0, ring, 4, bounds)
+
+    area = shapely.LineString(line).buffer(1.0, cap_style="flat")
+    truth = MEETING if area.intersects(shapely.Polygon(ring)) else APART
+    assert answer in (truth, UNSURE)
+
+
+def test_pieces_cover_every_segment() -> None:
+    line = np.c_[np.arange(2.0 * PIECE + 2), np.zeros(2 * PIECE + 2)]
+    pieces = np.zeros((4, 4))
+
+    bound_pieces(line, len(line), pieces)
+
+    assert num_pieces(len(line)) == 3
+    np.testing.assert_array_equal(pieces[:3, 0], [0, PIECE, 2 * PIECE])
+    np.testing.assert_array_equal(pieces[:3, 2], [PIECE, 2 * PIECE, 2 * PIECE + 1])

@@ -1,0 +1,244 @@
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pages import sections, unpack
+from stores import write_toy_store
+from worlds import cruise_scenario, standing_tracks
+
+import shiftsim
+from shiftsim.data.store.reading import open_store
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import simulate
+from shiftsim.view.build import Choice, Gallery, list_page, page_name, write_site
+from shiftsim.view.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
+from shiftsim.view.scene import Shown
+from shiftsim.view.still import save_figure
+from shiftsim.world.state import AgentKind
+
+HOSTILE = "</script><script>alert(1)</script><!--&\u2028'\""
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    bare = cruise_scenario(iterations=41)
+    poses = np.array([[40.0, 3.5, 0.1], [25.0, -4.0, 1.0]])
+    kinds = [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
+    return replace(bare, tracks=standing_tracks(len(bare.time_us), poses, kinds))
+
+
+def shown(scenario, **settings):
+    log = simulate(scenario, load_planner("constant-velocity"), **settings)
+    return Shown("constant-velocity", settings.get("noise", "none"), 0, log, 0.5)
+
+
+def test_a_page_holds_the_rollout_to_a_centimetre(scenario):
+    item = shown(scenario)
+
+    found = sections(replay_page(scenario, [item]))
+
+    origin = np.rint(
+        (np.min(item.log.expert_ego[:, :2], axis=0) + np.max(item.log.expert_ego[:, :2], axis=0))
+        / 2
+    )
+    ego = unpack(found["rollout0"])["ego.xy"][:, 0]
+    np.testing.assert_allclose(ego + origin, item.log.ego[:, :2], atol=0.006)
+    tracks = unpack(found["scene"])["tracks.xy"]
+    np.testing.assert_allclose(tracks[0] + origin, [[40.0, 3.5], [25.0, -4.0]], atol=0.006)
+    assert json.loads(found["meta"])["tracks"] == list(scenario.tracks.tokens)
+
+
+def test_rollouts_share_the_recorded_tracks_and_carry_their_own_when_traffic_reacts(scenario):
+    moving = replace(
+        scenario, tracks=replace(scenario.tracks, velocities=scenario.tracks.velocities + 2.0)
+    )
+    recorded = sections(replay_page(moving, [shown(moving), shown(moving, noise="ou-high")]))
+    reacting = sections(replay_page(moving, [shown(moving, traffic="reactive")]))
+
+    assert "tracks.xy" in unpack(recorded["scene"])
+    assert "tracks.xy" not in unpack(recorded["rollout0"])
+    assert "tracks.xy" in unpack(reacting["rollout0"])
+    assert "tracks.xy" not in unpack(reacting["scene"])
+
+
+def test_making_a_page_leaves_rollout_and_scenario_as_they_are(scenario):
+    item = shown(scenario)
+    item.log.expert_ego[:, 2] += 7.0  # headings beyond a turn are unwrapped for the page only
+    before = item.log.expert_ego.copy(), item.log.ego.copy(), scenario.tracks.poses.copy()
+
+    replay_page(scenario, [item])
+
+    for was, now in zip(
+        before, (item.log.expert_ego, item.log.ego, scenario.tracks.poses), strict=True
+    ):
+        np.testing.assert_array_equal(was, now)
+
+
+def test_texts_of_the_data_cannot_become_script(scenario):
+    hostile = replace(
+        scenario, token=HOSTILE, city=HOSTILE, scenario_type=HOSTILE, log_name=HOSTILE
+    )
+    item = replace(shown(scenario), planner=HOSTILE, noise=HOSTILE)
+
+    page = replay_page(hostile, [item])
+
+    assert "alert(1)</script>" not in page
+    assert "<script>alert" not in page
+    assert page.count("<script") == 4  # meta, scene, one rollout, the program
+    assert json.loads(sections(page)["meta"])["token"] == HOSTILE
+    assert json.loads(sections(page)["meta"])["rollouts"][0]["planner"] == HOSTILE
+
+
+def test_the_list_escapes_what_it_shows():
+    row = {"token": HOSTILE, "type": HOSTILE, "violated": {}, "page": page_name(HOSTILE)}
+
+    page = list_page(HOSTILE, [row])
+
+    assert "<script>alert" not in page
+    assert page.count("<script") == 2
+    assert json.loads(sections(page)["rows"])[0]["token"] == HOSTILE
+
+
+def test_a_page_needs_nothing_from_elsewhere(scenario):
+    page = replay_page(scenario, [shown(scenario)])
+
+    assert "default-src 'none'" in page
+    assert not re.search(r"""(?:src|href)\s*=\s*["'](?!data:)""", page)
+    assert "http://" not in page
+    assert "https://" not in page
+
+
+def test_file_names_of_pages_are_distinct_and_stay_in_their_folder():
+    tokens = ["0123abcd", "../../etc/passwd", "a/b", "a~2fb", "A b", "ä", "con?x=1#y"]
+
+    names = [page_name(token) for token in tokens]
+
+    assert names[0] == "0123abcd.html"
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9_~-]+\.html", name) for name in names)
+
+
+def test_a_template_is_filled_once():
+    assert fill("<{{a}}|{{b}}>", a="{{b}}", b="{{a}}") == "<{{b}}|{{a}}>"
+
+
+def test_json_for_a_page_has_no_markup():
+    text = json_text({"a": "<b>&</b>\u2028"})
+
+    assert not set("<>&\u2028") & set(text)
+    assert json.loads(text) == {"a": "<b>&</b>\u2028"}
+
+
+def test_a_page_in_a_notebook_is_a_frame_of_its_own(scenario):
+    frame = embedded(replay_page(scenario, [shown(scenario)]))
+
+    assert frame.count("<") == 2  # the frame's own tag, opened and closed
+    assert 'sandbox="allow-scripts"' in frame
+
+
+def test_rollouts_are_shown_by_name_and_in_notebooks(scenario, tmp_path):
+    log = shown(scenario).log
+
+    page = shiftsim.show(scenario, mine=log, pdm_closed=log)
+
+    names = [item["planner"] for item in json.loads(sections(page)["meta"])["rollouts"]]
+    assert names == ["mine", "pdm-closed"]
+    assert page._repr_html_().startswith("<iframe")
+    assert page.save(tmp_path / "a.html").read_text("utf-8") == page
+
+
+def test_a_run_shows_the_replay_of_a_scenario(clean_run):
+    page = clean_run.view("0001")
+
+    assert json.loads(sections(page)["meta"])["token"] == "0001cafe"
+
+
+def test_more_than_six_rollouts_are_refused(scenario):
+    with pytest.raises(ValueError, match="1 to 6"):
+        replay_page(scenario, [shown(scenario)] * (MAX_ROLLOUTS + 1))
+
+
+def test_sixty_agents_take_less_than_the_promised_room(rng):
+    bare = cruise_scenario()
+    rows = len(bare.time_us)
+    still = standing_tracks(rows, rng.uniform(0, 60, (60, 3)), [AgentKind.VEHICLE] * 60)
+    wander = np.cumsum(rng.normal(0, 0.3, (rows, 60, 3)), axis=0)
+    crowded = replace(bare, tracks=replace(still, poses=still.poses + wander))
+
+    page = replay_page(crowded, [shown(crowded)])
+
+    assert len(page) < 400_000
+
+
+@pytest.fixture
+def gallery(clean_run, toy):
+    return Gallery([clean_run], open_store(toy))
+
+
+class TestGallery:
+    def test_every_scenario_shows_each_planner_clean_and_with_the_first_seed(self, gallery):
+        tasks = gallery.tasks(gallery.tokens[0])
+
+        assert [(t.planner, t.noise, t.seed) for t in tasks] == [
+            ("constant-velocity", "none", 0),
+            ("constant-velocity", "ou-high", 0),
+            ("log-future", "none", 0),
+            ("log-future", "ou-high", 0),
+        ]
+
+    def test_the_choice_narrows_planners_noises_and_seeds(self, clean_run, toy):
+        choice = Choice(planners=("log-future",), noises=("ou-high",), seeds=(1,))
+        gallery = Gallery([clean_run], open_store(toy), choice)
+
+        assert [t.seed for t in gallery.tasks(gallery.tokens[0])] == [1]
+
+    def test_a_folder_of_pages_links_every_rollout(self, gallery, tmp_path):
+        count = write_site(tmp_path, [gallery], title="toy")
+
+        rows = json.loads(sections((tmp_path / "index.html").read_text())["rows"])
+        assert count == 4
+        assert {row["page"] for row in rows} == {f"replay/{page_name(t)}" for t in gallery.tokens}
+        assert all((tmp_path / row["page"]).is_file() for row in rows)
+        lowest = min(rows, key=lambda row: row["cls"])
+        assert rows[0]["token"] == lowest["token"]
+
+    def test_an_unknown_scenario_is_named_with_a_near_one(self, gallery):
+        with pytest.raises(ConfigError) as caught:
+            gallery.find("0000cafd")
+
+        assert "0000cafe" in caught.value.hint
+
+    def test_the_beginning_of_a_token_is_enough(self, gallery):
+        assert gallery.find("0003") == "0003cafe"
+
+    def test_a_run_of_another_store_is_refused(self, clean_run, toy, tmp_path):
+        other = open_store(write_toy_store(tmp_path / "other", count=1, first=7))
+
+        with pytest.raises(DataError, match="another store"):
+            Gallery([clean_run], other)
+
+
+class TestFigures:
+    @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
+    def test_stills_have_the_same_bytes_each_time(self, scenario, tmp_path, ending):
+        pytest.importorskip("matplotlib")
+        items = [shown(scenario), shown(scenario, noise="ou-high")]
+
+        files = [tmp_path / f"{name}.{ending}" for name in "ab"]
+        for file in files:
+            save_figure(file, scenario, items, at=1.0)
+
+        assert files[0].read_bytes() == files[1].read_bytes()
+
+    def test_an_unknown_ending_names_those_possible(self, scenario, tmp_path):
+        with pytest.raises(ConfigError, match=r"\.bmp") as caught:
+            save_figure(tmp_path / "a.bmp", scenario, [shown(scenario)], at=0.0)
+
+        assert ".svg" in caught.value.hint
+
+    def test_a_time_beyond_the_end_is_refused(self, scenario, tmp_path):
+        with pytest.raises(ConfigError, match="not within"):
+            save_figure(tmp_path / "a.png", scenario, [shown(scenario)], at=99.0)
