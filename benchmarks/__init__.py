@@ -10,9 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from shiftsim.errors import one_of
 from shiftsim.report.groups import KnownSet
 from shiftsim.report.published import Published
-from shiftsim.runs.config import one_of
 
 TRACKS = ("semantic-shift", "state-drift")
 _HERE = Path(__file__).parent

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
-from shiftsim.runs.config import checkpoint_folder, one_of
+from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError, one_of
+from shiftsim.files import checkpoint_folder
 from shiftsim.sim.planner import Planner
 
 

@@ -2,16 +2,19 @@
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from shiftsim import _moved
+from shiftsim._version import __version__ as __version__
+
+_moved.install()
 
 if TYPE_CHECKING:
+    from shiftsim.api import Run as Run
+    from shiftsim.api import open_run as open_run
+    from shiftsim.api import run as run
     from shiftsim.errors import ShiftsimError as ShiftsimError
     from shiftsim.metrics import compute_metrics as score
     from shiftsim.planners.contract import check_planner as check_planner
-    from shiftsim.runs.execute import open_named_store as open_store
-    from shiftsim.runs.execute import run as run
-    from shiftsim.runs.results import Run as Run
-    from shiftsim.runs.results import open_run as open_run
+    from shiftsim.runs.prepare import open_named_store as open_store
     from shiftsim.sim.log import SimulationLog as SimulationLog
     from shiftsim.sim.loop import simulate as simulate
     from shiftsim.sim.noise import NoiseModel as NoiseModel
@@ -32,7 +35,7 @@ _PUBLIC = {
     "NoiseModel": "shiftsim.sim.noise:NoiseModel",
     "Observation": "shiftsim.sim.planner:Observation",
     "Planner": "shiftsim.sim.planner:Planner",
-    "Run": "shiftsim.runs.results:Run",
+    "Run": "shiftsim.api:Run",
     "Scenario": "shiftsim.world.scenario:Scenario",
     "SceneInfo": "shiftsim.sim.planner:SceneInfo",
     "ShiftsimError": "shiftsim.errors:ShiftsimError",
@@ -40,9 +43,9 @@ _PUBLIC = {
     "Tracks": "shiftsim.world.state:Tracks",
     "Trajectory": "shiftsim.world.state:Trajectory",
     "check_planner": "shiftsim.planners.contract:check_planner",
-    "open_run": "shiftsim.runs.results:open_run",
-    "open_store": "shiftsim.runs.execute:open_named_store",
-    "run": "shiftsim.runs.execute:run",
+    "open_run": "shiftsim.api:open_run",
+    "open_store": "shiftsim.runs.prepare:open_named_store",
+    "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
     "show": "shiftsim.view.page:show",
     "simulate": "shiftsim.sim.loop:simulate",

@@ -1,5 +1,8 @@
 """The exception tree. A message says what is wrong, where, and what to do about it."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class ShiftsimError(Exception):
     """Base of all errors that a user can cause or mend.
@@ -51,3 +54,22 @@ class InvalidTrajectoryError(PlannerError):
 
 class MissingExtraError(ShiftsimError, ImportError):
     """An optional dependency is not installed."""
+
+
+def one_of(what: str, value: str, choices: Iterable[str]) -> str:
+    """The value, when it is among the choices.
+
+    Raises:
+        ConfigError: It is not; the hint names the nearest choice.
+    """
+    valid = sorted(choices)
+    if value in valid:
+        return value
+    near = nearest(value, valid)
+    hint = f"did you mean {near!r}? " if near else ""
+    raise ConfigError(f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}")
+
+
+def nearest(value: str, choices: Iterable[str]) -> str:
+    """The choice that a mistyped value most likely means; empty where none is near."""
+    return next(iter(difflib.get_close_matches(value, list(choices), n=1, cutoff=0.5)), "")

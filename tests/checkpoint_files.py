@@ -77,9 +77,9 @@ def write_diffusion(folder: Path, state: dict[str, torch.Tensor], prefix: str = 
 
 def diffusion_args() -> dict[str, Any]:
     """Settings of Diffusion Planner as its training writes them."""
-    from shiftsim.planners.learned.diffusion.network import model as diffusion_planner
+    from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS
 
-    return dict(diffusion_planner.DEFAULT_ARGS)
+    return dict(DEFAULT_ARGS)
 
 
 def save(entries: Any, path: Path, **options: Any) -> Path:

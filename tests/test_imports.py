@@ -1,6 +1,8 @@
 """Who may import whom: data flows one way, and so do imports."""
 
 import ast
+import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,30 +10,25 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-BASE = {"arrays", "config", "errors", "geometry", "predicates", "state"}
-WORLD = {
-    "dynamics",
-    "layers",
-    "log",
-    "map",
-    "noise",
-    "planner",
-    "scenario",
-    "traffic",
+# Who may import whom: a package may use those of lower layers, and itself.
+LAYERS = (
+    {"_moved", "_version", "arrays", "errors", "files", "geometry"},
+    {"world"},
+    {"sim", "metrics", "data", "planners"},
+    {"runs"},
+    {"report", "view", "verify", "env", "train", "compat"},
+    {"api", "cli", "benchmarks", "__main__", "__init__"},
+)
+LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
+# what may be used of a neighbour in the same layer
+NEIGHBOURS = {
+    "planners": ("sim.dynamics", "sim.noise", "sim.plan_check", "sim.planner"),
+    "metrics": ("sim.log",),
+    "view": ("report.palette",),
+    "train": ("env",),
 }
-LOOP = {"simulation", "plan_check"}
-MIDDLE = {"data", "metrics", "planners", *LOOP}
-# what a module of row 2 may use besides its own sub-package
-ALLOWED = {
-    **{name: BASE for name in BASE},
-    **{name: BASE | WORLD for name in WORLD},
-    **{name: BASE | WORLD | LOOP for name in LOOP},
-    "data": BASE | WORLD,
-    "metrics": BASE | {"map", "layers", "log"},
-    "planners": BASE | WORLD | {"plan_check"},
-}
-TOP = {"benchmarks", "cli", "__main__"}
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
+MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/")
 SOURCES = sorted(
     path
     for folder in ("shiftsim", "planners", "metrics", "data", "benchmarks")
@@ -40,42 +37,75 @@ SOURCES = sorted(
 )
 
 
-def part_of(path):
-    """The top-level module or sub-package that a source file belongs to."""
+def module_of(path):
+    """`sim.loop` for shiftsim/sim/loop.py; a package has the name of its folder."""
     parts = path.relative_to(REPOSITORY).with_suffix("").parts
-    return parts[1] if parts[0] == "shiftsim" else parts[0]
+    parts = parts[1:] if parts[0] == "shiftsim" else parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+
+
+MODULES = {module_of(path): path for path in SOURCES}
 
 
 def imported(tree):
-    """(module, whether at the top of the file) of every import."""
+    """(module or name, whether at the top of the file) of every import that is run."""
     top = set(map(id, tree.body))
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
     for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
         if isinstance(node, ast.Import):
             yield from ((alias.name, id(node) in top) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative import"
-            if node.module == "shiftsim":
-                yield from ((f"shiftsim.{alias.name}", id(node) in top) for alias in node.names)
-            else:
-                yield node.module, id(node) in top
+            yield from ((f"{node.module}.{alias.name}", id(node) in top) for alias in node.names)
+
+
+def ours(path):
+    """The modules of the project that a file imports, anywhere in it."""
+    for name, _ in imported(ast.parse(path.read_text())):
+        name = name.removeprefix("shiftsim.") if name.startswith("shiftsim.") else ""
+        while name and name not in MODULES:
+            name = name.rpartition(".")[0]
+        if name and MODULES[name] != path:
+            yield name
+
+
+def open_to_all(package):
+    """In the lowest and in the highest layer, neighbours use one another."""
+    return LAYER[package] in (0, len(LAYERS) - 1)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_a_module_imports_only_what_its_layer_may(path):
-    part = part_of(path)
-    ours, heavy = set(), set()
-    for name, at_top in imported(ast.parse(path.read_text())):
-        words = name.split(".")
-        if words[0] == "shiftsim" and len(words) > 1:
-            ours.add(words[1])
-        elif at_top and words[0] in LAZY and "nets" not in path.parts:
-            heavy.add(words[0])
-    ours -= {part, "__version__"}
-    assert heavy == set(), "import it inside the function that uses it"
-    if part in ALLOWED:
-        assert ours - ALLOWED[part] == set()
-    elif part not in TOP and part != "__init__":
-        assert ours & TOP == set()
+    package = module_of(path).partition(".")[0]
+    for name in ours(path):
+        other = name.partition(".")[0]
+        same_layer = LAYER[other] == LAYER[package]
+        if other == package or LAYER[other] < LAYER[package] or (same_layer and open_to_all(other)):
+            continue
+        assert name.startswith(NEIGHBOURS.get(package, ())), name
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_heavy_libraries_are_imported_where_they_are_used(path):
+    if MAY_IMPORT_TORCH.search(path.as_posix()):
+        return
+    found = {name.split(".")[0] for name, top in imported(ast.parse(path.read_text())) if top}
+    assert found & LAZY == set()
+
+
+def test_no_module_needs_itself():
+    graph = {name: set(ours(path)) for name, path in MODULES.items()}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
 def test_the_core_works_without_torch():

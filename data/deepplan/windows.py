@@ -12,9 +12,8 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.dsc3d.recording import Annotations
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
-from shiftsim.runs.config import one_of
 
 ROW_S = 0.05  # s between rows of a converted recording
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"

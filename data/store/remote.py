@@ -23,7 +23,7 @@ from shiftsim.data.store.reading import (
 )
 from shiftsim.data.store.review import REVIEW
 from shiftsim.errors import DataError
-from shiftsim.runs.config import remote_store_folder
+from shiftsim.files import remote_store_folder
 
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
 

@@ -31,8 +31,8 @@ from shiftsim.planners.idm.path import (
     plan_route,
     route_blocks,
 )
+from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.sim.traffic.idm.policy import idm_acceleration
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     NUM_STATE,

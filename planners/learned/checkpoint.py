@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import CheckpointError
+from shiftsim.files import checkpoint_folder
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
 from shiftsim.planners.learned.match import (
     differences,
@@ -27,7 +28,6 @@ from shiftsim.planners.learned.match import (
 )
 from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
 from shiftsim.planners.registry import PLANNERS
-from shiftsim.runs.config import checkpoint_folder
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
 SUFFIXES = (".ckpt", ".pth", ".safetensors")

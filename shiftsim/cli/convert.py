@@ -51,7 +51,7 @@ def nuplan(
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
     from shiftsim.data.nuplan.convert import convert_nuplan
     from shiftsim.data.nuplan.mapping import parse_mapping
-    from shiftsim.runs.config import store_path
+    from shiftsim.files import store_path
 
     folder = store_path(store)
     with progress_bar(quiet=quiet or as_json) as advance:
@@ -138,7 +138,8 @@ def dsc3d(
     from functools import partial
 
     from shiftsim.data.deepplan.convert import convert_dsc3d
-    from shiftsim.runs.config import default_workers, store_path
+    from shiftsim.files import store_path
+    from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
     flags = {
@@ -196,7 +197,7 @@ def _category_map(words: list[str]) -> dict[str, str] | None:
 def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
     from shiftsim.data.deepplan.windows import make_config
     from shiftsim.errors import ConfigError
-    from shiftsim.runs.config import read_toml
+    from shiftsim.files import read_toml
 
     values = read_toml(path) if path else {}
     try:

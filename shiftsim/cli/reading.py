@@ -75,9 +75,9 @@ def report(
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.errors import one_of
     from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
-    from shiftsim.runs.config import one_of
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:
@@ -103,7 +103,7 @@ def report(
         files = write_report(out, tables, drawn, style or FORMATS)
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
-        from shiftsim.report.site import write_report_site
+        from shiftsim.cli.site import write_report_site
 
         with progress_bar(quiet=quiet) as advance:
             page = write_report_site(
@@ -190,7 +190,7 @@ def check(
 ) -> None:
     """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
     from shiftsim.data.store.check import check_store
-    from shiftsim.runs.config import store_path
+    from shiftsim.files import store_path
 
     path = store_path(store)
     problems = check_store(path)
@@ -298,7 +298,7 @@ def verify(
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).
     """
-    from shiftsim.runs.config import one_of
+    from shiftsim.errors import one_of
     from shiftsim.verify import MODES
     from shiftsim.verify import verify as compare
 

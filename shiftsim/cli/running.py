@@ -137,7 +137,8 @@ def run(
     debug: Debug = False,
 ) -> None:
     """Simulate and score planners on scenarios."""
-    from shiftsim.runs.config import make_config, read_toml
+    from shiftsim.files import read_toml
+    from shiftsim.runs.config import make_config
 
     values = read_toml(config) if config else {}
     flags: dict[str, Any] = {
@@ -316,14 +317,14 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
 
 
 def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
-    from shiftsim.report import failures, summary, worst_rollouts
+    from shiftsim.report import failures, score_table, summary, worst_rollouts
 
     if as_json:
         say_json(summary(finished))
         return
     counts = finished.manifest["counts"]
     say()
-    say(finished.table(allow_partial=allow_partial))
+    say(score_table([finished], allow_partial=allow_partial))
     bad = [row for row in worst_rollouts(finished, 3) if row["cls"] < 1.0]
     if bad:
         words = (f"{row['token']} {row['planner']} {row['cls']:.2f} {row['reason']}" for row in bad)
@@ -350,7 +351,8 @@ def demo(
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed."""
     from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
-    from shiftsim.runs.config import DEFAULT_STORE, make_config, store_path
+    from shiftsim.files import store_path
+    from shiftsim.runs.config import DEFAULT_STORE, make_config
     from shiftsim.verify.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)

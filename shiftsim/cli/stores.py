@@ -222,8 +222,8 @@ def show_stats(
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
     from shiftsim.data.store.statistics import store_stats
+    from shiftsim.errors import one_of
     from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
-    from shiftsim.runs.config import one_of
     from shiftsim.runs.execute import open_named_store
 
     one_of("column", by, ("city", "type"))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from shiftsim.errors import one_of
 from shiftsim.report import data_tables, details, paper
 from shiftsim.report.figures import Figure
 from shiftsim.report.groups import Group, made_up_note
@@ -13,7 +14,6 @@ from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
 from shiftsim.report.writers import ENDINGS, render
-from shiftsim.runs.config import one_of
 
 # the kinds of tables: names up to the first "_"
 TABLES = (

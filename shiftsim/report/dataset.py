@@ -11,8 +11,7 @@ from shiftsim.data.store.statistics import (
     PUBLISHED_SETS,
     StoreStats,
 )
-from shiftsim.errors import ConfigError, MissingExtraError
-from shiftsim.runs.config import one_of
+from shiftsim.errors import ConfigError, MissingExtraError, one_of
 
 FORMATS = ("text", "csv")
 _HEADINGS = {

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from shiftsim.arrays import FloatArray
+from shiftsim.errors import one_of
 from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.groups import COLUMNS, Group, KnownSet, made_up_note, read_groups
 from shiftsim.report.tables import Cell, Number, Table
 from shiftsim.report.writers import FORMATS, render
-from shiftsim.runs.config import one_of
 from shiftsim.runs.results import Run
 
 GROUPINGS = ("scenario_type", "city", "seed")

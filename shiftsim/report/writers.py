@@ -6,8 +6,8 @@ import io
 import re
 from collections.abc import Callable, Sequence
 
+from shiftsim.errors import one_of
 from shiftsim.report.tables import Table, plain_columns, shown
-from shiftsim.runs.config import one_of
 
 ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
 FORMATS = tuple(ENDINGS)

@@ -17,7 +17,7 @@ from shiftsim.data.store.reading import (
 )
 from shiftsim.data.store.review import REVIEW
 from shiftsim.errors import DataError
-from shiftsim.runs.config import store_path
+from shiftsim.files import store_path
 from shiftsim.runs.results import Run
 
 BUNDLE = "store"  # folder below that of the run

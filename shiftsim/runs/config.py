@@ -4,17 +4,16 @@ A setting is wrong at the moment it is read, not an hour later: types, ranges an
 known here are checked by the constructor; planners, stores and splits are checked by the runner.
 """
 
-import difflib
 import json
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, one_of
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
@@ -164,20 +163,6 @@ def _no_repeats(name: str, values: tuple[object, ...]) -> None:
         raise ConfigError(f"{name} {list(values)!r}: a value is listed twice")
 
 
-def one_of(what: str, value: str, choices: Iterable[str]) -> str:
-    """The value, when it is among the choices.
-
-    Raises:
-        ConfigError: It is not; the hint names the nearest choice.
-    """
-    valid = sorted(choices)
-    if value in valid:
-        return value
-    near = difflib.get_close_matches(value, valid, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ConfigError(f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}")
-
-
 def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
     """Settings from plain values, such as those of a TOML file.
 
@@ -200,25 +185,6 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
         return RunConfig(**plain)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}", hint=error.hint) from error
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file.
-
-    Raises:
-        ConfigError: There is no such file, or it is not TOML.
-    """
-    try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot read {str(path)!r}: {error.strerror or error}", hint="check the path"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{str(path)!r} is not TOML: {error}", hint="mend the line named above"
-        ) from error
 
 
 def write_toml(config: RunConfig) -> str:
@@ -280,29 +246,6 @@ def parse_shard(text: str) -> tuple[int, int]:
     if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)
     raise ConfigError(f"shard {text!r} is not i/n with i from 1 to n", hint="for example 2/16")
-
-
-def store_path(name: str) -> Path:
-    """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`).
-
-    A store in the current directory may be named without `./`, unless the name is taken below.
-    """
-    path = Path(name).expanduser()
-    if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
-        return path
-    below = Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
-    return path if (path / "store.json").is_file() and not below.exists() else below
-
-
-def checkpoint_folder() -> Path:
-    """Folder where checkpoints are found by name: `SHIFTSIM_CHECKPOINTS`, or below the cache."""
-    default = "~/.cache/shiftsim/checkpoints"
-    return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
-
-
-def remote_store_folder() -> Path:
-    """Folder of what was copied from stores behind a URL: `SHIFTSIM_CACHE`, or below the cache."""
-    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
 
 
 def default_workers(memory_each: float = 0.5e9) -> int:

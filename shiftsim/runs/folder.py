@@ -18,7 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.runs.journal import Journal, Line, whole_file
+from shiftsim.files import whole_file
+from shiftsim.runs.journal import Journal, Line
 from shiftsim.runs.results import (
     MISSING,
     OK,

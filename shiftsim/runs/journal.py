@@ -9,14 +9,14 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.files import whole_file
 from shiftsim.runs.results import PLACE, TEXTS, TaskResult, open_run, stored_results
 from shiftsim.runs.rollouts import Task, decode_rollout
 
@@ -157,18 +157,6 @@ class _Appended:
         """Drop what follows."""
         self.file.truncate(end)
         self._end = end
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A file to be written, which then takes its place: whole or not at all."""
-    partial = path.with_name(f".{path.name}.tmp")
-    try:
-        yield partial
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
 def _text(result: TaskResult, rollout: tuple[Any, ...]) -> bytes:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import shiftsim
+from shiftsim._version import __version__
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FORMAT_VERSION
 
@@ -95,7 +96,7 @@ def _sources() -> dict[str, bytes]:
 
 def versions() -> dict[str, str]:
     """Versions of Python, shiftsim and the packages that results could depend on."""
-    out = {"shiftsim": shiftsim.__version__, "python": sys.version.split()[0]}
+    out = {"shiftsim": __version__, "python": sys.version.split()[0]}
     for name in _PACKAGES:
         try:
             out[name] = metadata.version(name)

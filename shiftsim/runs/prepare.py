@@ -12,18 +12,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import shiftsim
-from shiftsim.errors import ConfigError, DataError
+from shiftsim._version import __version__
+from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.files import store_path
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.runs.config import (
-    DEFAULT_STORE,
-    RunConfig,
-    Value,
-    default_workers,
-    one_of,
-    parse_shard,
-    store_path,
-)
+from shiftsim.runs.config import DEFAULT_STORE, RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.filter import Verdicts, read_verdicts
 from shiftsim.runs.manifest import code_digest
 from shiftsim.runs.planners import PlannerEntry, can_travel, planner_entry, takes_argument
@@ -356,7 +349,7 @@ def _determining(
     """Everything else that the scores depend on, as JSON values."""
     noisy = any(model.kind != "none" for model in models)
     fields = {
-        "shiftsim": shiftsim.__version__,
+        "shiftsim": __version__,
         "code": code_digest(),
         "metric_version": METRIC_VERSION,
         "planners": {entry.name: dict(entry.fingerprint) for entry in entries},

@@ -191,39 +191,6 @@ class Run:
         """Whether every expected task finished."""
         return bool(self.manifest["counts"]["ok"] == self.manifest["counts"]["expected"])
 
-    def table(self, *, allow_partial: bool = False) -> str:
-        """The score table as text."""
-        from shiftsim.report import score_table
-
-        return score_table([self], allow_partial=allow_partial)
-
-    def worst(self, count: int = 10) -> list[dict[str, Any]]:
-        """The rollouts with the lowest scores: key, `cls` and `reason`."""
-        from shiftsim.report import worst_rollouts
-
-        return worst_rollouts(self, count)
-
-    def view(self, token: str) -> Any:
-        """The replay of one scenario: a page that notebooks show, and that has `.save(path)`.
-
-        Raises:
-            ConfigError: There is no stored rollout of it.
-            DataError: The store of the run is not there.
-        """
-        from shiftsim.runs.bundle import open_run_store
-        from shiftsim.view.build import Gallery
-
-        gallery = Gallery([self], open_run_store(self))
-        return gallery.page(gallery.find(token))
-
-    def __repr__(self) -> str:
-        return f"Run({str(self.path)!r})\n{self.table()}"
-
-    def _repr_html_(self) -> str:
-        import html
-
-        return f"<pre>{html.escape(self.table())}</pre>"
-
 
 def stored_place(
     run: Path, rollout: str | None, rollout_row: int, rollout_rows: int

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 
-from shiftsim.errors import ConfigError
-from shiftsim.runs.config import one_of, read_toml
+from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import read_toml
 
 
 @dataclass(frozen=True, slots=True)

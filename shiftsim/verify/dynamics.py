@@ -23,9 +23,9 @@ from shiftsim.metrics.comfort import (
 from shiftsim.metrics.thresholds import PROFILES
 from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
+from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import NOISE_NAMES, noise_from_normals, parse_noise
-from shiftsim.sim.traffic.idm.policy import idm_acceleration, idm_step
 from shiftsim.verify.array_file import EXACT, ArrayFile
 from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report

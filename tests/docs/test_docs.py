@@ -36,8 +36,8 @@ from shiftsim.data.deepplan.states import resample
 from shiftsim.data.deepplan.windows import find_runs
 from shiftsim.data.demo import store as synthetic
 from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
-from shiftsim.data.store import schema
 from shiftsim.data.store import map as store_map
+from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.runs import config

@@ -6,8 +6,8 @@ import shapely
 from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
-from shiftsim import geometry
 from shiftsim.arrays import kernel
+from shiftsim.geometry import boxes, frames, polylines, predicates, rings
 
 NUM_PAIRS = 60_000  # twice, at both offsets: more than 1e5 pairs of each kind
 
@@ -20,7 +20,7 @@ def grid_points(rng, count, offset, step=0.5, reach=6.0):
     return points + np.array(offset)
 
 
-def boxes(rng, count, offset):
+def some_boxes(rng, count, offset):
     """Half of the boxes axis-parallel on a grid (touching pairs abound), half arbitrary."""
     centers = grid_points(rng, count, offset)
     headings = rng.uniform(-np.pi, np.pi, count)
@@ -31,12 +31,12 @@ def boxes(rng, count, offset):
 
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_boxes_intersect_exactly_where_shapely_says_so(rng, offset):
-    poses_a, sizes_a = boxes(rng, NUM_PAIRS, offset)
-    poses_b, sizes_b = boxes(rng, NUM_PAIRS, offset)
-    ours = geometry.boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
+    poses_a, sizes_a = some_boxes(rng, NUM_PAIRS, offset)
+    poses_b, sizes_b = some_boxes(rng, NUM_PAIRS, offset)
+    ours = boxes.boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
     theirs = shapely.intersects(
-        shapely.polygons(geometry.boxes_to_corners(poses_a, sizes_a)),
-        shapely.polygons(geometry.boxes_to_corners(poses_b, sizes_b)),
+        shapely.polygons(boxes.boxes_to_corners(poses_a, sizes_a)),
+        shapely.polygons(boxes.boxes_to_corners(poses_b, sizes_b)),
     )
     np.testing.assert_array_equal(ours, theirs)
     assert 0.1 < ours.mean() < 0.9
@@ -46,7 +46,7 @@ def test_boxes_intersect_exactly_where_shapely_says_so(rng, offset):
 def locate_many(xy, ring_ptr, points):
     out = np.empty(len(points), np.int64)
     for index in range(len(points)):
-        out[index] = geometry.locate_in_polygon(
+        out[index] = rings.locate_in_polygon(
             xy, ring_ptr, 0, len(ring_ptr) - 1, points[index, 0], points[index, 1]
         )
     return out
@@ -56,7 +56,7 @@ def locate_many(xy, ring_ptr, points):
 def distance_many(xy, ring_ptr, points):
     out = np.empty(len(points))
     for index in range(len(points)):
-        out[index] = geometry.polygon_distance(
+        out[index] = rings.polygon_distance(
             xy, ring_ptr, 0, len(ring_ptr) - 1, points[index, 0], points[index, 1]
         )
     return out
@@ -79,8 +79,8 @@ def test_points_lie_in_a_polygon_exactly_where_shapely_says_so(rng, offset):
     points[-quarter:] = xy[edge] + rng.uniform(0, 1, (quarter, 1)) * (xy[edge + 1] - xy[edge])
     located = locate_many(xy, ring_ptr, points)
     shapes = shapely.points(points)
-    np.testing.assert_array_equal(located == geometry.INTERIOR, shapely.contains(polygon, shapes))
-    np.testing.assert_array_equal(located != geometry.EXTERIOR, shapely.intersects(polygon, shapes))
+    np.testing.assert_array_equal(located == rings.INTERIOR, shapely.contains(polygon, shapes))
+    np.testing.assert_array_equal(located != rings.EXTERIOR, shapely.intersects(polygon, shapes))
     assert set(np.unique(located)) == {-1, 0, 1}
 
 
@@ -98,14 +98,14 @@ def test_distances_to_a_polygon_equal_those_of_shapely(rng, offset):
 def ring_distances(a, b):
     out = np.empty(len(a))
     for index in range(len(a)):
-        out[index] = geometry.ring_distance(a[index], b[index])
+        out[index] = rings.ring_distance(a[index], b[index])
     return out
 
 
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_distances_between_boxes_equal_those_of_shapely(rng, offset):
-    a = geometry.boxes_to_corners(*boxes(rng, 20_000, offset))
-    b = geometry.boxes_to_corners(*boxes(rng, 20_000, offset))
+    a = boxes.boxes_to_corners(*some_boxes(rng, 20_000, offset))
+    b = boxes.boxes_to_corners(*some_boxes(rng, 20_000, offset))
     expected = shapely.distance(shapely.polygons(a), shapely.polygons(b))
     np.testing.assert_allclose(ring_distances(a, b), expected, rtol=0, atol=2e-9)
 
@@ -114,7 +114,7 @@ def test_distances_between_boxes_equal_those_of_shapely(rng, offset):
 def segments_meet(a, b, c, d):
     out = np.empty(len(a), np.bool_)
     for index in range(len(a)):
-        out[index] = geometry.segments_intersect(a[index], b[index], c[index], d[index])
+        out[index] = rings.segments_intersect(a[index], b[index], c[index], d[index])
     return out
 
 
@@ -132,7 +132,7 @@ def test_segments_meet_exactly_where_shapely_says_so(rng, offset):
 def point_meets(a, c, d):
     out = np.empty(len(a), np.bool_)
     for index in range(len(a)):
-        out[index] = geometry.segments_intersect(a[index], a[index], c[index], d[index])
+        out[index] = rings.segments_intersect(a[index], a[index], c[index], d[index])
     return out
 
 
@@ -147,7 +147,7 @@ def test_a_segment_of_length_zero_is_a_point(rng):
 def project_many(xy, arc, points):
     out = np.empty(len(points))
     for index in range(len(points)):
-        out[index] = geometry.project_on_polyline(
+        out[index] = polylines.project_on_polyline(
             xy, arc, 0, len(xy), points[index, 0], points[index, 1]
         )
     return out
@@ -157,7 +157,7 @@ def project_many(xy, arc, points):
 def test_projections_on_a_polyline_equal_those_of_shapely(rng, offset):
     angle = np.linspace(0, 4.0, 40)
     xy = np.c_[8 * np.sin(angle), 5 - 8 * np.cos(angle)] + np.array(offset)
-    arc = geometry.arc_lengths(xy, np.array([0, len(xy)]))
+    arc = polylines.arc_lengths(xy, np.array([0, len(xy)]))
     points = grid_points(rng, 20_000, offset, reach=15.0)
     line = shapely.LineString(xy)
     ours = project_many(xy, arc, points)
@@ -171,14 +171,14 @@ def test_projections_on_a_polyline_equal_those_of_shapely(rng, offset):
 def test_orientation_is_exact_on_nearly_collinear_points():
     base = 664_430.0
     tiny = 2.0**-33
-    assert geometry.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
-    assert geometry.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
-    assert geometry.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
+    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
+    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
+    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
 
 
 def test_corners_run_front_left_rear_left_rear_right_front_right():
     corners = np.empty((4, 2))
-    geometry.box_corners(10.0, 20.0, np.pi / 2, 4.0, 2.0, corners)
+    boxes.box_corners(10.0, 20.0, np.pi / 2, 4.0, 2.0, corners)
     np.testing.assert_allclose(corners, [[9, 22], [9, 18], [11, 18], [11, 22]], atol=1e-12)
 
 
@@ -186,22 +186,22 @@ def test_corners_run_front_left_rear_left_rear_right_front_right():
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])
     poses = np.array([[3.0, -4.0, heading], [motion[2], motion[1], 0.5]])
-    back = geometry.to_frame(geometry.from_frame(poses, origin), origin)
+    back = frames.to_frame(frames.from_frame(poses, origin), origin)
     np.testing.assert_allclose(back[:, :2], poses[:, :2], atol=1e-9)
-    assert np.abs(geometry.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
+    assert np.abs(frames.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
 
 
 @given(seeds)
 def test_intersection_of_boxes_is_symmetric(seed):
     rng = np.random.default_rng(seed)
-    a, b = boxes(rng, 50, OFFSETS[1]), boxes(rng, 50, OFFSETS[1])
-    forwards = geometry.boxes_intersect(*a, *b)
-    np.testing.assert_array_equal(forwards, geometry.boxes_intersect(*b, *a))
+    a, b = some_boxes(rng, 50, OFFSETS[1]), some_boxes(rng, 50, OFFSETS[1])
+    forwards = boxes.boxes_intersect(*a, *b)
+    np.testing.assert_array_equal(forwards, boxes.boxes_intersect(*b, *a))
 
 
 @given(angles)
 def test_wrapped_angles_lie_in_the_half_open_range(angle):
-    wrapped = geometry.wrap_angle(angle + 6 * np.pi)
+    wrapped = frames.wrap_angle(angle + 6 * np.pi)
     assert -np.pi <= wrapped < np.pi
     assert abs(np.sin(wrapped - angle)) < 1e-12
 
@@ -210,7 +210,7 @@ def test_wrapped_angles_lie_in_the_half_open_range(angle):
 def boundary_distances(xy, points, limit):
     out = np.empty(len(points))
     for index in range(len(points)):
-        out[index] = geometry.boundary_distance_below(
+        out[index] = rings.boundary_distance_below(
             xy, 0, len(xy), points[index, 0], points[index, 1], limit
         )
     return out

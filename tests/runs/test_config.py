@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from shiftsim.errors import ConfigError
-from shiftsim.runs.config import make_config, parse_argument, read_toml, store_path, write_toml
+from shiftsim.files import read_toml, store_path
+from shiftsim.runs.config import make_config, parse_argument, write_toml
 
 GOOD = {"planners": ["idm", "my.module:Mine"], "noise": ["ou-high"], "seeds": [0, 2]}
 

@@ -151,7 +151,7 @@ def test_what_was_with_a_task_whose_worker_died_is_done_alone():
 def test_workers_end_with_their_parent_even_in_an_endless_task(tmp_path):
     code = (
         "import sys; sys.path.append(sys.argv[1])\n"
-        "from test_executors import Late\n"
+        "from test_workers import Late\n"
         "from shiftsim.runs.workers import map_unordered\n"
         "for outcome in map_unordered(Late, [1, 13, 13], workers=2):\n"
         "    print(outcome.result, flush=True)\n"

@@ -6,6 +6,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
+from shiftsim.sim.dynamics.idm import idm_step
 from shiftsim.sim.traffic.idm.footprints import (
     Obstacles,
     Scratch,
@@ -17,7 +18,6 @@ from shiftsim.sim.traffic.idm.footprints import (
 from shiftsim.sim.traffic.idm.grid import enter, fill_grid
 from shiftsim.sim.traffic.idm.lead import LOST, find_lead
 from shiftsim.sim.traffic.idm.paths import PROGRESS, Fleet, Roads, extend_route
-from shiftsim.sim.traffic.idm.policy import idm_step
 from shiftsim.world.layers import Polygons
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY

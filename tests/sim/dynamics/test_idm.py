@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shiftsim.sim.traffic.idm.policy import idm_acceleration, idm_step
+from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 
 DEFAULTS = (1.0, 1.5, 1.0, 2.0)  # minimum gap, headway, largest acceleration, deceleration
 
