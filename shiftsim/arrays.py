@@ -3,13 +3,15 @@
 Shapes and units are in the docstrings; the aliases say the kind of number only.
 
 Compiled kernels are cached on disk. numba's cache looks only at the file of the outermost kernel,
-so in a checkout, where a kernel of another file may change under it, the cache lives in a folder
-named by a hash of all kernel sources. An installed package is replaced as a whole and needs no such
-care. `NUMBA_CACHE_DIR` overrides both.
+so in a checkout, where a kernel or constant of another file may change under it, every file with
+kernels has a cache of its own, named by a hash of that file and of all that it imports. An
+installed package is replaced as a whole and needs no such care. `NUMBA_CACHE_DIR` overrides both.
 """
 
 import hashlib
 import os
+import re
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,30 +19,32 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from shiftsim.files import PACKAGE, sources
+
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
-_CHECKOUT = Path(__file__).resolve().parent.parent
+CACHE = PACKAGE.parent / ".numba-cache"  # in a checkout
+_USES_CACHE = "NUMBA_CACHE_DIR" not in os.environ and (CACHE.parent / "pyproject.toml").is_file()
+_COMPILED = re.compile(rb"kernel|^[A-Z][A-Z0-9_, ]* = ", re.MULTILINE)  # constants are, too
 
 
-def _kernel_sources() -> list[Path]:
-    folders = ("shiftsim", "planners", "metrics", "data")
-    return sorted(path for name in folders for path in (_CHECKOUT / name).rglob("*.py"))
+def cache_folder(file: str = "") -> str:
+    """Where the compiled kernels of a source file are; without one, where all of them are."""
+    if not _USES_CACHE:
+        return str(vars(numba.config)["CACHE_DIR"])
+    return _folder_of(Path(file)) if file else str(CACHE)
 
 
-def _use_checkout_cache() -> None:
-    if "NUMBA_CACHE_DIR" in os.environ or not (_CHECKOUT / "pyproject.toml").is_file():
-        return
+@cache
+def _folder_of(path: Path) -> str:
     digest = hashlib.sha256()
-    for path in _kernel_sources():
-        if b"kernel" in (source := path.read_bytes()):
-            digest.update(path.name.encode() + b"\n" + source)
-    folder = _CHECKOUT / ".numba-cache" / digest.hexdigest()[:16]
-    vars(numba.config)["CACHE_DIR"] = str(folder)  # a setting that numba makes at run time
-
-
-_use_checkout_cache()
+    is_ours = path.is_relative_to(PACKAGE)
+    for name, source in sorted(sources([path] if is_ours else PACKAGE.rglob("*.py")).items()):
+        if _COMPILED.search(source):
+            digest.update(name.encode() + b"\n" + source)
+    return str(CACHE / digest.hexdigest()[:16])
 
 
 # The entry point for C, which nobody calls, would take a tenth of the time to compile.
@@ -54,7 +58,7 @@ def kernel(function: Any) -> Any:
     of threads. Division by zero gives inf or NaN, as in NumPy.
     """
     # said although it is the default: a kernel called by a lean one would inherit the opposite
-    return numba.njit(**(_OPTIONS | {"_nrt": True}))(function)
+    return _compiled(function, counts_references=True)
 
 
 def lean_kernel(function: Any) -> Any:
@@ -64,4 +68,10 @@ def lean_kernel(function: Any) -> Any:
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """
-    return numba.njit(**(_OPTIONS | {"_nrt": False}))(function)
+    return _compiled(function, counts_references=False)
+
+
+def _compiled(function: Any, *, counts_references: bool) -> Any:
+    # a setting that numba makes at run time, and reads when a function is decorated
+    vars(numba.config)["CACHE_DIR"] = cache_folder(function.__code__.co_filename)
+    return numba.njit(**(_OPTIONS | {"_nrt": counts_references}))(function)

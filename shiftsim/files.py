@@ -1,17 +1,26 @@
 """Where users' files are, and how files are read and written: settings in TOML, whole files only.
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
-half written: `whole_file` is the one way to replace one.
+half written: `whole_file` is the one way to replace one. `sources` says what a module of ours is
+made of, so that caches and runs notice when it changes.
 """
 
 import os
+import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError
+
+PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(
+    r"^ *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))",
+    re.MULTILINE,
+)
 
 
 def store_path(name: str) -> Path:
@@ -66,3 +75,30 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
         ) from error
+
+
+def sources(paths: Iterable[Path]) -> dict[str, bytes]:
+    """Modules of ours and all that they import, one from the other: their text by path.
+
+    Args:
+        paths: Files below `PACKAGE`.
+    """
+    waiting, found = list(paths), dict[str, bytes]()
+    while waiting:
+        name = waiting.pop().relative_to(PACKAGE).as_posix()
+        if name not in found:
+            found[name], imported = _read_source(name)
+            waiting += imported
+    return found
+
+
+@cache
+def _read_source(name: str) -> tuple[bytes, list[Path]]:
+    """The text of a module, and the modules that its import statements name."""
+    text = (PACKAGE / name).read_bytes()
+    imported = []
+    for module, block, line, plain in _IMPORT.findall(text.decode()):
+        place = PACKAGE.joinpath(*(module or plain).split("."))
+        for at in (place, *(place / word for word in re.findall(r"\w+", block + line))):
+            imported += [at.with_suffix(".py"), at / "__init__.py"]
+    return text, [path for path in imported if path.is_file()]

@@ -1,17 +1,17 @@
 """Compile the kernels that many tests need, once, before two workers would both compile them."""
 
+import hashlib
 import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
-import numba
-
+from shiftsim.arrays import cache_folder
+from shiftsim.files import PACKAGE, sources
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.verify.warmup import SHARES, scene
 
-MARKER = "compiled-for-tests"
 GROUPS = (
     ("routes", "contacts", "pdm-closed", "plantf", "pluto"),
     ("planners", "reactive", "diffusion-planner", "carl"),
@@ -21,11 +21,14 @@ LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 
 def compile_all() -> None:
     """Do nothing where it has been done; a process for each of `GROUPS` otherwise."""
-    marker = Path(vars(numba.config)["CACHE_DIR"]) / MARKER
+    everything = sources(path for path in PACKAGE.rglob("*.py"))
+    digest = hashlib.sha256(repr(sorted(everything.items())).encode()).hexdigest()
+    marker = Path(cache_folder()) / f"compiled-for-tests-{digest[:16]}"
     if marker.exists():
         return
     processes = [subprocess.Popen([sys.executable, __file__, *group]) for group in GROUPS]
     if not any([process.wait() for process in processes]):
+        marker.parent.mkdir(exist_ok=True)
         marker.touch()
 
 

@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import Any
 
 import shiftsim.verify
+from shiftsim.arrays import cache_folder
 from shiftsim.runs.config import default_workers
 
 REFERENCE = Path(shiftsim.verify.__file__).parent / "reference"
@@ -71,8 +72,6 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
-    import numba
-
     from shiftsim.runs.manifest import versions
     from shiftsim.verify import verify
     from shiftsim.verify.warmup import warm_up
@@ -94,7 +93,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         cores=default_workers(memory_each=1.0),
         memory=_memory(),
         workers=default_workers(),
-        kernel_cache=str(vars(numba.config)["CACHE_DIR"]),
+        kernel_cache=cache_folder(),
         seconds=perf_counter() - began,
         cases=sum(report.num_cases for report in reports),
         mismatches=tuple(line for report in reports for line in report.mismatches),

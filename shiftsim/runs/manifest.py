@@ -3,7 +3,6 @@
 import hashlib
 import os
 import platform
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,18 +13,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import shiftsim
 from shiftsim._version import __version__
+from shiftsim.files import PACKAGE, sources
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FORMAT_VERSION
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
 # what computes a result: a task, and everything that may be named by a setting
 _ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
-_IMPORT = re.compile(
-    r"^ *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))",
-    re.MULTILINE,
-)
 
 
 def make_manifest(
@@ -69,29 +64,10 @@ def now() -> str:
 def code_digest() -> str:
     """Digest of all sources that results depend on: two versions of them are not mixed."""
     digest = hashlib.blake2b(digest_size=8)
-    for name, source in sorted(_sources().items()):
+    roots = [path for pattern in _ROOTS for path in PACKAGE.glob(pattern)]
+    for name, source in sorted(sources(roots).items()):
         digest.update(f"{name}\n".encode() + source)
     return digest.hexdigest()
-
-
-def _sources() -> dict[str, bytes]:
-    """The modules of `_ROOTS` and all that they import, one from the other, by path."""
-    root = Path(shiftsim.__file__).parent
-    waiting = [path for pattern in _ROOTS for path in root.glob(pattern)]
-    found: dict[str, bytes] = {}
-    while waiting:
-        path = waiting.pop()
-        name = path.relative_to(root).as_posix()
-        if name in found:
-            continue
-        found[name] = path.read_bytes()
-        for module, block, line, plain in _IMPORT.findall(found[name].decode()):
-            place = root.joinpath(*(module or plain).split("."))
-            names = re.findall(r"\w+", block + line)
-            tried = [place, *(place / name for name in names)]
-            files = [file for at in tried for file in (at.with_suffix(".py"), at / "__init__.py")]
-            waiting += [file for file in files if file.is_file()]
-    return found
 
 
 def versions() -> dict[str, str]:
