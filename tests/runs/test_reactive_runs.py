@@ -3,7 +3,7 @@
 import pytest
 
 import shiftsim
-from shiftsim.runs.rescore import rescore
+from shiftsim.runs.derive import rescore
 
 
 @pytest.mark.parametrize(
