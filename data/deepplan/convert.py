@@ -34,9 +34,10 @@ from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.opendrive.records import OpenDrive
-from shiftsim.data.store.files import digest, file_name
 from shiftsim.data.store.map import write_map
-from shiftsim.data.store.reading import PARTIAL, StoreWriter, read_report
+from shiftsim.data.store.reading import read_report
+from shiftsim.data.store.tables import PARTIAL, digest, file_name
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind

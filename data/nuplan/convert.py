@@ -11,7 +11,7 @@ from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import EGO, cut_window, find_maps, load_map, offered, read_span
 from shiftsim.data.recording import Window
-from shiftsim.data.store.reading import StoreWriter
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
 

@@ -16,8 +16,8 @@ from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
 from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.recording import Window
-from shiftsim.data.store.files import write_json
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.tables import write_json
 from shiftsim.errors import ConversionError
 
 MAP_VERSION = "1.0.0"

@@ -9,13 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from shiftsim.data.store.reading import (
-    ScenarioStore,
-    StoreWriter,
-    open_store,
-    window_row,
-)
+from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import DataError
 from shiftsim.files import store_path
 from shiftsim.runs.results import Run
