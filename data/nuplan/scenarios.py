@@ -4,22 +4,15 @@
 """
 
 import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from shiftsim.arrays import IntArray
-from shiftsim.data.nuplan.log import (
-    Log,
-    has_goals,
-    make_tracks,
-    open_log,
-    read_boxes,
-    read_ego,
-    read_lights,
-    read_route,
-)
+from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
+from shiftsim.data.nuplan.log import Log, has_goals, open_log, read_ego, read_lights, read_route
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.mapping import Mapping, mapping_of
 from shiftsim.data.recording import EgoTrace, Recording, Window
@@ -148,7 +141,7 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
 
 
 def read_span(
-    log: Log, name: str, first: int, last: int, flaws: dict[str, int]
+    log: Log, name: str, first: int, last: int, flaws: Counter[str]
 ) -> tuple[Recording, EgoTrace]:
     """The rows first … last - 1 of a log as a recording of its own, with the ego."""
     recording = Recording(
@@ -166,7 +159,7 @@ def read_scenario(
     token: str,
     road: VectorMap,
     mapping: Mapping | None = None,
-    flaws: dict[str, int] | None = None,
+    flaws: Counter[str] | None = None,
 ) -> Scenario:
     """One scenario of a log.
 
@@ -183,7 +176,7 @@ def read_scenario(
     with open_log(path) as log:
         window = cut_window(log, token, mapping)
         recording, ego = read_span(
-            log, log.name, window.first_row, window.last_row, {} if flaws is None else flaws
+            log, log.name, window.first_row, window.last_row, Counter() if flaws is None else flaws
         )
     return make_scenario(recording, ego, window, road, offset=window.first_row)
 
