@@ -175,9 +175,8 @@ def freeze(scene: Scenario) -> None:
 def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
     """Order of dense tracks (R, N), such that every frame lists its tracks as nuPlan does.
 
-    nuPlan rule 410: objects are listed by type, and within a type as the log lists them. The order
-    depends only on the rows given, so that a window of a longer recording is ordered as if it had
-    been read alone.
+    nuPlan rule 410: by type, and within a type as the log lists them. The order depends only on the
+    rows given, so that a window of a longer recording is ordered as if it had been read alone.
     """
     before = np.zeros((len(kinds), len(kinds)), np.bool_)
     first = np.full(len(kinds), len(valid), np.int64)

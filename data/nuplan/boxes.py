@@ -99,7 +99,7 @@ def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tra
     poses[where] = boxes.values[:, :3]
     poses[..., 2] = np.where(valid, poses[..., 2], np.nan)
     velocities[where] = boxes.values[:, 3:5]
-    velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan
+    velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan  # nuPlan rule 420
     sizes[where] = boxes.values[:, 5:7]
     tokens = list(index)
     return Tracks(

@@ -1,4 +1,4 @@
-"""Scenario -> one nuPlan log (.db) of its own (nuplan-formats.md §2, §6)."""
+"""Scenario -> one nuPlan log (.db) of its own."""
 
 import hashlib
 import pickle
@@ -31,7 +31,7 @@ _HEIGHTS = {
     AgentKind.CZONE_SIGN: 1.2,
     AgentKind.GENERIC_OBJECT: 1.0,
 }  # m
-_SCENES = 5  # nuPlan ignores the first two and the last two, nuplan-formats.md §2
+_SCENES = 5  # nuPlan rule 411: the first two and the last two are ignored
 _PICKLE = 2  # protocol
 
 _TABLES = {
@@ -100,7 +100,7 @@ def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
 
 
 def _iterations(time: IntArray, anchor_us: int, mapping: Mapping) -> IntArray:
-    """Rows of the iterations as nuPlan cuts them, nuplan-formats.md §2."""
+    """Rows of the iterations as they are cut, nuPlan rule 417."""
     duration, offset, ratio = mapping
     start = int(anchor_us + offset * 1e6)
     first = int(np.searchsorted(time, start))

@@ -130,7 +130,7 @@ def to_metres(epsg: int) -> pyproj.Transformer:
 
 
 def _id(value: object, layer: str, column: str) -> str:
-    # nuPlan: reference columns are cast to int as a whole (nuplan-formats.md §3 rule 5).
+    # nuPlan rule 425: columns of references are numbers as a whole
     try:
         number = float(value)  # type: ignore[arg-type]  # anything SQLite can hold
         if number == int(number):

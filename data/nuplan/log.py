@@ -1,6 +1,6 @@
 """One nuPlan log (.db): its clock, scenes and tags, and the rows of a span of time.
 
-Facts about the tables are in nuplan-formats.md §2. Columns with pickled content are never read.
+Columns with pickled content are never read.
 """
 
 from collections import Counter
@@ -43,8 +43,8 @@ _TABLES = {
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
 _LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
-_UNIT_TOLERANCE = 1e-14  # nuPlan: quaternions closer to length 1 are not normalised
-_IGNORED_SCENES = 2  # nuPlan: at either end of a log, nuplan-formats.md §2
+_UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
+_IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
 
 
 @dataclass
@@ -116,7 +116,7 @@ def _read_clock(database: Database) -> Log:
         raise DataError(f"{path}: table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}", hint=_REPAIR)
     tokens = [token_text(row[0], path, "lidar_pc") for row in rows]
     time_us = _check_clock(path, tokens, rows)
-    tags = dict(
+    tags = dict(  # nuPlan rule 418: the largest of several tags
         database.query(
             "SELECT lidar_pc_token, MAX(type) FROM scenario_tag GROUP BY lidar_pc_token",
             "table 'scenario_tag'",
@@ -127,7 +127,7 @@ def _read_clock(database: Database) -> Log:
     return Log(
         database=database,
         name=path.stem,
-        map_name=maps[0][0].removesuffix(".gpkg"),
+        map_name=maps[0][0].removesuffix(".gpkg"),  # nuPlan rule 419
         tokens=tokens,
         time_us=time_us,
         types=[str(tags.get(row[0]) or "unknown") for row in rows],
@@ -199,7 +199,7 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
             f"{log.path}: lidar_pc {log.tokens[row]!r} belongs to an unknown scene", hint=_REPAIR
         )
     text, *goal = found[0]
-    # nuPlan: the reader splits at blanks, whatever the schema's comment says.
+    # nuPlan rule 412: split at blanks
     route = tuple(part for part in str(text or "").split(" ") if part)
     if goal[0] is None:
         return route, None
@@ -216,15 +216,14 @@ def _yaw(quaternions: FloatArray) -> FloatArray:
     square = (quaternions * quaternions).sum(axis=1, keepdims=True)
     unit = np.abs(1.0 - square) < _UNIT_TOLERANCE
     w, x, y, z = np.where(unit, quaternions, quaternions / np.sqrt(square)).T
-    # nuPlan: the yaw of its quaternion library has w z - x y in the numerator, not w z + x y; the
-    # two agree only without roll and pitch.
+    # nuPlan rule 413: w z - x y, not w z + x y
     return np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def read_ego(log: Log, first: int, last: int) -> FloatArray:
     """Ego states (R, 11) of the rows first … last - 1.
 
-    nuPlan: steering, yaw rate and their rates are 0, nuplan-simulation.md §3.
+    nuPlan rule 415: steering, yaw rate and their rates are 0.
     """
     rows = read_rows(
         log,
@@ -291,7 +290,8 @@ def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> Traffic
     frame = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64)) - first
     status = np.full((last - first, len(index)), int(LightStatus.ABSENT), np.int8)
     status[frame, np.array(connector, np.int64)] = [
-        int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows
+        int(_LIGHTS.get(row[2], LightStatus.UNKNOWN))  # nuPlan rule 428
+        for row in rows
     ]
     twice = len(rows) - int((status != LightStatus.ABSENT).sum())
     flaws["traffic light listed twice in a frame: the last one is kept"] += twice

@@ -1,4 +1,4 @@
-"""nuPlan's map.gpkg -> VectorMap (nuplan-formats.md §3)."""
+"""nuPlan's map.gpkg -> VectorMap."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ _MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
 _BIKE_LANE = 1
 _TURN_UNKNOWN = 4
 
-# Drivable area: the rows of these layers one after the other, nuplan-formats.md §3 rule 4.
+# nuPlan rule 421: the drivable area is the rows of these layers, one after the other
 _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
 
 
@@ -193,7 +193,7 @@ def _connectors(
     turns = table.integers("turn_type_fid", _TURN_UNKNOWN)
     stop_shapes = dict(zip(stops.ids, stops.shapes, strict=True))
     out = []
-    # In the order of the polygons: nuPlan's point queries run over that layer.
+    # nuPlan rule 424: in the order of the polygons
     for area, fid in enumerate(owners):
         if fid is None or fid not in row_of:
             _count(flaws, "polygon of an unknown lane connector", 1)
@@ -215,7 +215,7 @@ def _connectors(
                 left_id=left[area] or "",
                 right_id=right[area] or "",
                 speed_limit=_speed(table, row),
-                has_traffic_lights=listed != "",
+                has_traffic_lights=listed != "",  # nuPlan rule 423
                 stop_lines=_stop_lines(listed, baseline, stop_shapes),
                 intersection_id=crossings[row],
                 turn_type=turns[row],
@@ -259,8 +259,8 @@ def _blocks(gpkg: GeoPackage, flaws: dict[str, int]) -> list[BlockSpec]:
 def _stop_lines(
     listed: str, baseline: FloatArray, polygons: dict[str, shapely.Polygon]
 ) -> list[str]:
-    # nuPlan: the listed polygons that meet the baseline, else the one nearest to its first point
-    # (nuplan-simulation.md §10.6). Unknown ids stay, for `build_map` to count them.
+    # nuPlan rule 422: those that meet the baseline, else the nearest one. Unknown ids stay, for
+    # `build_map` to count them.
     ids = [part.strip() for part in listed.split(",") if part.strip()]
     unknown = [i for i in ids if i not in polygons]
     known = [i for i in ids if i in polygons]

@@ -1,6 +1,6 @@
-"""nuPlan logs and maps -> scenarios (nuplan-formats.md §5).
+"""nuPlan logs and maps -> scenarios.
 
-`read_scenario` gives one scenario straight from a log; `nuplan_convert` writes many to a store.
+`read_scenario` gives one scenario straight from a log; `convert` writes many to a store.
 """
 
 import json
@@ -22,8 +22,8 @@ from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
 ROW_SECONDS = 0.05  # nominal distance of log rows
-_PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window, nuplan-formats.md §5
-# Rows are counted, not timed, where nuPlan looks back and ahead: keep at least as many.
+_PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window
+# nuPlan rule 417: rows are counted where it looks back and ahead, so keep at least as many
 _PAST_ROWS, _FUTURE_ROWS = 60, 161
 _MIN_ITERATIONS = 3
 EGO = "ego"

@@ -169,7 +169,7 @@ def _parts(shape: shapely.Geometry) -> list[shapely.Polygon]:
 
 
 def is_crosswalk(thing: RoadObject) -> bool:
-    """Whether an object marks a crosswalk, by type, or by name of a marking."""
+    """Whether an object marks a crosswalk, by type or by name (nuPlan rule 515)."""
     if thing.type == "crosswalk":
         return True
     if thing.type not in ("roadMark", "-1", "none", "") and "crosswalk" not in thing.type.lower():

@@ -91,7 +91,7 @@ def stop_lines(
     controls: Sequence[frozenset[str]],
     polygons: Sequence[shapely.Polygon],
 ) -> list[StopLine]:
-    """One stop line per lane that ends at a controlled or marked junction.
+    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506).
 
     Args:
         od: The file.
@@ -173,7 +173,7 @@ def is_lit(connector: ConnectorRun, found: frozenset[str]) -> bool:
 
 
 def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:
-    """The limit that holds on most of a lane, the lower one on ties [m/s]; None for no limit."""
+    """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]; None for none."""
     lengths: dict[float, float] = defaultdict(float)
     for piece in pieces:
         road = od.roads[piece.key.road]
@@ -242,7 +242,7 @@ def _sign_value(signal: Signal) -> float | None:
     value = signal.value if signal.value and signal.value > 0 else None
     if value is None and signal.subtype.isdecimal():
         number = int(signal.subtype)
-        value = float((number - 50) * 10 if 51 <= number <= 63 else number)  # 274-55 is 50 km/h
+        value = float((number - 50) * 10 if 51 <= number <= 63 else number)  # nuPlan rule 509
     if value is None or value <= 0:
         return None
     return value * SPEED_UNITS.get(signal.unit, _MPH if is_us else _KMH)

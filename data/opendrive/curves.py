@@ -3,7 +3,7 @@
 A record is a curve (u, v) in the frame of its own start pose. Clothoids are integrated by
 Gauss-Legendre quadrature over panels that turn by at most 0.25 rad, which is exact to rounding and
 does not cancel when both curvatures are nearly equal. The cubic curves are taken by arc length,
-whatever their parameter is.
+whatever their parameter is (nuPlan rule 500).
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class ReferenceLine:
     def evaluate(self, s: FloatArray) -> Poses:
         """Poses at distances `s` (K,) [m]; beyond the ends the line stays at its ends.
 
-        The heading at a joint belongs to the later record.
+        nuPlan rule 501: the heading at a joint is that of the later record.
         """
         s = np.asarray(s, np.float64)
         index = np.maximum(np.searchsorted(self.starts, s, side="right") - 1, 0)

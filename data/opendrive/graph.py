@@ -193,7 +193,7 @@ class _Builder:
         return runs_forward(self.od.roads[key.road], key.section, key.lane)
 
     def _link_through(self, key: LaneKey) -> None:
-        """Take a lane out and join what lies before it to what lies after it."""
+        """Take a lane out and join what lies before it to what follows (nuPlan rule 514)."""
         sources, targets = sorted(self.before[key]), sorted(self.after[key])
         for source in sources:
             self._part(source, key)
@@ -271,6 +271,7 @@ class _Builder:
         return group if group != self._group_of(keys[0]) else None
 
     def _cut_seams(self) -> None:
+        """Short connectors between lanes that no junction joins (nuPlan rule 504)."""
         lanes = self.graph.lanes
         by_first = {lane.pieces[0].key: i for i, lane in enumerate(lanes)}
         links: dict[int, list[tuple[int, int]]] = defaultdict(list)

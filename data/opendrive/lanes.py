@@ -91,7 +91,8 @@ def section_borders(
         for number in sorted((i for i in lanes if i * sign > 0), key=abs):
             lane = lanes[number]
             borders.inner[number] = previous
-            if len(lane.widths) or not len(lane.borders):  # nothing at all is width 0
+            # nuPlan rule 502: widths win over borders; nothing at all is width 0
+            if len(lane.widths) or not len(lane.borders):
                 outer = previous + sign * evaluate_cubics(lane.widths, s - begin, look_up - begin)
             else:
                 outer = evaluate_cubics(lane.borders, s - begin, look_up - begin)
@@ -106,7 +107,7 @@ def section_borders(
 
 
 def border_is_mirrored(lane: Lane) -> bool:
-    """Whether all border records of a right lane lie on the left."""
+    """Whether all border records of a right lane lie on the left (nuPlan rule 513)."""
     return lane.id < 0 and not len(lane.widths) and bool((lane.borders[:, 1] > 0).all())
 
 
@@ -197,7 +198,7 @@ class _Linker:
             self._add((incoming, here, source, end), (connecting, there, target, contact))
 
     def _add(self, side: _Side, other: _Side) -> None:
-        """An edge between two lanes that touch, if traffic can pass from one to the other."""
+        """A link of two lanes that touch, where traffic can pass (nuPlan rule 503)."""
         if 0 in (side[2], other[2]):
             return
         if any(

@@ -2,7 +2,7 @@
 
 No point may lie inside two lanes. Where lanes cross, both roadblocks
 are cut and the pieces in between become connectors of an intersection. Other overlaps are taken
-away from the longer lane. Lanes on different levels stay as they are.
+away from the longer lane (nuPlan rule 505). Lanes on different levels stay as they are.
 """
 
 from collections import defaultdict
@@ -22,7 +22,7 @@ from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
 from shiftsim.data.polygons import largest_part, shared_areas
 
 OVERLAP = 1e-6  # m², less is a shared border
-LEVEL = 3.0  # m of height between lanes that do not meet
+LEVEL = 3.0  # m of height between lanes that do not meet, nuPlan rule 512
 _CROSSING_ANGLE = np.deg2rad(20.0)  # flatter overlaps are merges, not crossings
 _MARGIN, _MIN_LANE = 0.5, 1.0  # m around a crossing; shorter lanes beside it join it
 _SAMPLE = 1.0  # m

@@ -314,6 +314,7 @@ def _read_speed(element: Any, reader: Reader) -> Speed:
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
         return Speed(begin, None)
+    # nuPlan rule 508: without a unit in m/s
     limit = reader.number(element, "max") * SPEED_UNITS.get(unit or "m/s", np.nan)
     if not (np.isfinite(limit) and limit > 0):
         reader.warn("speed limit that is not a positive number in a known unit")

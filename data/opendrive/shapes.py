@@ -21,7 +21,7 @@ from shiftsim.data.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
 
 CHORD_ERROR = 0.05  # m
-BASELINE_STEP = 0.25  # m, PLUTO takes every fourth vertex as 1 m
+BASELINE_STEP = 0.25  # m, nuPlan rule 510: PLUTO takes every fourth vertex as 1 m
 _DENSE_STEP = 0.1  # m, of exact points a baseline is drawn through: 0.4 mm on a radius of 3 m
 _TARGET_ERROR = 0.02  # m at the middle of a chord; the largest error may lie beside it
 _MAX_STEP = 10.0  # m
@@ -31,7 +31,7 @@ _STEP = 0.01  # m, beyond which a jump of the middle of a lane is spread
 _CORNER, _MIN_STRETCH = 0.3, 0.7  # rad, and m between corners, to be kept as vertices
 _KINK, _BEND = 0.1, 5.0  # rad, and m, of ends that are bent into the direction of a neighbour
 _BLEND = 10.0  # m over which a jump between pieces is spread
-_NARROW = 2.5  # m, connectors below it are widened (nuPlan's "scaled width")
+_NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 
 
 @dataclass(frozen=True)
