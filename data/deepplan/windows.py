@@ -1,7 +1,8 @@
 """Windows of a recording, and which tracks may serve as ego.
 
-A window is a span of time, whatever the frame rate (nuPlan rule 450). Each track seen in it gets a verdict: `ego`, or
-the first rule it fails: category, presence, speed, overlap (later stages add lane and route).
+A window is a span of time, whatever the frame rate (nuPlan rule 450). Each track seen in it gets a
+verdict: `ego`, or the first rule it fails: category, presence, speed, overlap (later stages add
+lane and route).
 """
 
 from collections.abc import Mapping
