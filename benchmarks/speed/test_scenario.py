@@ -10,7 +10,7 @@ import pytest
 
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store.reading import StoreWriter
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.metrics import compute_metrics
 from shiftsim.runs.config import make_config
 from shiftsim.runs.planners import planner_entry

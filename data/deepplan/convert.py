@@ -1,9 +1,9 @@
-"""A DSC3D download and its OpenDRIVE map to scenarios of a store (deepplan-conversion.md).
+"""A DSC3D download and its OpenDRIVE map to scenarios of a store.
 
 Every recording is read twice: for the place of the map, which the whole site decides, and to be
 converted. Each is converted by itself into a folder below `.partial` that appears in one step and
 moves into the store at the end. So recordings may be spread over processes, a conversion that was
-killed goes on with those that it lacks, and the bytes are the same each time.
+killed goes on with those that are missing, and the bytes are the same each time.
 """
 
 import shutil
@@ -34,9 +34,10 @@ from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.opendrive.records import OpenDrive
-from shiftsim.data.store.files import digest, file_name
 from shiftsim.data.store.map import write_map
-from shiftsim.data.store.reading import PARTIAL, StoreWriter, read_report
+from shiftsim.data.store.reading import read_report
+from shiftsim.data.store.tables import PARTIAL, digest, file_name
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
@@ -98,7 +99,7 @@ class ConversionReport:
         recordings: Summary of every recording that was converted.
         skipped: Why, by name of a recording that cannot be converted.
         kept: How many recordings were converted before, by an interrupted or an earlier call.
-        map_warnings: Count by kind of what was mended in the map.
+        map_warnings: Count by kind of what was repaired in the map.
     """
 
     site: str
@@ -332,7 +333,7 @@ def _check_georeference(drive: OpenDrive, site: Site) -> None:
             to_utm = pyproj.Transformer.from_crs(crs, site.epsg, always_xy=True)
             own = to_utm.transform(offset[0], offset[1])
         except pyproj.exceptions.ProjError:
-            return  # not a projection (opendrive.md §5): the map counts as local
+            return  # not a projection: the map counts as local
     if not np.hypot(own[0] - site.offset[0], own[1] - site.offset[1]) <= _MAX_FRAME_SHIFT:
         raise ConversionError(
             f"{drive.source} places its origin at UTM ({own[0]:.2f}, {own[1]:.2f}),"

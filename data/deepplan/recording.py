@@ -1,4 +1,4 @@
-"""One DSC3D recording to scenarios (deepplan-conversion.md).
+"""One DSC3D recording to scenarios.
 
 One pass: windows and verdicts on the source frames, everything at 20 Hz once, then an ego trace per
 accepted track and a scenario per accepted (window, track). Whatever is dropped is counted.
@@ -46,7 +46,7 @@ class RecordingSummary:
         candidates: Pairs that pass category, presence, speed and overlap.
         accepted: Scenarios.
         rejected: Count of the other pairs by the rule they failed.
-        warnings: Count by kind of what was mended.
+        warnings: Count by kind of what was repaired.
     """
 
     name: str
@@ -187,7 +187,7 @@ def _scenario(
     last = int(np.searchsorted(source.track, track, side="right")) - 1
     if source.time[last] > window.start_s + config.window_s:
         center = np.array([*source.centers[last, :2] + offset, source.headings[last]])
-        goal = rear_poses(center)
+        goal = rear_poses(center)  # nuPlan rule 457
     key = f"{road.name}|{source.name}|{window.start_s}|{source.track_ids[track]}|{config.window_s}"
     return Window(
         token=hashlib.blake2b(key.encode(), digest_size=8).hexdigest(),

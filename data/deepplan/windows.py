@@ -1,7 +1,8 @@
-"""Windows of a recording, and which tracks may serve as ego (deepplan-conversion.md §3, §4).
+"""Windows of a recording, and which tracks may serve as ego.
 
-A window is a span of time, whatever the frame rate. Each track seen in it gets a verdict: `ego`, or
-the first rule it fails: category, presence, speed, overlap (later stages add lane and route).
+A window is a span of time, whatever the frame rate (nuPlan rule 450). Each track seen in it gets a
+verdict: `ego`, or the first rule it fails: category, presence, speed, overlap (later stages add
+lane and route).
 """
 
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ _EPS = 1e-9  # s
 
 @dataclass(frozen=True)
 class ConversionConfig:
-    """Every threshold of the conversion, with the names of deepplan-conversion.md.
+    """Every threshold of the conversion.
 
     Attributes:
         window_s: Length of a window [s].
@@ -164,7 +165,7 @@ def rows_of(seconds: float) -> int:
 
 
 def find_runs(recording: Annotations, max_hole_s: float) -> Runs:
-    """Split the tracks where they are absent for longer than `max_hole_s`."""
+    """Split the tracks where they are absent for longer than `max_hole_s` (nuPlan rule 458)."""
     time = recording.time
     gap = np.r_[np.inf, np.diff(time)]
     new_track = np.r_[True, np.diff(recording.track) != 0]
@@ -189,7 +190,7 @@ def judge_windows(
 ) -> list[WindowVerdicts]:
     """The verdict on every track in every window, rules of category to overlap."""
     allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
-    speed = _median_of_three(
+    speed = _median_of_three(  # nuPlan rule 452
         np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]), recording.track
     )
     partner = overlap_partners(recording, allowed, config.max_overlap)
@@ -201,6 +202,8 @@ def judge_windows(
 
 def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap: float) -> IntArray:
     """(A,) a track whose box overlaps the row's at its frame, -1 where none does.
+
+    nuPlan rule 451: with the recorded sizes, and tracks of all categories.
 
     Args:
         recording: The recording.

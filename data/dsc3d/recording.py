@@ -2,7 +2,7 @@
 
 A recording is a table with one row per object and frame. It is kept flat, sorted by track and frame
 (nothing here grows with tracks x frames), in the local frame of the site; `local + offset` is UTM.
-Position and heading are taken as truth, heading through the rotation matrix (dsc3d-format.md §2).
+Position and heading are taken as truth, heading through the rotation matrix.
 """
 
 import json
@@ -50,7 +50,7 @@ CATEGORIES = {
         ("animal", "bicycle_rack", "movable_object", "static_object", "generic_object"),
         AgentKind.GENERIC_OBJECT,
     ),
-}  # deepplan-conversion.md §7
+}  # nuPlan rule 462: it has no class for motorcycles
 
 _NEEDED = ("frame_id", "track_id", "category", *POSITION, *ROTATION, *DIMENSION, *VELOCITY)
 
@@ -232,7 +232,7 @@ def find_map(site: Site, given: Path | None = None) -> Path:
 def read_recording(
     site: Site, name: str, category_map: dict[str, str] | None = None
 ) -> Annotations:
-    """One recording, checked (dsc3d-format.md §6).
+    """One recording, checked.
 
     Args:
         site: Its site.
@@ -268,7 +268,7 @@ def read_recording(
     names, kinds = _agent_kinds(names, category_map or {}, path)
     bottom, rotation = matrix(POSITION), matrix(ROTATION)
     angles, up = rotation_angles(rotation)
-    centers = bottom + 0.5 * sizes[track, 2:3] * up
+    centers = bottom + 0.5 * sizes[track, 2:3] * up  # nuPlan rule 461
     clock = (frame_ids - frame_ids[0]) / site.frame_rate
     time = clock[frame]
     stored = None

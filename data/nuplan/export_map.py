@@ -1,4 +1,4 @@
-"""VectorMap -> nuPlan's map.gpkg (nuplan-formats.md §3)."""
+"""VectorMap -> nuPlan's map.gpkg."""
 
 from collections.abc import Iterable, Mapping
 from itertools import count
@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from shiftsim.data.nuplan.geopackage_writer import FeatureLayer, Value, write_geopackage
+from shiftsim.data.nuplan.geopackage import FeatureLayer, write_geopackage
+from shiftsim.data.nuplan.sqlite import Value
 from shiftsim.errors import ConversionError
 from shiftsim.world.layers import Layer, Polylines
 from shiftsim.world.map import NONE, VectorMap
@@ -173,7 +174,7 @@ class _Writer:
     def _lane(self, edge: int) -> None:
         road, fid = self.road, self.edges[edge]
         for other in (*road.incoming.at(edge), *road.outgoing.at(edge)):
-            if not road.is_connector(int(other)):
+            if not road.is_connector(int(other)):  # nuPlan rule 427
                 raise ConversionError(
                     f"map {road.name!r}: lane {road.edges.ids[edge]!r} is linked to lane"
                     f" {road.edges.ids[int(other)]!r} without a connector",
@@ -245,7 +246,7 @@ class _Writer:
         return links[0] if links else None
 
     def _lit_stop_lines(self, edge: int) -> str:
-        """Stop lines of lit connectors only: any text there means that lights govern it."""
+        """Stop lines of lit connectors only; nuPlan rule 423: any text there means lights."""
         road = self.road
         if not road.has_traffic_lights[edge]:
             return ""
@@ -345,7 +346,7 @@ class _Writer:
             for at in range(len(other))
         }
         owners = [known.get((layer.ids[at], layer.shape(at).wkb)) for at in range(len(layer))]
-        # nuPlan lists road segments, intersections, generic areas and car parks, in this order
+        # nuPlan rule 421: road segments, intersections, generic areas and car parks, in this order
         first = next((at for at, owner in enumerate(owners) if owner is not None), len(layer))
         rest = [at for at, owner in enumerate(owners) if owner is None]
         for fid, shape, _ in self._areas(layer, [at for at in rest if at < first]):

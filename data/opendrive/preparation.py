@@ -5,15 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.data.opendrive.areas import PAVED, SEAMS, WALKED
 from shiftsim.data.opendrive.curves import ReferenceLine, length_error
-from shiftsim.data.opendrive.graph import DRIVABLE
 from shiftsim.data.opendrive.lanes import border_is_mirrored
-from shiftsim.data.opendrive.records import OpenDrive, Road
+from shiftsim.data.opendrive.records import (
+    DRIVABLE,
+    PAVED,
+    SEAMS,
+    UNUSED,
+    WALKED,
+    OpenDrive,
+    Road,
+)
 from shiftsim.errors import MapError
 
-UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
-GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m, opendrive.md §7
+GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
 MAX_LANE_LENGTH = 3e6  # m, of all lanes together
 

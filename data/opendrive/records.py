@@ -5,6 +5,17 @@ from dataclasses import dataclass
 from shiftsim.arrays import FloatArray
 
 LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s
+
+# Types of lanes by what they are used for.
+DRIVABLE = frozenset(
+    "driving entry exit onRamp offRamp connectingRamp slipLane bidirectional HOV bus taxi "
+    "mwyEntry mwyExit".split()
+)
+PAVED = frozenset(("shoulder", "stop", "parking", "roadWorks", "restricted"))
+WALKED = frozenset(("sidewalk", "walking"))
+SEAMS = frozenset(("border", "curb"))  # merged into a neighbouring walkway where narrow
+UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +266,6 @@ class Junction:
     id: str
     type: str
     connections: tuple[Connection, ...]
-    main_road: str | None = None
 
 
 @dataclass(frozen=True)
@@ -270,7 +280,7 @@ class OpenDrive:
         roads: By id, in the order of the file.
         junctions: By id, in the order of the file.
         counts: How many records of each kind the file holds, dropped ones included.
-        warnings: What was mended or left out: count by kind.
+        warnings: What was repaired or left out: count by kind.
     """
 
     source: str

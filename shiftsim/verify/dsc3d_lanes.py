@@ -56,7 +56,7 @@ def _pieces(
         source = drive.roads[origin.key.road]
         low, high = sorted((origin.begin, origin.end))
         s = np.linspace(low, high, max(2, round((high - low) / 0.5) + 1))
-        borders = section_borders(source, origin.key.section, s, mend=True)
+        borders = section_borders(source, origin.key.section, s, repair=True)
         poses = ReferenceLine(source.geometries).evaluate(s)
         inner = poses.offset(borders.inner[origin.key.lane])
         outer = poses.offset(borders.outer[origin.key.lane])

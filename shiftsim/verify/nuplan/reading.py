@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.arrays import IntArray
-from shiftsim.data.nuplan.log import open_log, read_boxes
+from shiftsim.data.nuplan.boxes import read_boxes
+from shiftsim.data.nuplan.log import open_log
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import find_maps, load_map, read_scenario
 from shiftsim.errors import DataError
