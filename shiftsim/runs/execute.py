@@ -11,11 +11,11 @@ from functools import partial
 from typing import Any
 
 from shiftsim.errors import DataError
+from shiftsim.planners.registry import planner_name
 from shiftsim.runs.bundle import write_bundle
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
-from shiftsim.runs.planners import planner_name
 from shiftsim.runs.prepare import RUNS as RUNS
 from shiftsim.runs.prepare import Prepared as Prepared
 from shiftsim.runs.prepare import open_named_store as open_named_store

@@ -16,10 +16,10 @@ from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import store_path
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
 from shiftsim.runs.config import DEFAULT_STORE, RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.filter import Verdicts, read_verdicts
 from shiftsim.runs.manifest import code_digest
-from shiftsim.runs.planners import PlannerEntry, can_travel, planner_entry, takes_argument
 from shiftsim.runs.resume import State, check_resumable, check_room, check_target
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.splits import find_split, token_hash
@@ -162,7 +162,7 @@ def prepare(
     )
 
 
-def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
+def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
     checkpoints = _checkpoints(config, sources)
     entries = []
     for name, source in zip(config.planners, sources, strict=True):
@@ -171,7 +171,7 @@ def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
             arguments["checkpoint"] = checkpoints[name]
         if takes_argument(source, "device"):
             arguments.setdefault("device", config.device)
-        entries.append(planner_entry(source, arguments))
+        entries.append(run_planner(source, arguments))
     return entries
 
 
@@ -258,9 +258,9 @@ def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) 
     return before
 
 
-def _workers(config: RunConfig, entries: Sequence[PlannerEntry], num_units: int) -> int:
+def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_units: int) -> int:
     """Number of worker processes; 1 for planners that cannot be sent to another process."""
-    stuck = [entry.name for entry in entries if not can_travel(entry)]
+    stuck = [entry.name for entry in entries if not entry.can_travel]
     if stuck and (config.timeout or config.executor != "processes"):
         raise ConfigError(
             f"planner {stuck[0]!r} cannot be sent to a worker process, as a timeout or a cluster "
@@ -288,7 +288,7 @@ def _check_traffic(name: str) -> None:
 
 
 def _tasks(
-    entries: Iterable[PlannerEntry],
+    entries: Iterable[RunPlanner],
     models: Iterable[NoiseModel],
     seeds: Iterable[int],
     tokens: Iterable[str],
@@ -303,7 +303,7 @@ def _tasks(
     return (Task(*run, token) for token in tokens for run in runs)
 
 
-def _units(entries: Iterable[PlannerEntry], tasks: list[Task], size: int) -> list[Unit]:
+def _units(entries: Iterable[RunPlanner], tasks: list[Task], size: int) -> list[Unit]:
     """The tasks, those of a planner that answers in batches grouped.
 
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
@@ -342,7 +342,7 @@ def _leading_first(units: list[Unit]) -> list[Unit]:
 
 def _determining(
     config: RunConfig,
-    entries: Sequence[PlannerEntry],
+    entries: Sequence[RunPlanner],
     models: Sequence[NoiseModel],
     thresholds: dict[str, Any],
 ) -> dict[str, Any]:

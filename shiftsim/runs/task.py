@@ -17,7 +17,7 @@ import numpy as np
 
 from shiftsim.errors import ShiftsimError
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
-from shiftsim.runs.planners import PlannerEntry, close_planner
+from shiftsim.planners.registry import RunPlanner, close_planner
 from shiftsim.runs.results import FAILED, OK, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rollout
 from shiftsim.sim.log import SimulationLog
@@ -45,7 +45,7 @@ class TaskRunner:
     """
 
     store: str
-    planners: Mapping[str, PlannerEntry]
+    planners: Mapping[str, RunPlanner]
     noises: Mapping[str, NoiseModel]
     traffic: str
     controller: str
