@@ -19,7 +19,7 @@ from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.sim.plan_check import find_fault
 from shiftsim.sim.planner import History, Observation, SceneInfo
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Command, Tracks, Trajectory
+from shiftsim.world.state import Command, Trajectory
 
 CALLS = 20
 NEAR = 2.0  # m, and
@@ -224,10 +224,10 @@ def frozen_inputs(scenario: Scenario) -> tuple[SceneInfo, list[Observation]]:
 
 
 def _frozen_observation(seen: Observation) -> Observation:
-    past, tracks = seen.history, seen.history.tracks
-    arrays = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes, tracks.kinds)
-    frozen = Tracks(*map(_frozen, arrays), tracks.tokens)
-    history = History(_frozen(past.time_us), _frozen(past.ego), frozen)
+    past, names = seen.history, ("valid", "poses", "velocities", "sizes", "kinds")
+    arrays: dict[str, Any] = {name: _frozen(getattr(past.tracks, name)) for name in names}
+    tracks = replace(past.tracks, **arrays)
+    history = History(_frozen(past.time_us), _frozen(past.ego), tracks)
     return replace(
         seen, history=history, lights=replace(seen.lights, status=_frozen(seen.lights.status))
     )
