@@ -131,8 +131,9 @@ def oriented_rectangle(ring: FloatArray) -> FloatArray:
     """(4, 2) corners of the smallest rectangle around a polygon, one side along its convex hull.
 
     The first side lies along the hull's edge. Every edge of a rectangle does equally well, so that
-    the last bit of an area decides which corner comes first: sides are compared in the order of
-    the hull, clockwise from its lowest vertex, and measured from the origin of the map.
+    the last bit of an area decides which corner comes first (nuPlan rule 305): sides are compared
+    in the order of the hull, clockwise from its lowest vertex, and measured from the origin of the
+    map.
 
     Args:
         ring: (V, 2) vertices [m].

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, linear
+from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp, Scenes, linear
 
 DIM = 128
 NUM_AGENT_KINDS = 4
@@ -77,20 +77,6 @@ class SceneTensors:
         return torch.cat([now, self.centers], dim=1)
 
 
-class Mlp(nn.Module):
-    """Two linear layers with an exact GELU between them."""
-
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = Linear(dim, hidden)
-        self.fc2 = Linear(hidden, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., D) to (..., D)."""
-        out: Tensor = self.fc2(functional.gelu(self.fc1(x)))
-        return out
-
-
 class EncoderBlock(nn.Module):
     """Pre-norm transformer block."""
 
@@ -99,7 +85,7 @@ class EncoderBlock(nn.Module):
         self.norm1 = nn.LayerNorm(DIM)
         self.attn = Attention(DIM, num_heads)
         self.norm2 = nn.LayerNorm(DIM)
-        self.mlp = Mlp(DIM, 4 * DIM)
+        self.mlp = Mlp(DIM, 4 * DIM, DIM)
 
     def forward(self, x: Tensor, scenes: Scenes, asking: Tensor | None = None) -> Tensor:
         """Tokens (T, D) of scenes after the block, or one for each of them.
@@ -155,7 +141,7 @@ class _HistoryBlock(nn.Module):
         self.norm1 = nn.LayerNorm(dim)
         self.attn = NeighborhoodAttention(dim, num_heads, window)
         self.norm2 = nn.LayerNorm(dim)
-        self.mlp = Mlp(dim, _MLP_RATIO * dim)
+        self.mlp = Mlp(dim, _MLP_RATIO * dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attn(self.norm1(x))
@@ -273,7 +259,7 @@ class AgentEncoder(nn.Module):
     def forward(self, seen: SceneTensors) -> Tensor:
         """(B, A, 128)."""
         steps, (others, _) = _history_steps(seen), seen.there
-        others[:, 0] = False  # the ego's history is not used
+        others[:, 0] = False  # nuPlan rule 306: the ego's history is not used
         tokens = steps.new_zeros(*others.shape, DIM)
         if others.any():
             tokens[others] = self.history_encoder(steps[others])

@@ -143,7 +143,7 @@ def make_lines(valid: Tensor, counts: Sequence[int], *, misordered_masks: bool) 
     # a scene without any line that has points attends to all of them, and nothing reads it
     attended = valid | ~valid.any(dim=1, keepdim=True)
     logits = torch.zeros(valid.shape, device=valid.device).masked_fill(~attended, -torch.inf)
-    if misordered_masks:  # by mode, where the queries are ordered by scene
+    if misordered_masks:  # nuPlan rule 307: by mode, where the queries are ordered by scene
         logits = logits.repeat(MODES, 1).reshape(len(valid), MODES, -1)
     else:
         logits = logits[:, None]
