@@ -195,22 +195,19 @@ def test_diffusion_planner_against_the_plain_sampler(scenes, loaded):
     import torch
     from plain_diffusion import plain_network, plain_sample
 
-    from shiftsim.planners.learned.diffusion.planner import INPUTS
-
     planner = loaded("diffusion-planner")
-    plain = plain_network(planner._network)
+    plain = plain_network(planner.network)
     for scene in ("bench_scene_100", "s04_left_turn", "s13_empty_road"):
         forks, observations = started(planner, [scenes[scene]], 1)
         features = [forks[0].features(observations[0])]
-        inputs = {name: planner._batch(features, name) for name in INPUTS}
-        noise = planner._batch(features, "noise")
+        inputs, noise = planner.batch(features)
         ratios = []
         with torch.inference_mode():
             for _ in range(40):  # times vary more than what they differ by
                 began = process_time()
                 plain_sample(plain, inputs, noise)
                 middle = process_time()
-                planner._network(inputs, noise)
+                planner.network(inputs, noise)
                 ratios.append((process_time() - middle) / (middle - began))
         ratio = statistics.median(ratios[2:])
         print(

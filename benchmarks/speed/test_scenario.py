@@ -12,8 +12,8 @@ from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.metrics import compute_metrics
+from shiftsim.planners.registry import run_planner
 from shiftsim.runs.config import make_config
-from shiftsim.runs.planners import planner_entry
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.loop import simulate
@@ -47,7 +47,7 @@ def runner(scenes, tmp_path_factory):
             rows = (0, len(scene.time_us), scene.iteration_rows, scene.row_step)
             place = (scene.route, scene.mission_goal, scene.mapping)
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
-    planners = {"constant-velocity": planner_entry("constant-velocity", {})}
+    planners = {"constant-velocity": run_planner("constant-velocity", {})}
     noises = {"none": parse_noise("none")}
     return TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
 
