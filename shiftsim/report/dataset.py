@@ -1,7 +1,5 @@
 """Statistics of a store as tables and as a picture."""
 
-import csv
-import io
 from pathlib import Path
 
 from shiftsim.data.store.statistics import (
@@ -12,6 +10,8 @@ from shiftsim.data.store.statistics import (
     StoreStats,
 )
 from shiftsim.errors import ConfigError, MissingExtraError, one_of
+from shiftsim.report.tables import aligned
+from shiftsim.report.writers import csv_text
 
 FORMATS = ("text", "csv")
 _HEADINGS = {
@@ -55,40 +55,26 @@ def stats_table(stats: StoreStats, *, by: str = "city", style: str = "text") -> 
         return _csv(stats)
     lines = [[by, *_HEADINGS.values()]]
     for name, row in stats.groups(by).items():
-        lines.append(
-            [
-                name,
-                f"{row['scenarios']:.0f}",
-                *(_cell(n, row) for n in _HEADINGS if n != "scenarios"),
-            ]
-        )
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = [
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+        lines.append([name, *(_cell(column, row) for column in _HEADINGS)])
     notes = "means per scenario; t0 = at iteration 0, else over all iterations; m, m/s"
     sets = ", ".join(f"{name} {count}" for name, count in PUBLISHED_SETS.items())
-    return "\n".join([*text, f" {notes}", f" published scenarios: {sets}"])
+    return "\n".join([*aligned(lines, 1), f" {notes}", f" published scenarios: {sets}"])
 
 
 def _cell(name: str, row: dict[str, float]) -> str:
     if name not in row:
         return "–"
-    return f"{100.0 * row[name]:.0f} %" if name == "intersection" else f"{row[name]:.1f}"
+    if name == "intersection":
+        return f"{100.0 * row[name]:.0f} %"
+    return f"{row[name]:.0f}" if name == "scenarios" else f"{row[name]:.1f}"
 
 
 def _csv(stats: StoreStats) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["token", "city", "type", *COLUMNS])
+    rows = [["token", "city", "type", *COLUMNS]]
     for token, row in stats.rows.items():
         numbers = [repr(getattr(row, name)) for name in COLUMNS]
-        writer.writerow([token, stats.cities[token], stats.types[token], *numbers])
-    return out.getvalue().rstrip("\n")
+        rows.append([token, stats.cities[token], stats.types[token], *numbers])
+    return csv_text(rows)
 
 
 def stats_dict(stats: StoreStats) -> dict[str, object]:

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import MissingExtraError
-from shiftsim.report.groups import COLUMNS, DataSet, Estimate, Group
+from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
 from shiftsim.report.palette import Look, looks
-from shiftsim.report.paper import METRICS, distinct_sets, traffics
-from shiftsim.report.statistics import Interval
+from shiftsim.report.paper import METRICS, traffics
+from shiftsim.report.statistics import score_interval
+from shiftsim.report.tables import Estimate, Interval
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
@@ -170,7 +171,7 @@ def _cities(
 
     def cell(group: Group, place: int) -> tuple[Estimate | None, Interval | None]:
         where = None if place == 0 else data.within(cities[place - 1])
-        return _estimate(group, allow_partial, "cls", where), group.interval("cls", where)
+        return _estimate(group, allow_partial, "cls", where), score_interval(group, "cls", where)
 
     figure = _dots(groups, names, cell, styles)
     note = "bars: 95 % bootstrap interval over recordings (none for a single recording)"
@@ -185,7 +186,7 @@ def _metrics(
 
     def cell(group: Group, place: int) -> tuple[Estimate | None, Interval | None]:
         name = columns[place]
-        return _estimate(group, allow_partial, name), group.interval(name)
+        return _estimate(group, allow_partial, name), score_interval(group, name)
 
     figure = _dots(groups, [COLUMNS[name] for name in columns], cell, styles)
     note = "bars: 95 % bootstrap interval over recordings"
