@@ -20,7 +20,7 @@ from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
-from shiftsim.sim.loop import HISTORY_SAMPLES
+from shiftsim.sim.observation import HISTORY_SAMPLES
 from shiftsim.sim.planner import History, Observation, SceneInfo
 from shiftsim.verify.array_file import ArrayFile
 from shiftsim.verify.nuplan.reading import load_scenes, read_json
