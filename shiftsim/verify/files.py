@@ -90,7 +90,8 @@ class Source:
     def below(self, prefix: str) -> "Source":
         """The values whose names begin with a prefix, by the rest of their names."""
         values = {n.removeprefix(prefix): v for n, v in self.values.items() if n.startswith(prefix)}
-        return Source(self.name, self.what, values, self.report, used=self.used, prefix=prefix)
+        shared = {"used": self.used, "rows": self._rows, "prefix": self._prefix + prefix}
+        return Source(self.name, self.what, values, self.report, **shared)
 
     def groups(self, *key: str) -> dict[tuple[str, ...], "Source"]:
         """The rows by the values of key columns, in the order of the file."""
