@@ -20,20 +20,19 @@ from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
+from shiftsim.sim.observation import HISTORY_SAMPLES, past_rows, scene_info
 from shiftsim.sim.plan_check import validate_plan
-from shiftsim.sim.planner import BatchPlanner, History, Observation, Planner, SceneInfo
+from shiftsim.sim.planner import BatchPlanner, History, Observation, Planner
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     NUM_STATE,
-    PACIFICA,
     Command,
     Tracks,
     TrafficLights,
     Trajectory,
 )
 
-HISTORY_SAMPLES = 22  # 2.1 s and the present; nuPlan: not 2.0 s (nuplan-simulation.md §12 Q3)
 PLAN_SAMPLES = 11  # first second of a plan, every 0.1 s
 MIN_ITERATIONS = 3
 CONTROLLERS = ("lqr", "perfect", "log-playback")
@@ -113,7 +112,7 @@ class Rollout:
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
-            planner.reset(_scene_info(scenario, seed))
+            planner.reset(scene_info(scenario, seed))
 
     @property
     def done(self) -> bool:
@@ -308,9 +307,7 @@ def _make_buffer(scenario: Scenario) -> _Buffer:
     nuPlan asks for 22 past samples and drops the oldest when the present one arrives; samples that
     the log does not have are missing silently (nuplan-simulation.md §1, §2).
     """
-    first = int(scenario.iteration_rows[0])
-    past = np.arange(first - (HISTORY_SAMPLES - 1) * scenario.row_step, first, scenario.row_step)
-    rows = np.concatenate([past[past >= 0], scenario.iteration_rows])
+    rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
     start = len(rows) - scenario.num_iterations
     ego = np.full((len(rows), NUM_STATE), np.nan)
     ego[: start + 1] = scenario.ego[rows[: start + 1]]
@@ -320,17 +317,4 @@ def _make_buffer(scenario: Scenario) -> _Buffer:
         ego,
         scenario.tracks.rows(rows),
         scenario.traffic_lights.rows(rows),
-    )
-
-
-def _scene_info(scenario: Scenario, seed: int) -> SceneInfo:
-    return SceneInfo(
-        map=scenario.map,
-        route=scenario.route,
-        goal=scenario.mission_goal,
-        dt=float(np.diff(scenario.iteration_times).mean() * 1e-6),
-        token=scenario.token,
-        expert=scenario,
-        vehicle=PACIFICA,
-        seed=seed,
     )

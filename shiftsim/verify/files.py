@@ -127,7 +127,7 @@ class Source:
         Args:
             where: Which case.
             ours: Our value by name.
-            atol: Tolerance of all, or by name; exact where it has none.
+            atol: Tolerance of all, or by name, "" being that of all others; else exact.
             quantity: Begins the names of the quantities, instead of the name of the file.
 
         Returns:
@@ -135,7 +135,7 @@ class Source:
         """
         prefix, agree = self.name if quantity is None else quantity, True
         for name, value in ours.items():
-            bound = atol if isinstance(atol, float) else atol.get(name, EXACT)
+            bound = atol if isinstance(atol, float) else atol.get(name, atol.get("", EXACT))
             label = f"{prefix} {name}".strip()
             if name not in self:
                 self.report.fail(label, where, f"no {self.what} {name!r}")
@@ -143,6 +143,26 @@ class Source:
             else:
                 agree &= self.report.compare(label, where, value, self[name], atol=bound)
         return agree
+
+    def match_rows(
+        self,
+        ours: Mapping[str, Any],
+        atol: float | Mapping[str, float] = EXACT,
+        *,
+        where: str = "case",
+        quantity: str | None = None,
+    ) -> None:
+        """`match`, where every row is a case of its own.
+
+        Raises:
+            DataError: Ours are not as many rows.
+        """
+        counts = {len(value) for value in (*ours.values(), *(self[n] for n in ours if n in self))}
+        if len(counts) != 1:
+            raise DataError(f"{self.name}: {', '.join(ours)}: rows are {sorted(counts)}")
+        for row in range(counts.pop()):
+            values = {name: value[row] for name, value in ours.items()}
+            self.at(row).match(f"{where} {row}", values, atol, quantity=quantity)
 
     def note(self, what: str, *names: str) -> None:
         """Name values that need not be compared."""
@@ -158,10 +178,10 @@ class Source:
             part.finish()
 
 
-def read_arrays(path: Path, report: Report) -> Source:
-    """The arrays of an `.npz`."""
+def read_arrays(path: Path, report: Report, name: str = "") -> Source:
+    """The arrays of an `.npz`; `name` is another name for it."""
     with np.load(path, allow_pickle=False) as archive:
-        return Source(path.stem, "array", {n: archive[n] for n in archive.files}, report)
+        return Source(name or path.stem, "array", {n: archive[n] for n in archive.files}, report)
 
 
 def read_table(path: Path, report: Report) -> Source:
@@ -190,9 +210,9 @@ def read_json(path: Path) -> Any:
         raise DataError(f"{path}: not readable JSON: {error}") from error
 
 
-def read_fields(path: Path, report: Report) -> Source:
-    """The fields of a `.json` that holds one object; others as for `read_json`."""
-    return Source(path.stem, "field", read_json(path), report)
+def read_fields(path: Path, report: Report, name: str = "") -> Source:
+    """The fields of a `.json` that holds one object; `name` is another name for it."""
+    return Source(name or path.stem, "field", read_json(path), report)
 
 
 def verify_files(

@@ -160,7 +160,8 @@ def _array(value: Any) -> np.ndarray[Any, Any]:
         return np.asarray(value)
     except ValueError:  # lists of several lengths
         out = np.empty(len(value), np.object_)
-        out[:] = value
+        for index, item in enumerate(value):
+            out[index] = item
         return out
 
 
