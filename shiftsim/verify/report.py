@@ -49,7 +49,14 @@ class Report:
     informative: list[str] = field(default_factory=list)
 
     def compare(
-        self, quantity: str, where: str, actual: object, expected: object, *, atol: float = 0.0
+        self,
+        quantity: str,
+        where: str,
+        actual: object,
+        expected: object,
+        *,
+        atol: float = 0.0,
+        angle: bool = False,
     ) -> bool:
         """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
 
@@ -60,6 +67,7 @@ class Report:
             expected: The reference value of the same form; None among numbers is NaN.
             atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
                 compared exactly.
+            angle: Whether the values are angles [rad], which are equal up to whole turns.
 
         Returns:
             Whether they agree.
@@ -77,7 +85,9 @@ class Report:
             left, right = ours.astype(np.float64), theirs.astype(np.float64)
             same = (left == right) | (np.isnan(left) & np.isnan(right))
             with np.errstate(invalid="ignore"):
-                error = np.where(same, 0.0, np.abs(left - right))
+                gap = left - right
+                gap = (gap + np.pi) % (2.0 * np.pi) - np.pi if angle else gap
+                error = np.where(same, 0.0, np.abs(gap))
             error = np.where(np.isnan(error), np.inf, error)
             if error.size:
                 tally.max_error = max(tally.max_error, float(error.max()))
