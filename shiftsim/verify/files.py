@@ -38,10 +38,11 @@ class Source:
     def __init__(
         self, name: str, what: str, values: Mapping[str, Any], report: Report, **shared: Any
     ) -> None:
-        """`shared` is for parts of a file: `used`, and `rows` (None for all)."""
+        """`shared` is for parts of a file: `used`, `rows` (None for all) and `prefix` of names."""
         self.name, self.what, self.values, self.report = name, what, values, report
         self.used: set[str] = shared.get("used", set())
         self._rows: Any = shared.get("rows")
+        self._prefix: str = shared.get("prefix", "")
         self._parts: dict[str, list[Source]] = {}
 
     def __contains__(self, name: str) -> bool:
@@ -58,7 +59,7 @@ class Source:
         """
         if name not in self.values:
             raise DataError(f"{self.name}: {self.what} {name!r} is missing")
-        self.used.add(name)
+        self.used.add(self._prefix + name)
         value = self.values[name]
         return value if self._rows is None else value[self._rows]
 
@@ -86,6 +87,12 @@ class Source:
         elif getattr(rows, "dtype", None) == np.bool_:
             rows = np.flatnonzero(rows)
         return Source(self.name, self.what, self.values, self.report, used=self.used, rows=rows)
+
+    def below(self, prefix: str) -> "Source":
+        """The values whose names begin with a prefix, by the rest of their names."""
+        values = {n.removeprefix(prefix): v for n, v in self.values.items() if n.startswith(prefix)}
+        shared = {"used": self.used, "rows": self._rows, "prefix": self._prefix + prefix}
+        return Source(self.name, self.what, values, self.report, **shared)
 
     def groups(self, *key: str) -> dict[tuple[str, ...], "Source"]:
         """The rows by the values of key columns, in the order of the file."""
@@ -165,7 +172,7 @@ class Source:
 
     def note(self, what: str, *names: str) -> None:
         """Name values that need not be compared."""
-        self.used.update(names)
+        self.used.update(self._prefix + name for name in names)
         self.report.note(f"{self.name} {', '.join(names)}{': ' if names else ''}{what}")
 
     def finish(self) -> None:

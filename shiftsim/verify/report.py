@@ -50,7 +50,18 @@ class Report:
     informative: list[str] = field(default_factory=list)
 
     def compare(
+<<<<<<< HEAD
         self, quantity: str, where: str, actual: object, expected: object, *, atol: ArrayLike = 0.0
+=======
+        self,
+        quantity: str,
+        where: str,
+        actual: object,
+        expected: object,
+        *,
+        atol: float = 0.0,
+        angle: bool = False,
+>>>>>>> verify2
     ) -> bool:
         """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
 
@@ -59,8 +70,14 @@ class Report:
             where: Which case: file, scene, run.
             actual: Ours: a scalar, string, array or list, also of lists of several lengths.
             expected: The reference value of the same form; None among numbers is NaN.
+<<<<<<< HEAD
             atol: Absolute tolerance, of all values or of each (it is broadcast to them); 0 demands
                 equality. Strings, booleans and integers are always compared exactly.
+=======
+            atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
+                compared exactly.
+            angle: Whether the values are angles [rad], which are equal up to whole turns.
+>>>>>>> verify2
 
         Returns:
             Whether they agree.
@@ -78,7 +95,9 @@ class Report:
             left, right = ours.astype(np.float64), theirs.astype(np.float64)
             same = (left == right) | (np.isnan(left) & np.isnan(right))
             with np.errstate(invalid="ignore"):
-                error = np.where(same, 0.0, np.abs(left - right))
+                gap = left - right
+                gap = (gap + np.pi) % (2.0 * np.pi) - np.pi if angle else gap
+                error = np.where(same, 0.0, np.abs(gap))
             error = np.where(np.isnan(error), np.inf, error)
             if error.size:
                 tally.max_error = max(tally.max_error, float(error.max()))
