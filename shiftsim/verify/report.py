@@ -50,18 +50,14 @@ class Report:
     informative: list[str] = field(default_factory=list)
 
     def compare(
-<<<<<<< HEAD
-        self, quantity: str, where: str, actual: object, expected: object, *, atol: ArrayLike = 0.0
-=======
         self,
         quantity: str,
         where: str,
         actual: object,
         expected: object,
         *,
-        atol: float = 0.0,
+        atol: ArrayLike = 0.0,
         angle: bool = False,
->>>>>>> verify2
     ) -> bool:
         """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
 
@@ -70,14 +66,9 @@ class Report:
             where: Which case: file, scene, run.
             actual: Ours: a scalar, string, array or list, also of lists of several lengths.
             expected: The reference value of the same form; None among numbers is NaN.
-<<<<<<< HEAD
             atol: Absolute tolerance, of all values or of each (it is broadcast to them); 0 demands
                 equality. Strings, booleans and integers are always compared exactly.
-=======
-            atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
-                compared exactly.
             angle: Whether the values are angles [rad], which are equal up to whole turns.
->>>>>>> verify2
 
         Returns:
             Whether they agree.
