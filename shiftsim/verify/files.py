@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import ArrayLike
 
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
@@ -100,6 +101,11 @@ class Source:
             groups.setdefault(tuple(map(str, values)), []).append(row)
         return {values: self.at(np.array(rows)) for values, rows in groups.items()}
 
+    def by(self, key: str, value: str) -> "Source":
+        """One column as values that another one names, such as scores by metric."""
+        pairs = zip(self[key].tolist(), self[value].tolist(), strict=True)
+        return Source(self.name, key, dict(pairs), self.report)
+
     def each(self, name: str) -> "list[Source]":
         """The objects in a list of a `.json`, as parts of the file; or the one that is not listed.
 
@@ -118,7 +124,7 @@ class Source:
         self,
         where: str,
         ours: Mapping[str, object],
-        atol: float | Mapping[str, float] = EXACT,
+        atol: float | Mapping[str, ArrayLike] = EXACT,
         *,
         quantity: str | None = None,
     ) -> bool:
@@ -147,7 +153,7 @@ class Source:
     def match_rows(
         self,
         ours: Mapping[str, Any],
-        atol: float | Mapping[str, float] = EXACT,
+        atol: float | Mapping[str, ArrayLike] = EXACT,
         *,
         where: str = "case",
         quantity: str | None = None,
@@ -196,6 +202,58 @@ def read_table(path: Path, report: Report) -> Source:
         raise DataError(f"{path}: not a readable Parquet file ({error})") from error
     columns = {name: table[name].to_numpy() for name in table.column_names}
     return Source(path.stem, "column", columns, report)
+
+
+class Groups:
+    """The rows of a `.parquet` by key, and which of them were asked for."""
+
+    def __init__(self, path: Path, report: Report, key: tuple[str, ...] = RUN_KEY) -> None:
+        """A file that does not exist is named as not covered, and has no rows."""
+        self._groups: dict[tuple[str, ...], Source] = {}
+        self._asked: set[tuple[str, ...]] = set()
+        if path.is_file():
+            self.table = read_table(path, report)
+            self._groups = self.table.groups(*key)
+        else:
+            self.table = Source(path.stem, "column", {}, report)
+            report.skip(f"{path.name} is missing")
+
+    def __iter__(self) -> Iterator[tuple[str, ...]]:
+        return iter(self._groups)
+
+    def get(self, *key: str) -> Source | None:
+        """The rows of a key, if there are any."""
+        self._asked.add(key)
+        return self._groups.get(key)
+
+    def __getitem__(self, key: tuple[str, ...]) -> Source:
+        rows = self.get(*key)
+        if rows is None:
+            raise DataError(f"{self.table.name}: no rows of {' '.join(key)}")
+        return rows
+
+    def match(
+        self,
+        key: tuple[str, ...],
+        ours: Mapping[str, Any],
+        atol: float | Mapping[str, ArrayLike] = EXACT,
+        *,
+        quantity: str | None = None,
+    ) -> bool:
+        """`Source.match` for the rows of a key; where there are none, ours must have none."""
+        rows, where = self.get(*key), " ".join(key)
+        if rows is None:
+            count = len(next(iter(ours.values())))
+            return self.table.report.compare(f"{self.table.name} rows", where, count, 0)
+        return rows.match(where, ours, atol, quantity=quantity)
+
+    def finish(self, mode: str | None = None) -> None:
+        """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
+        for key in self._groups:
+            if key not in self._asked and (mode is None or mode in key):
+                self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
+        if self._asked & set(self._groups):
+            self.table.finish()
 
 
 def read_json(path: Path) -> Any:

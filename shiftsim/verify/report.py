@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 import shapely
+from numpy.typing import ArrayLike
 
 from shiftsim.errors import ShiftsimError
 
@@ -55,7 +56,7 @@ class Report:
         actual: object,
         expected: object,
         *,
-        atol: float = 0.0,
+        atol: ArrayLike = 0.0,
         angle: bool = False,
     ) -> bool:
         """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
@@ -65,8 +66,8 @@ class Report:
             where: Which case: file, scene, run.
             actual: Ours: a scalar, string, array or list, also of lists of several lengths.
             expected: The reference value of the same form; None among numbers is NaN.
-            atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
-                compared exactly.
+            atol: Absolute tolerance, of all values or of each (it is broadcast to them); 0 demands
+                equality. Strings, booleans and integers are always compared exactly.
             angle: Whether the values are angles [rad], which are equal up to whole turns.
 
         Returns:
@@ -74,7 +75,7 @@ class Report:
         """
         tally = self.quantities.setdefault(quantity, Quantity())
         tally.cases += 1
-        tally.tolerance = max(tally.tolerance, atol)
+        tally.tolerance = max(tally.tolerance, float(np.max(atol)))
         ours, theirs = _array(actual), _array(expected)
         if ours.shape != theirs.shape:
             return self._differ(tally, quantity, where, f"shape {ours.shape}, not {theirs.shape}")
@@ -91,7 +92,7 @@ class Report:
             error = np.where(np.isnan(error), np.inf, error)
             if error.size:
                 tally.max_error = max(tally.max_error, float(error.max()))
-            bad = np.atleast_1d(error > atol)
+            bad = np.atleast_1d(error > np.asarray(atol))
         else:
             bad = np.atleast_1d(ours != theirs)
         if not bad.any():
