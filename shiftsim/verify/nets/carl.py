@@ -14,12 +14,12 @@ from shiftsim.planners.learned.carl.view import CHANNELS, SIZE, in_picture, pict
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import read_arrays
-from shiftsim.verify.nets.loops import FILE_COLUMNS, Step, verify_loop
+from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
 from shiftsim.verify.nets.networks import make_network, num_elements, verify_manifest
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, NUM_STATE, AgentKind, Command
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, NUM_STATE, AgentKind
 
 NAME = Carl.name
 NETWORK = 2e-5  # network outputs
@@ -37,9 +37,8 @@ _DRIVE = {
     "dist_sigma.0.bias": "[0, 0]",
     "dist_mu.0.bias": "[2.5, 0]",
 }
-# nuPlan rule 623: at inference the critic is told constants
-_VALUE_MEASUREMENTS = np.ones(4, np.float32)
-_LOOP_ARRAYS = ("measurements", "action", "alpha", "beta", "value")
+_VALUE_MEASUREMENTS = np.ones(4, np.float32)  # what the critic is told at inference
+_RECORDED = ("measurements", "action", "alpha", "beta", "value")
 
 
 def _verify_manifest(path: Path, report: Report, scenes: Scenes) -> None:
@@ -66,9 +65,10 @@ def _verify_forward(path: Path, report: Report, scenes: Scenes) -> None:
     variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
     expected = {"case": path.stem.removeprefix("forward_"), "variants": variants}
     report.compare(f"{NAME} meta", path.name, expected, meta)
-    inputs = [file[f"in.{name}"][None] for name in ("bev_semantics", "measurements")]
+    names = ("bev_semantics", "measurements", "value_measurements")
+    see, feel, tell = (file[f"in.{name}"][None] for name in names)
     for variant in variants:
-        parts, heads = _outputs(variant, *inputs, file["in.value_measurements"][None])
+        parts, heads = _outputs(variant, see, feel, tell)
         for start, ours in (("out.", parts), (f"out.{variant}.", heads)):
             file.below(start).match(f"{path.stem} {variant}", ours, _bounds(ours), quantity=NAME)
     file.finish()
@@ -126,68 +126,66 @@ def _verify_decoding(path: Path, report: Report, scenes: Scenes) -> None:
     file.finish()
 
 
-def _compare(step: Step) -> None:
+def _compare(loop: Loop) -> None:
     """Compare picture, outputs and command of one iteration."""
-    pictures, measured = step.features.pictures.copy(), step.features.measurements
-    equal = _compare_pictures(step, pictures)
-    if any(name.startswith("cache/") for name in step.stored):
-        _compare_drawn(step)
-    _, heads = _outputs(
-        step.loop.variant, pictures[None], measured[None], _VALUE_MEASUREMENTS[None]
-    )
+    pictures, measured = loop.features.pictures.copy(), loop.features.measurements
+    equal = _compare_pictures(loop, pictures)
+    if any(name.startswith("cache/") for name in loop.stored):
+        _compare_drawn(loop)
+    _, heads = _outputs(loop.variant, pictures[None], measured[None], _VALUE_MEASUREMENTS[None])
     ours = {name: value[0] for name, value in heads.items()}
-    ours |= {"measurements": measured, "action": step.output}
-    for name in _LOOP_ARRAYS:
+    ours |= {"measurements": measured, "action": loop.output}
+    for name in _RECORDED:
         atol = _bounds(ours)[name] if equal or name == "measurements" else BORDER_ACTION
-        step.compare(name, ours[name], step.recorded(name), atol)
+        loop.compare(name, ours[name], loop.recorded(name), atol)
     # the next step goes on from their action: standing still, each step multiplies a difference
-    decoded = step.planner.decode(step.recorded("action"), step.seen)
+    decoded = loop.planner.decode(loop.recorded("action"), loop.seen)
     atol = COMMAND if equal else BORDER_ACTION * 10.0
-    for whose, command, bound in (("our", step.plan, atol), ("their", decoded, DECODED)):
+    for whose, command, bound in (("our", loop.plan, atol), ("their", decoded, DECODED)):
         numbers = (command.acceleration, command.steering_rate)
-        step.compare(f"command of {whose} action", numbers, step.recorded("command"), bound)
+        loop.compare(f"command of {whose} action", numbers, loop.recorded("command"), bound)
 
 
-def _compare_pictures(step: Step, ours: np.ndarray) -> bool:
+def _compare_pictures(loop: Loop, ours: np.ndarray) -> bool:
     """Compare the nine channels; whether all pixels are equal."""
-    report, theirs = step.loop.file.report, step.stored.take("bev_semantics", *ours.shape)
-    step.compare("picture type", str(ours.dtype), str(theirs.dtype))
+    report, theirs = loop.file.report, loop.stored.take("bev_semantics", *ours.shape)
+    loop.compare("picture type", str(ours.dtype), str(theirs.dtype))
     differing = ours != theirs
-    border = differing & _near_border(step, theirs) if differing.any() else differing
+    border = differing & _near_border(loop, theirs) if differing.any() else differing
     for channel, label in enumerate(CHANNELS):
         pixels = np.argwhere(border[channel]).tolist()
         if len(pixels) > MAX_PIXELS:
-            report.fail(f"{NAME} picture {label}", step.where, f"{len(pixels)} pixels differ")
+            report.fail(f"{NAME} picture {label}", loop.where, f"{len(pixels)} pixels differ")
             continue
         for row, column in pixels:
-            report.note(f"{step.where} {label}: pixel {row}, {column} (border)")
+            report.note(f"{loop.where} {label}: pixel {row}, {column} (border)")
         drawn = np.where(border[channel], theirs[channel], ours[channel])
-        step.compare(f"picture {label}", drawn, theirs[channel])
+        loop.compare(f"picture {label}", drawn, theirs[channel])
     return not differing.any()
 
 
-def _near_border(step: Step, theirs: np.ndarray) -> np.ndarray:
+def _near_border(loop: Loop, theirs: np.ndarray) -> np.ndarray:
     """(9, 256, 256) whether a move of the ego by next to nothing would give this pixel."""
     found = np.zeros(theirs.shape, np.bool_)
     for dx in (-JITTER, 0.0, JITTER):
         for dy in (-JITTER, 0.0, JITTER):
-            ego = step.seen.history.ego.copy()
+            ego = loop.seen.history.ego.copy()
             ego[-1, :HEADING] += dx, dy
-            moved = replace(step.seen, history=replace(step.seen.history, ego=ego))
-            found |= step.planner.features(moved).pictures == theirs
-    step.planner.features(step.seen)
+            moved = replace(loop.seen, history=replace(loop.seen.history, ego=ego))
+            found |= loop.planner.features(moved).pictures == theirs
+    loop.planner.features(loop.seen)
     return found
 
 
-def _compare_drawn(step: Step) -> None:
+def _compare_drawn(loop: Loop) -> None:
     """Compare which objects were drawn, and in which order."""
-    lights = [f"{name}:{status.name}" for name, status in step.seen.traffic_lights.items()]
+    lights = [f"{name}:{status.name}" for name, status in loop.seen.traffic_lights.items()]
     lists = {
-        **_drawn_areas(step.planner, step.loop.scenario.map),
-        **_drawn_tracks(step.seen),
+        **_drawn_areas(loop.planner, loop.scenario.map),
+        **_drawn_tracks(loop.seen),
         "traffic_lights": lights,
     }
-    step.stored.below("cache/").match(step.where, lists, quantity=NAME)
+    loop.stored.below("cache/").match(loop.where, lists, quantity=NAME)
 
 
 def _drawn_areas(planner: Carl, road: VectorMap) -> dict[str, list[str]]:
@@ -223,5 +221,7 @@ FILES = {
     "state_dict.json": _verify_manifest,
     "forward_*.npz": _verify_forward,
     "action_decode.npz": _verify_decoding,
-    "closed_loop_*.npz": partial(verify_loop, make=Carl, compare=_compare, recorded=_LOOP_ARRAYS),
+    "closed_loop_*.npz": partial(
+        verify_loop, make=Carl, compare=_compare, recorded=("command", *_RECORDED)
+    ),
 }

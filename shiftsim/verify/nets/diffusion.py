@@ -33,7 +33,7 @@ from shiftsim.planners.learned.diffusion.kernels import (
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source, read_arrays, read_fields, read_json
-from shiftsim.verify.nets.loops import POSITION, Step, verify_loop
+from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
 from shiftsim.verify.nets.networks import FEATURE, make_network, num_elements, verify_manifest
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
@@ -233,15 +233,15 @@ def _verify_sampling(
         stored.match(where, {name: value.numpy()}, atol, quantity=NAME)
 
 
-def _compare(step: Step) -> None:
+def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
-    bound = SAMPLED[step.loop.variant]
-    step.compare("ego_prediction", step.output[0], step.recorded("ego_prediction"), bound)
-    step.compare_plan(POSITION)
-    if not list(step.stored):
+    bound = SAMPLED[loop.variant]
+    loop.compare("ego_prediction", loop.output[0], loop.recorded("ego_prediction"), bound)
+    loop.compare_plan(POSITION)
+    if not list(loop.stored):
         return
-    features, road, tokens = step.features, step.loop.scenario.map, step.loop.scenario.tracks.tokens
-    step.match(
+    features, road, tokens = loop.features, loop.scenario.map, loop.scenario.tracks.tokens
+    loop.match(
         {
             "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
             "agent_tokens": [tokens[track] for track in features.agents.tolist()],
@@ -250,10 +250,10 @@ def _compare(step: Step) -> None:
     )
     route = [f"route_lanes_{name}" for name in ("speed_limit", "has_speed_limit")]
     read = {f"feature/{name}": getattr(features, name) for name in (*INPUTS, *route)}
-    step.match(read, FEATURE)
-    step.match({"prediction": step.output}, bound)
-    if "encoding" in step.stored:
-        step.match({"encoding": _encoding(step.loop.variant, features)}, NETWORK)
+    loop.match(read, FEATURE)
+    loop.match({"prediction": loop.output}, bound)
+    if "encoding" in loop.stored:
+        loop.match({"encoding": _encoding(loop.variant, features)}, NETWORK)
 
 
 def _encoding(variant: str, features: Features) -> Any:
@@ -346,7 +346,7 @@ FILES = {
     "state_dict.json": _verify_manifest,
     "forward_*.npz": _verify_forward,
     "closed_loop_*.npz": partial(
-        verify_loop, make=KeyedPlanner, compare=_compare, recorded=("ego_prediction",)
+        verify_loop, make=KeyedPlanner, compare=_compare, recorded=(*PLANS, "ego_prediction")
     ),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,

@@ -44,7 +44,8 @@ def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[st
         path: The file `state_dict.json`.
         report: Receives the comparisons.
         planner: Name of the planner.
-        others: Further fields: our value, or a function that makes it from theirs.
+        others: Further fields: our value, a function that makes it from theirs, or None for a text
+            that need not be compared.
     """
     manifest, module = read_fields(path, report), network_module(planner)
     network = module.build_network(None)
@@ -77,12 +78,13 @@ def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[st
     else:
         weights = deterministic_state(built, rules)
         for name in check:
-            ours = weights[name].ravel()[: len(check[name])].astype(float)
-            report.compare(f"{planner} selfcheck", name, ours, check[name])
-    made = {
-        name: value(manifest[name]) if callable(value) else value for name, value in others.items()
-    }
-    manifest.match(
-        path.name, {"planner": manifest["planner"], **made}, quantity=f"{planner} manifest"
-    )
+            first = weights[name].ravel()[: len(check[name])].astype(float)
+            report.compare(f"{planner} selfcheck", name, first, check[name])
+    for name, ours in others.items():
+        if ours is None:
+            manifest.note("description", name)
+        else:
+            value = ours(manifest[name]) if callable(ours) else ours
+            manifest.match(path.name, {name: value}, quantity=f"{planner} manifest")
+    manifest.used.add("planner")
     manifest.finish()

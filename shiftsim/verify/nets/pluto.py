@@ -15,9 +15,10 @@ from shiftsim.verify.files import read_arrays
 from shiftsim.verify.nets.loops import (
     FILE_COLUMNS,
     HEADING,
+    PLANS,
     POSITION,
     STATE,
-    Step,
+    Loop,
     verify_loop,
 )
 from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network
@@ -67,27 +68,27 @@ def _verify_brake(path: Path, report: Report, scenes: Scenes) -> None:
     file.finish()
 
 
-def _compare(step: Step) -> None:
+def _compare(loop: Loop) -> None:
     """Compare everything stored of one iteration."""
-    sight, choice = step.planner.sight, step.planner.choice
-    if "agent_tokens" in step.stored:  # one of the iterations stored in full
-        _compare_sight(step, sight)
-        _compare_network(step)
+    sight, choice = loop.planner.sight, loop.planner.choice
+    if "agent_tokens" in loop.stored:  # one of the iterations stored in full
+        _compare_sight(loop, sight)
+        _compare_network(loop)
     if choice is None:
-        step.loop.file.report.fail(f"{NAME} reference lines", step.where, "none found")
+        loop.file.report.fail(f"{NAME} reference lines", loop.where, "none found")
         return
-    _compare_choice(step, choice)
-    if "agent_tokens" in step.stored:
-        _compare_from_stored(step, sight)
-    best = int(step.recorded("best_index"))
-    if not _is_near_tie(step, choice.best, best):
-        step.compare("best proposal", choice.best, best)
-        step.compare("emergency brake", choice.braked, bool(step.recorded("emergency_brake")))
-        step.compare_plan(MOTION)
+    _compare_choice(loop, choice)
+    if "agent_tokens" in loop.stored:
+        _compare_from_stored(loop, sight)
+    best = int(loop.recorded("best_index"))
+    if not _is_near_tie(loop, choice.best, best):
+        loop.compare("best proposal", choice.best, best)
+        loop.compare("emergency brake", choice.braked, bool(loop.recorded("emergency_brake")))
+        loop.compare_plan(MOTION)
 
 
-def _compare_sight(step: Step, sight: Sight) -> None:
-    inputs, road, near = step.features._asdict(), step.loop.scenario.map, sight.road
+def _compare_sight(loop: Loop, sight: Sight) -> None:
+    inputs, road, near = loop.features._asdict(), loop.scenario.map, sight.road
     blocks = [
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
@@ -99,12 +100,12 @@ def _compare_sight(step: Step, sight: Sight) -> None:
         "reference_line.future_projection": np.zeros((len(sight.lines), 8, 2)),
         **{INPUTS[name]: value for name, value in inputs.items() if name.startswith("line_")},
     }
-    compare_features(step, sight.agents, near, step.planner.route.blocks, others)
-    stored = [name for name in step.stored if name.startswith("reference_line_")]
-    step.compare("reference lines", len(sight.lines), len(stored))
-    step.match({f"reference_line_{i}": line for i, line in enumerate(sight.lines)}, LINE)
-    # nuPlan rule 621: static objects come out of a set, so their order means nothing
-    theirs, pose = step.stored.below("feature/static_objects."), inputs["object_pose"]
+    compare_features(loop, sight.agents, near, loop.planner.route.blocks, others)
+    stored = [name for name in loop.stored if name.startswith("reference_line_")]
+    loop.compare("reference lines", len(sight.lines), len(stored))
+    loop.match({f"reference_line_{i}": line for i, line in enumerate(sight.lines)}, LINE)
+    # the official code takes static objects out of a set: their order means nothing
+    theirs, pose = loop.stored.below("feature/static_objects."), inputs["object_pose"]
     ours = {
         "position": pose[:, :2],
         "heading": pose[:, 2],
@@ -114,7 +115,7 @@ def _compare_sight(step: Step, sight: Sight) -> None:
     }
     order, their_order = _by_place(pose[:, :2]), _by_place(theirs["position"])
     for name, value in ours.items():
-        step.compare(f"static_objects.{name}", value[order], theirs[name][their_order], FEATURE)
+        loop.compare(f"static_objects.{name}", value[order], theirs[name][their_order], FEATURE)
 
 
 def _by_place(positions: Any) -> Any:
@@ -123,67 +124,67 @@ def _by_place(positions: Any) -> Any:
     return np.lexsort((rounded[:, 1], rounded[:, 0]))
 
 
-def _compare_network(step: Step) -> None:
+def _compare_network(loop: Loop) -> None:
     from shiftsim.planners.learned.pluto.network import Inputs
 
-    network, inputs = make_network(NAME, step.loop.variant), step.features
+    network, inputs = make_network(NAME, loop.variant), loop.features
     raw = run_network(NAME, network, Inputs(*stack([inputs], "cpu")))
     ours = {name: value[0] for name, value in raw.items()}
     present = np.concatenate([inputs.position[1:, -1], inputs.heading[1:, -1:]], axis=1)
     ours |= derived_outputs(ours, present)
     del ours["trajectory"], ours["candidate_trajectories"]  # too large, not stored
-    compare_outputs(step.stored.below("net/"), step.where, NAME, step.loop.variant, ours)
+    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
 
 
-def _compare_choice(step: Step, choice: Choice) -> None:
+def _compare_choice(loop: Loop, choice: Choice) -> None:
     """Compare proposals and scores that were made from the log on."""
-    stored, scores = step.stored.below("post/"), choice.scores
+    stored, scores = loop.stored.below("post/"), choice.scores
     ours = {
         "cand": (choice.poses, POSITION),
         "lscore": (choice.learned, SCORE),
         "agents_pred": (choice.agents[0], POSITION),
-        "agents_vel": (choice.agents[1], OUTPUT[step.loop.variant]),
+        "agents_vel": (choice.agents[1], OUTPUT[loop.variant]),
         **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
     }
     for name, (value, atol) in ours.items():
         if name in stored:
-            step.compare(name, value, stored[name], atol)
+            loop.compare(name, value, stored[name], atol)
             if name in ("cand", "rollout", "agents_pred"):
-                step.compare(f"{name} heading", value[..., 2], stored[name][..., 2], HEADING)
+                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], HEADING)
     # what follows from the other stored scores
     progress, rule = aggregate(stored["multi"], stored["weighted"], stored["progress"])
-    step.compare("aggregated progress", progress, stored["weighted"][0], EXACT)
-    step.compare("aggregated rule", rule, stored["rule"], EXACT)
+    loop.compare("aggregated progress", progress, stored["weighted"][0], EXACT)
+    loop.compare("aggregated rule", rule, stored["rule"], EXACT)
 
 
-def _compare_from_stored(step: Step, sight: Sight) -> None:
+def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     """Compare what the scores of the stored proposals are, against the stored predictions."""
     stored, scenario, ego = (
-        step.stored.below("post/"),
-        step.loop.scenario,
-        step.seen.history.ego[-1],
+        loop.stored.below("post/"),
+        loop.scenario,
+        loop.seen.history.ego[-1],
     )
     tokens = [scenario.tracks.tokens[track] for track in sight.agents.tracks.tolist()]
     line = nearest_line(sight.lines, ego)
     ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
-    stored.match(step.where, ours, EXACT, quantity=NAME)
-    world = step.planner.world_of(step.seen, (stored["agents_pred"], stored["agents_vel"]))
+    stored.match(loop.where, ours, EXACT, quantity=NAME)
+    world = loop.planner.world_of(loop.seen, (stored["agents_pred"], stored["agents_vel"]))
     place = Place(sight.drivable, scenario.map.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
     scores: Scores = score(proposals, stored["lscore"], ego, world, place, PACIFICA)
     ours = {name: getattr(scores, field) for name, (field, _) in SCORES.items()}
-    stored.match(step.where, ours, EXACT, quantity=f"{NAME} stored proposals'")
+    stored.match(loop.where, ours, EXACT, quantity=f"{NAME} stored proposals'")
 
 
-def _is_near_tie(step: Step, ours: int, theirs: int) -> bool:
+def _is_near_tie(loop: Loop, ours: int, theirs: int) -> bool:
     """Whether another proposal was chosen in a near-tie, which is listed."""
-    stored = step.stored.below("post/")
+    stored = loop.stored.below("post/")
     total = stored["rule"] + 0.3 * stored["lscore"]
     first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
     if ours == theirs or first - second > NEAR_TIE:
         return False
     what = f"proposal {ours} instead of {theirs}, scores {first:.6f} and {second:.6f}"
-    step.loop.file.report.note(f"{NAME} {step.where}: near-tie, {what}")
+    loop.file.report.note(f"{NAME} {loop.where}: near-tie, {what}")
     return True
 
 
@@ -195,10 +196,13 @@ FILES = {
         max_agents=MAX_AGENTS,
         build_reference_line=True,
     ),
-    # nuPlan rule 622: the official code masks agents of a batch in the wrong order
+    # the official code masks the agents of a batch in the wrong order
     "forward_*.npz": partial(verify_forward, planner=NAME, radius=RADIUS, misordered_masks=True),
     "closed_loop_*.npz": partial(
-        verify_loop, make=Pluto, compare=_compare, recorded=("best_index", "emergency_brake")
+        verify_loop,
+        make=Pluto,
+        compare=_compare,
+        recorded=(*PLANS, "best_index", "emergency_brake"),
     ),
     "emergency_brake.npz": _verify_brake,
 }

@@ -1,4 +1,4 @@
-"""What the comparisons of PlanTF and PLUTO share: features, inputs and outputs of their networks."""
+"""What the comparisons of PlanTF and PLUTO share: features, inputs and outputs of networks."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -7,14 +7,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.arrays import BoolArray
 from shiftsim.planners.learned.features import EGO_LENGTH, EGO_WIDTH, SAMPLES, AgentFeatures
 from shiftsim.planners.learned.map_features import RoadFeatures
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.learned.plan_states import STEP
 from shiftsim.planners.learned.pluto.proposals import STEPS, headings_of
 from shiftsim.verify.files import Source, read_arrays
-from shiftsim.verify.nets.loops import Step
+from shiftsim.verify.nets.loops import Loop
 from shiftsim.verify.nets.networks import (
     FEATURE,
     OUTPUT,
@@ -25,7 +25,7 @@ from shiftsim.verify.nets.networks import (
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
-Arrays: TypeAlias = Mapping[str, np.ndarray]
+Arrays: TypeAlias = dict[str, np.ndarray]
 
 DERIVED_HEADING = 5e-4  # rad, arctangent of small vectors
 RAW = ("trajectory", "probability", "prediction", "ref_free_trajectory")
@@ -59,13 +59,17 @@ INPUTS = {  # field of the networks' inputs → array of the files
     "line_orientations": "reference_line.orientation",
     "line_valid": "reference_line.valid_mask",
 }
-CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
+CODES = {  # integers, stored as floats
+    *(INPUTS[name] for name in ("category", "kind", "on_route", "light", "object_category")),
+    "map.polygon_road_block_id",
+}
+HISTORIES = ("position", "heading", "velocity", "shape")  # of agents
 _ROUNDING = 2.0**-22  # twice the relative error of a 32 bit float
 _FEW = 0.01  # part of the values
 
 
 def compare_features(
-    step: Step,
+    loop: Loop,
     agents: AgentFeatures,
     road: RoadFeatures,
     route: tuple[int, ...],
@@ -74,13 +78,13 @@ def compare_features(
     """Compare what is stored of one iteration that is made before the network.
 
     Args:
-        step: The iteration.
+        loop: The iteration.
         agents: The ego and the agents.
         road: Lanes, connectors and crosswalks.
         route: Blocks of the corrected route.
         others: Further features by name.
     """
-    scenario, ego = step.loop.scenario, step.seen.history.ego[-1]
+    scenario, ego = loop.scenario, loop.seen.history.ego[-1]
     ids = [*scenario.map.edges.ids, *scenario.map.crosswalks.ids]
     features = {
         "origin": ego[:2],
@@ -102,8 +106,9 @@ def compare_features(
         "map.valid_mask": road.valid,
         **others,
     }
-    step.match({f"feature/{name}": value for name, value in features.items()}, FEATURE)
-    step.match(
+    stored = loop.stored.below("feature/")
+    stored.match(loop.where, features, FEATURE, quantity=loop.name)
+    loop.match(
         {
             "agent_tokens": ["ego", *(scenario.tracks.tokens[i] for i in agents.tracks.tolist())],
             "map_ids": [ids[row] for row in road.objects.tolist()],
@@ -115,12 +120,12 @@ def compare_features(
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
     there, absent = agents.valid, {"position": origin, "heading": -ego[2]}
-    for name in ("position", "heading", "velocity", "shape"):
-        ours, theirs = getattr(agents, name), step.stored[f"feature/agent.{name}"]
-        step.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)
+    for name in HISTORIES:
+        ours, theirs = getattr(agents, name), stored[f"agent.{name}"]
+        loop.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)
         rest = np.broadcast_to(absent.get(name, 0.0), theirs.shape)[~there]
         atol = FEATURE + _ROUNDING * float(np.abs(rest).max(initial=0.0))
-        step.compare(f"agent.{name} where absent", rest, theirs[~there], atol)
+        loop.compare(f"agent.{name} where absent", rest, theirs[~there], atol)
 
 
 def network_inputs(planner: str, arrays: Source) -> Any:
@@ -140,7 +145,7 @@ def network_inputs(planner: str, arrays: Source) -> Any:
         elif field == "current_state":
             array = array[:, :STATE_CHANNELS]
         values[field] = torch.from_numpy(np.ascontiguousarray(array))
-        if field in CODES:
+        if INPUTS[field] in CODES:
             values[field] = values[field].long()
     return kind(**values)
 
@@ -187,9 +192,8 @@ def compare_outputs(
             stored.report.compare(label, where, value, theirs, atol=atol)
             continue
         stored.report.compare(label, where, value[..., others], theirs[..., others], atol=atol)
-        turn = wrap_angles((value[..., 2] - theirs[..., 2]).astype(np.float64))
-        label = f"{planner} {name} heading"
-        stored.report.compare(label, where, turn, np.zeros(turn.shape), atol=DERIVED_HEADING)
+        ours, theirs, label = value[..., 2], theirs[..., 2], f"{planner} {name} heading"
+        stored.report.compare(label, where, ours, theirs, atol=DERIVED_HEADING, angle=True)
 
 
 def verify_forward(
@@ -200,6 +204,7 @@ def verify_forward(
     Args:
         path: The file.
         report: Receives the comparisons.
+        scenes: Not used.
         planner: Name of the planner.
         radius: Beyond which points are not valid [m].
         args: Hyper-parameters of the network that differ from the released ones.
@@ -225,7 +230,7 @@ def verify_forward(
 def verify_vector_manifest(
     path: Path, report: Report, scenes: Scenes, planner: str, **builder: object
 ) -> None:
-    """Compare `state_dict.json`; `builder` are settings of the features that the planners differ in."""
+    """Compare `state_dict.json`; `builder` are the planner's settings of the features."""
     module = network_module(planner)
     network = module.build_network()
     heads = {
@@ -267,103 +272,62 @@ def compare_inputs(file: Source, planner: str, radius: float) -> None:
         planner: Name of the planner.
         radius: Beyond which points are not valid [m].
     """
-    names = list(file.below("in/"))
-    given = {name: np.asarray(file[f"in/{name}"], np.float64) for name in names}
-    masks = {
-        name.partition(".")[0]: value > 0.0
-        for name, value in given.items()
-        if name.endswith(".valid_mask")
-    }
+    inputs = file.below("in/")
+    given = {name: np.asarray(inputs[name], np.float64) for name in inputs}
+    masks = {name: value > 0.0 for name, value in given.items() if name.endswith(".valid_mask")}
+    gaps = _gaps(given, masks["agent.valid_mask"], masks["map.valid_mask"], radius)
     for name, value in given.items():  # padding is zero
-        mask = masks.get(name.partition(".")[0])
+        mask = masks.get(f"{name.partition('.')[0]}.valid_mask")
         if mask is not None:
             there = mask if value.shape[: mask.ndim] == mask.shape else mask.any(axis=-1)
-            _check(file, planner, f"{name} where absent", value[~there], 0.0)
-    _check_equal(file, planner, given, masks, radius)
-    for name, gaps in _angle_gaps(given).items():
-        _check(file, planner, name, wrap_angles(gaps), 0.0)
-    for name, gaps in _motion_gaps(given, masks["agent"]).items():
-        if np.count_nonzero(np.abs(gaps) > FEATURE) > _FEW * gaps.size:
+            gaps[f"{name} where absent"] = value[~there]
+    for name, gap in gaps.items():
+        away = np.count_nonzero(np.abs(gap) > FEATURE) / max(gap.size, 1)
+        if name.endswith("of agents") and away > _FEW:
             file.report.note(f"{file.name}: {name} (this input does not obey it)")
-        else:
-            _check(file, planner, name, gaps, 0.0)
+            continue
+        label, where, angle = f"{planner} inputs", f"{file.name} {name}", "orientation" in name
+        file.report.compare(label, where, gap, 0.0 * gap, atol=FEATURE, angle=angle)
 
 
-def _check(file: Source, planner: str, name: str, ours: Any, theirs: Any) -> None:
-    theirs = np.broadcast_to(theirs, np.shape(ours)) if np.ndim(theirs) == 0 else theirs
-    label = f"{planner} inputs"
-    file.report.compare(label, f"{file.name} {name}", ours, theirs, atol=FEATURE)
-
-
-def _check_equal(file: Source, planner: str, given: Arrays, masks: Arrays, radius: float) -> None:
-    """What follows from other inputs, or is always the same."""
+def _gaps(given: Arrays, present: BoolArray, near: BoolArray, radius: float) -> Arrays:
+    """What is 0 in every input: differences of what says the same, and what is always 0."""
+    position, heading, velocity, shape = (given[f"agent.{name}"] for name in HISTORIES)
     points, center = given["map.point_position"], given["map.polygon_center"]
-    exists, limit = masks["map"].any(axis=-1), given["map.polygon_speed_limit"]
-    near = (np.abs(points[:, :, 0]) < radius).all(axis=-1)
-    state, count = given["current_state"], given["agent.category"].shape
-    made = {
-        "map.point_vector": (np.diff(points, axis=3), given["map.point_vector"][..., :-1, :]),
-        "map.point_side": (np.where(exists[..., None], np.arange(3), 0), given["map.point_side"]),
-        "map.polygon_center": (points[:, :, 0, 10], center[..., :2]),
-        "map.polygon_position": (points[:, :, 0, 0], given["map.polygon_position"]),
-        "map.valid_mask": (near[exists], masks["map"][exists]),
-        "map.polygon_speed_limit": (limit * given["map.polygon_has_speed_limit"], limit),
-        "agent.target": (np.zeros((*count, 0, 3)), given["agent.target"]),
-        "ego shape": (
-            given["agent.shape"][:, 0] * 0.0 + np.array([EGO_WIDTH, EGO_LENGTH]),
-            given["agent.shape"][:, 0],
-        ),
-        "ego speed": (state[:, 3], given["agent.velocity"][:, 0, -1, 0]),
-        "ego position": (given["agent.position"][:, 0, -1], 0.0),
-        "ego heading": (given["agent.heading"][:, 0, -1], 0.0),
-        "ego category": (given["agent.category"][:, 0], 0.0),
-        "ego current_state": (state[:, :3], 0.0),
-        "ego valid_mask": (given["agent.valid_mask"][:, 0], 1.0),
-    }
-    for field in CODES:
-        if INPUTS[field] in given:
-            codes = given[INPUTS[field]]
-            made[f"{INPUTS[field]} code"] = (np.rint(codes), codes)
-    if "reference_line.vector" in given:
-        pairs = given["reference_line.valid_mask"][..., 1:, None]
-        steps = given["reference_line.vector"][..., :-1, :]
-        lines = np.diff(given["reference_line.position"], axis=-2)
-        blocks = given["map.polygon_road_block_id"]
-        made["reference_line.vector"] = (lines * pairs, steps * pairs)
-        made["reference_line.future_projection"] = (given["reference_line.future_projection"], 0.0)
-        made["map.polygon_road_block_id"] = (np.rint(blocks), blocks)
-    for name, (ours, theirs) in made.items():
-        _check(file, planner, name, ours, theirs)
-
-
-def _angle_gaps(given: Arrays) -> Arrays:
-    """Differences of angles that are 0 up to whole turns [rad]."""
-    angles = given["map.point_orientation"]
-    made = {
-        "map.point_orientation": _angles(given["map.point_vector"]) - angles,
-        "map.polygon_center orientation": angles[:, :, 0, 10] - given["map.polygon_center"][..., 2],
+    vectors, angles = given["map.point_vector"], given["map.point_orientation"]
+    exists, state = near.any(axis=-1), given["current_state"]
+    gaps = {
+        "map.point_vector": np.diff(points, axis=3) - vectors[..., :-1, :],
+        "map.point_orientation": np.arctan2(vectors[..., 1], vectors[..., 0]) - angles,
+        "map.point_side": (given["map.point_side"] - np.arange(3))[exists],
+        "map.polygon_center": points[:, :, 0, 10] - center[..., :2],
+        "map.polygon_center orientation": angles[:, :, 0, 10] - center[..., 2],
+        "map.polygon_position": points[:, :, 0, 0] - given["map.polygon_position"],
         "map.polygon_orientation": angles[:, :, 0, 0] - given["map.polygon_orientation"],
+        "map.polygon_speed_limit": given["map.polygon_speed_limit"]
+        * (1.0 - given["map.polygon_has_speed_limit"]),
+        "map.valid_mask": 1.0 * ((np.abs(points[:, :, 0]) < radius).all(axis=-1) ^ near)[exists],
+        "agent.target": given["agent.target"],
+        "ego shape": shape[:, 0] - [EGO_WIDTH, EGO_LENGTH],
+        "ego speed": state[:, 3] - velocity[:, 0, -1, 0],
+        "ego position": position[:, 0, -1],
+        "ego heading": heading[:, 0, -1],
+        "ego category": given["agent.category"][:, 0],
+        "ego current_state": state[:, :3],
+        "ego valid_mask": 1.0 - present[:, 0],
+        **{f"{name} code": given[name] - np.rint(given[name]) for name in CODES & set(given)},
     }
     if "reference_line.vector" in given:
-        vectors, lines = given["reference_line.vector"], given["reference_line.orientation"]
-        made["reference_line.orientation"] = _angles(vectors) - lines
-    return made
-
-
-def _motion_gaps(given: Arrays, present: np.ndarray) -> Arrays:
-    """What is 0 by no rule, but nearly everywhere in a synthetic world."""
-    velocity, heading = given["agent.velocity"], given["agent.heading"]
-    both = present[..., 1:] & present[..., :-1]
-    moved = np.diff(given["agent.position"], axis=2) - velocity[:, :, :-1] * STEP
+        lines, steps = given["reference_line.position"], given["reference_line.vector"]
+        pairs = given["reference_line.valid_mask"][..., 1:, None]
+        angles = given["reference_line.orientation"]
+        gaps["reference_line.vector"] = (np.diff(lines, axis=-2) - steps[..., :-1, :]) * pairs
+        gaps["reference_line.orientation"] = np.arctan2(steps[..., 1], steps[..., 0]) - angles
+        gaps["reference_line.future_projection"] = given["reference_line.future_projection"]
+    # no rule, but nearly everywhere in a synthetic world
+    moved = np.diff(position, axis=2) - velocity[:, :, :-1] * STEP
+    gaps["motion of agents"] = moved[present[..., 1:] & present[..., :-1]]
     aside = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
-    shape = given["agent.shape"]
-    return {
-        "motion of agents": moved[both],
-        "headings of agents": aside[present],
-        "shapes of agents": (shape - shape[:, :, -1:])[present],
-    }
-
-
-def _angles(vectors: np.ndarray) -> np.ndarray:
-    angles: np.ndarray = np.arctan2(vectors[..., 1], vectors[..., 0])
-    return angles
+    gaps["headings of agents"] = aside[present]
+    gaps["shapes of agents"] = (shape - shape[:, :, -1:])[present]
+    return gaps
