@@ -23,7 +23,7 @@ from shiftsim.data.demo.store import bench_scene, demo_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import Rollout
-from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")
@@ -70,7 +70,7 @@ def scenes(store, tmp_path_factory):
         with tarfile.open(REPOSITORY / "tests/golden/nuplan.tar.xz") as archive:
             archive.extractall(folder.parent, filter="data")
     demo = open_store(store)
-    found = {**load_scenes(folder), "bench_scene_100": bench_scene(100, 0)}
+    found = {**Scenes(folder), "bench_scene_100": bench_scene(100, 0)}
     return {**found, "demo": demo.read(demo.tokens[0])}
 
 

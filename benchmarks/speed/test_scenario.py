@@ -18,7 +18,7 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
-from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.scenes import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, METRICS_TARGET = 25e-3, 5e-3  # s
@@ -30,7 +30,7 @@ def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN) as archive:
         archive.extractall(folder, filter="data")
-    return {**load_scenes(folder / "nuplan"), "bench_scene_100": bench_scene(100, 0)}
+    return {**Scenes(folder / "nuplan"), "bench_scene_100": bench_scene(100, 0)}
 
 
 @pytest.fixture(scope="module")

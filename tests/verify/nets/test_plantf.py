@@ -9,12 +9,11 @@ import places
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.nets.common import Scenes
+from shiftsim.verify.nets import verify_part
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
-
-from shiftsim.verify.nets.plantf import verify_plantf
 
 pytestmark = [pytest.mark.golden, pytest.mark.learned]
 
@@ -61,7 +60,7 @@ def scenes(nuplan_reference):
 
 def report_of(folder: Path, scenes: Scenes) -> Report:
     report = Report()
-    verify_plantf(folder, report, scenes)
+    verify_part("plantf", folder, report, scenes)
     return report
 
 
@@ -129,7 +128,7 @@ def test_files_that_nobody_knows_are_named(tmp_path, scenes):
     (tmp_path / "README.md").write_text("what this is")
     (tmp_path / "weights.bin").write_bytes(b"\0")
     report = report_of(tmp_path, scenes)
-    assert list(report.not_covered) == ["plantf: file weights.bin"]
+    assert list(report.not_covered) == ["file weights.bin"]
 
 
 def test_a_scene_that_is_not_at_hand_is_not_covered(tmp_path):
@@ -137,7 +136,7 @@ def test_a_scene_that_is_not_at_hand_is_not_covered(tmp_path):
     report = report_of(tmp_path, Scenes(tmp_path / "absent"))
     assert report.exit_code(require_all=True) == 2
     assert list(report.not_covered) == [
-        f"plantf {LOOP}: scene s04_left_turn, which is not at hand",
+        f"{LOOP}: scene s04_left_turn, which is not at hand",
     ]
 
 

@@ -6,16 +6,12 @@ import numpy as np
 import places
 import pytest
 
-from shiftsim.verify.nets import verify_nets
-from shiftsim.verify.nets.common import Scenes
+from shiftsim.verify.nets import verify_nets, verify_part
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.learned, pytest.mark.golden, pytest.mark.slow]
-
-from shiftsim.verify.nets import pluto as nets_pluto  # noqa: E402
-from shiftsim.verify.nets import pluto_loops as nets_pluto_loops  # noqa: E402
-from shiftsim.verify.nets import pluto_network as nets_pluto_network  # noqa: E402
 
 GOLDEN = places.GOLDEN / "nets" / "pluto"
 LOOP, BRAKES = "closed_loop_s02_curve_objects_drive.npz", "closed_loop_s03_queue_start_drive.npz"
@@ -38,33 +34,9 @@ def scenes(nuplan_reference):
     return Scenes(nuplan_reference)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def networks_are_made_once():
-    made = {}
-    make = nets_pluto_network.make_network
-
-    def make_once(*key):
-        if repr(key) not in made:
-            made[repr(key)] = make(*key)
-        return made[repr(key)]
-
-    planner = nets_pluto_loops.Pluto
-
-    def fork_of(checkpoint):
-        if checkpoint not in made:
-            made[checkpoint] = planner(checkpoint)
-        return made[checkpoint].fork()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nets_pluto_network, "make_network", make_once)
-        patch.setattr(nets_pluto_loops, "make_network", make_once)
-        patch.setattr(nets_pluto_loops, "Pluto", fork_of)
-        yield
-
-
 def report_of(folder, scenes):
     report = Report()
-    nets_pluto.verify_pluto(folder, report, scenes)
+    verify_part("pluto", folder, report, scenes)
     return report
 
 
@@ -169,7 +141,7 @@ def test_another_choice_in_a_near_tie_is_listed(tmp_path, scenes):
     changes = {"out/best_index": chosen, "it00/post/rule": rule}
     report = report_of(folder_with(tmp_path, BRAKES, **changes), scenes)
     assert any("near-tie" in line for line in report.informative)
-    assert not any("best candidate" in line for line in report.mismatches)
+    assert not any("best proposal" in line for line in report.mismatches)
 
 
 @pytest.mark.thorough

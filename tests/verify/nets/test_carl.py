@@ -11,10 +11,11 @@ import pytest
 
 from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.verify import verify
-from shiftsim.verify.nets.carl import verify_carl
-from shiftsim.verify.nets.common import Scenes, open_loop
-from shiftsim.verify.nets.routes import verify_routes
+from shiftsim.verify.files import read_arrays
+from shiftsim.verify.nets import verify_part
+from shiftsim.verify.nets.loops import Loop
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.golden, pytest.mark.learned]
@@ -38,7 +39,7 @@ def compared(name, content, tmp_path, scenes, part="carl"):
     else:
         (folder / name).write_text(json.dumps(content))
     report = Report()
-    {"carl": verify_carl, "route_correction": verify_routes}[part](folder, report, scenes)
+    verify_part(part, folder, report, scenes)
     return report
 
 
@@ -65,17 +66,17 @@ def changed(array):
 
 def test_everything_is_equal(scenes):
     report = Report()
-    verify_carl(GOLDEN / "carl", report, scenes)
+    verify_part("carl", GOLDEN / "carl", report, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.quantities["carl picture boundaries"].cases == 60
     assert report.quantities["carl lane_connectors"].cases == 9
-    assert report.quantities["carl next state"].cases == 320
+    assert report.quantities["carl out.next_state"].cases == 320
 
 
 def test_every_route_is_corrected_alike(scenes):
     report = Report()
-    verify_routes(GOLDEN / "route_correction", report, scenes)
+    verify_part("route_correction", GOLDEN / "route_correction", report, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.quantities["corrected route footprint"].cases == 52
@@ -87,7 +88,7 @@ def test_without_the_scenes_loops_and_routes_are_not_covered(tmp_path):
         path.unlink()
     report = verify(tmp_path / "nets")
     assert report.mismatches == []
-    assert f"carl {LOOP}: scene s04_left_turn, which is not at hand" in report.not_covered
+    assert f"{LOOP}: scene s04_left_turn, which is not at hand" in report.not_covered
     assert f"{ROUTES}: scene s04_left_turn, which is not at hand" in report.not_covered
 
 
@@ -137,9 +138,9 @@ def test_a_changed_input_of_a_loop_is_a_mismatch(tmp_path, scenes):
     arrays["ego/current_time_us"][-1] += 1
     report = compared(LOOP, arrays, tmp_path, scenes)
     found = {quantity for quantity, _ in differing(report)}
-    assert found >= {f"carl scene {name}" for name in meta}
-    assert found >= {"carl source name", "carl source checksum", "carl time [us]"}
-    assert found >= {"carl logged ego", "carl driven ego"}
+    assert found >= {f"carl scene {name}" for name in (*meta, "source_files", "source_crc32")}
+    assert found >= {"carl current_time_us", "carl initial_history_time_us"}
+    assert found >= {"carl initial_history", "carl driven ego"}
 
 
 @pytest.mark.parametrize("name", ["out/alpha", "it07/bev_semantics", "ego/current", "meta/variant"])
@@ -153,7 +154,7 @@ def test_other_weights_and_a_failure_that_was_none_are_mismatches(tmp_path, scen
     arrays = arrays_of(LOOP)
     arrays["meta/error"] = np.array("KeyError: 3")
     report = compared(LOOP, arrays, tmp_path, scenes)
-    assert {quantity for quantity, _ in differing(report)} == {"carl fails"}
+    assert {quantity for quantity, _ in differing(report)} == {"carl failure"}
     arrays = arrays_of(LOOP)
     arrays["meta/variant"] = np.array("base")
     assert "carl action" in {q for q, _ in differing(compared(LOOP, arrays, tmp_path, scenes))}
@@ -168,7 +169,7 @@ def test_what_nothing_compares_is_named(tmp_path, scenes):
     report = compared(LOOP, arrays, tmp_path, scenes)
     stem = Path(LOOP).stem
     assert set(report.not_covered) == {
-        "file carl/novelty.bin",
+        "file novelty.bin",
         f"{stem}: array 'out/novelty'",
         f"{stem}: array 'it00/cache/novelty'",
     }
@@ -176,10 +177,10 @@ def test_what_nothing_compares_is_named(tmp_path, scenes):
 
 def test_pixels_may_differ_where_a_vertex_lies_on_their_border_and_are_listed(tmp_path, scenes):
     name = "closed_loop_s03_queue_start.npz"
-    loop = open_loop(GOLDEN / "carl" / name, Report(), scenes, "carl")
     planner = Carl("deterministic:drive")
-    planner.reset(loop.info)
-    seen = loop.observation(5)
+    loop = Loop(read_arrays(GOLDEN / "carl" / name, Report()), planner, scenes)
+    loop.step(5)
+    seen = loop.seen
     ego = seen.history.ego.copy()
     ego[-1, :2] += 5e-8  # m
     moved = replace(seen, history=replace(seen.history, ego=ego))
@@ -205,7 +206,7 @@ def test_a_changed_decoding_is_a_mismatch(tmp_path, scenes):
     assert cases == {f"action_decode {row}" for row in (3, 5, 7, 9)}
     arrays = arrays_of(name)
     arrays["meta"] = np.array(str(arrays["meta"]).replace("0.1", "0.2"))
-    assert differing(compared(name, arrays, tmp_path, scenes)) == {("carl step [s]", name)}
+    assert differing(compared(name, arrays, tmp_path, scenes)) == {("carl meta", name)}
 
 
 @pytest.mark.thorough
@@ -245,8 +246,11 @@ def test_a_changed_manifest_is_a_mismatch(tmp_path, scenes):
     found = differing(report)
     kinds = ("value", "shape", "dtype", "rule", "names")
     assert {q for q, _ in found} >= {f"carl state {kind}" for kind in kinds}
-    assert found >= {("carl manifest", key) for key in ("hyper", "parameters", "drive_overrides")}
-    assert ("carl selfcheck", "policy_head.0.weight") in found
+    assert found >= {
+        (f"carl manifest {key}", "state_dict.json")
+        for key in ("hyper", "parameters", "drive_overrides")
+    }
+    assert ("carl selfcheck first3_raw_z", "policy_head.0.weight") in found
 
 
 @pytest.mark.thorough
@@ -261,7 +265,9 @@ def test_a_changed_route_is_a_mismatch(tmp_path, scenes):
     content["cases"][6]["novelty"] = 1
     report = compared(ROUTES, content, tmp_path, scenes, "route_correction")
     found = [quantity for quantity, _ in differing(report)]
-    assert {"corrected route map", "corrected route input", "corrected route pose"} <= set(found)
+    assert {"corrected route map", "corrected route route", "corrected route rear_axle"} <= set(
+        found
+    )
     assert found.count("corrected route square_1m") == 2
     assert found.count("corrected route footprint") == 3
-    assert list(report.not_covered) == [f"{ROUTES}: field 'novelty' of a case"]
+    assert list(report.not_covered) == [f"{Path(ROUTES).stem} cases: field 'novelty'"]

@@ -7,14 +7,14 @@ import numpy as np
 import places
 import pytest
 
-from shiftsim.verify.nets import verify_nets
-from shiftsim.verify.nets.common import Scenes
+from shiftsim.verify.nets import verify_nets, verify_part
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.learned, pytest.mark.golden, pytest.mark.slow]
 
-from shiftsim.verify.nets import diffusion as nets_diffusion  # noqa: E402  # needs torch
+from shiftsim.planners.learned.diffusion.planner import INPUTS, DiffusionPlanner  # noqa: E402
 
 GOLDEN = places.GOLDEN / "nets" / "diffusion_planner"
 LOOP, FORWARD = "closed_loop_s01_lead_brakes.npz", "forward_empty.npz"
@@ -36,34 +36,28 @@ def scenes(nuplan_reference):
 
 @pytest.fixture(scope="module")
 def made():
-    """Networks, and their outputs by input."""
+    """Outputs of networks by input."""
     return {}
 
 
 @pytest.fixture
 def quick(monkeypatch, made):
-    """Networks are made once, and run once for the same input."""
-    make, infer = nets_diffusion.make_network, nets_diffusion._infer
+    """Networks run once for the same input."""
+    infer = DiffusionPlanner.infer
 
-    def make_once(*key):
-        if repr(key) not in made:
-            made[repr(key)] = make(*key)
-        return made[repr(key)]
-
-    def infer_once(network, features):
-        parts = [getattr(features, name) for name in (*nets_diffusion.INPUTS, "noise")]
-        key = (id(network), b"".join(part.tobytes() for part in parts))
+    def infer_once(planner, features):
+        parts = [getattr(features[0], name) for name in (*INPUTS, "noise")]
+        key = (id(planner._network), b"".join(part.tobytes() for part in parts))
         if key not in made:
-            made[key] = infer(network, features)
+            made[key] = infer(planner, features)
         return made[key]
 
-    monkeypatch.setattr(nets_diffusion, "make_network", make_once)
-    monkeypatch.setattr(nets_diffusion, "_infer", infer_once)
+    monkeypatch.setattr(DiffusionPlanner, "infer", infer_once)
 
 
 def report_of(folder, scenes):
     report = Report()
-    nets_diffusion.verify_diffusion(folder, report, scenes)
+    verify_part("diffusion_planner", folder, report, scenes)
     return report
 
 
