@@ -17,7 +17,7 @@ from shiftsim.planners.pdm.rollout import follow_many
 from shiftsim.planners.pdm.route import search_lanes
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort, make_filters
 from shiftsim.planners.proposals.tracker import simulate_proposals
-from shiftsim.planners.route_correction import search
+from shiftsim.planners.routes.correction import search
 from shiftsim.sim.dynamics.lqr import NUPLAN
 from shiftsim.verify.files import TOLERANCE, Source, read_arrays, read_json, verify_files
 from shiftsim.verify.pdm.steps import verify_step, verify_summary
