@@ -31,7 +31,7 @@ from shiftsim.planners.learned.carl.view import (
 )
 from shiftsim.planners.learned.checkpoint import load_weights, split_ensemble
 from shiftsim.planners.learned.features import PerMap
-from shiftsim.planners.route_correction import correct_route, find_start
+from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import (

@@ -34,7 +34,7 @@ from shiftsim.planners.learned.diffusion.kernels import (
     nearest_lanes,
     resample_lanes,
 )
-from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
