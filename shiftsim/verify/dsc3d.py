@@ -338,8 +338,8 @@ def _verify_scenarios(
         given = repr([tuple(lane) for lane in lanes.pop(key, ())])
         ways = [repr([tuple(lane) for lane in way]) for way in local.sequences(centers[first:, :2])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
-    for key in lanes:
-        report.fail("lanes", f"{folder.name} window {key[0]} track {key[1]}", "no such scenario")
+    for rest in lanes:
+        report.fail("lanes", f"{folder.name} window {rest[0]} track {rest[1]}", "no such scenario")
     poses.finish()
 
 

@@ -12,7 +12,8 @@ from shiftsim.planners.learned.features import EGO_LENGTH, EGO_WIDTH, SAMPLES, A
 from shiftsim.planners.learned.map_features import RoadFeatures
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.learned.plan_states import STEP
-from shiftsim.planners.learned.pluto.proposals import STEPS, headings_of
+from shiftsim.planners.learned.pluto.proposals import headings_of
+from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.files import Source, read_arrays
 from shiftsim.verify.nets.loops import Loop
 from shiftsim.verify.nets.networks import (
