@@ -71,12 +71,7 @@ _OTHER_ARGS = {  # of training, or fixed by the features
     "device": "cpu",
 }
 _TRACK_COLUMNS = ["track", "vx", "vy", "heading", "width", "length", "x", "y"]
-_STATIC = (
-    AgentKind.CZONE_SIGN,
-    AgentKind.BARRIER,
-    AgentKind.TRAFFIC_CONE,
-    AgentKind.GENERIC_OBJECT,
-)
+_STATIC = ("CZONE_SIGN", "BARRIER", "TRAFFIC_CONE", "GENERIC_OBJECT")
 
 
 def start_noise(key: str) -> np.ndarray:
@@ -229,19 +224,17 @@ def _compare(loop: Loop) -> None:
     if not list(loop.stored):
         return
     features, road, tokens = loop.features, loop.scenario.map, loop.scenario.tracks.tokens
-    loop.match(
-        {
-            "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
-            "agent_tokens": [tokens[track] for track in features.agents.tolist()],
-            "corrected_route_ids": [road.blocks.ids[block] for block in features.route or ()],
-        }
-    )
-    route = [f"route_lanes_{name}" for name in ("speed_limit", "has_speed_limit")]
-    read = {f"feature/{name}": getattr(features, name) for name in (*INPUTS, *route)}
-    loop.match(read, FEATURE)
-    loop.match({"prediction": loop.output}, bound)
+    names = (*INPUTS, "route_lanes_speed_limit", "route_lanes_has_speed_limit")
+    ours = {
+        "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
+        "agent_tokens": [tokens[track] for track in features.agents.tolist()],
+        "corrected_route_ids": [road.blocks.ids[block] for block in features.route or ()],
+        "prediction": loop.output,
+        **{f"feature/{name}": getattr(features, name) for name in names},
+    }
     if "encoding" in loop.stored:
-        loop.match({"encoding": _encoding(loop.variant, features)}, NETWORK)
+        ours["encoding"] = _encoding(loop.variant, features)
+    loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
 
 
 def _encoding(variant: str, features: Features) -> Any:
@@ -274,7 +267,9 @@ def _tracks(file: Source) -> Tracks:
             if kinds.setdefault(int(track), kind) != kind:
                 raise DataError("a track changes its type")
     static = file.take("in.static", -1, 5)
-    static_kinds = [_STATIC[kind] for kind in file.take("in.static_type", len(static)).tolist()]
+    static_kinds = [
+        AgentKind[_STATIC[kind]] for kind in file.take("in.static_type", len(static)).tolist()
+    ]
     column = {track: index for index, track in enumerate(kinds)}
     shape = (len(frames), len(column) + len(static))
     values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)

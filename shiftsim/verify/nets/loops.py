@@ -14,7 +14,6 @@ import numpy as np
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.observation import HISTORY_SAMPLES, observe_log, past_rows, scene_info
-from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
@@ -49,12 +48,6 @@ class Loop:
         output: What its network said of them.
         plan: What it made of that.
     """
-
-    stored: Source
-    seen: Observation
-    features: Any
-    output: Any
-    plan: Any
 
     def __init__(self, file: Source, planner: Any, scenes: Scenes) -> None:
         self.file, self.planner, self.name = file, planner, planner.name

@@ -61,6 +61,7 @@ INPUTS = {  # field of the networks' inputs → array of the files
     "line_orientations": "reference_line.orientation",
     "line_valid": "reference_line.valid_mask",
 }
+OF_MAP = tuple(n for n in RoadFeatures._fields if INPUTS.get(n, "").startswith("map."))
 CODES = {  # integers, stored as floats
     *(INPUTS[name] for name in ("category", "kind", "on_route", "light", "object_category")),
     "map.polygon_road_block_id",
@@ -93,31 +94,22 @@ def compare_features(
         "angle": ego[2],
         "agent.valid_mask": agents.valid,
         "agent.target": np.zeros((len(agents.valid), 0, 3)),
-        "map.point_position": road.points,
-        "map.point_vector": road.vectors,
-        "map.point_orientation": road.orientations,
         "map.point_side": np.tile(np.arange(3), (len(road.kind), 1)),
-        "map.polygon_center": road.centers,
         "map.polygon_position": road.points[:, 0, 0],
         "map.polygon_orientation": road.orientations[:, 0, 0],
-        "map.polygon_type": road.kind,
-        "map.polygon_on_route": road.on_route,
-        "map.polygon_tl_status": road.light,
-        "map.polygon_has_speed_limit": road.has_limit,
-        "map.polygon_speed_limit": road.limit,
         "map.valid_mask": road.valid,
+        **{INPUTS[name]: getattr(road, name) for name in OF_MAP},
         **others,
     }
     stored = loop.stored.below("feature/")
     stored.match(loop.where, features, FEATURE, quantity=loop.name)
-    loop.match(
-        {
-            "agent_tokens": ["ego", *(scenario.tracks.tokens[i] for i in agents.tracks.tolist())],
-            "map_ids": [ids[row] for row in road.objects.tolist()],
-            "map_layers": LAYERS[road.kind],
-            "corrected_route_ids": [scenario.map.blocks.ids[block] for block in route],
-        }
-    )
+    names = {
+        "agent_tokens": ["ego", *(scenario.tracks.tokens[i] for i in agents.tracks.tolist())],
+        "map_ids": [ids[row] for row in road.objects.tolist()],
+        "map_layers": LAYERS[road.kind],
+        "corrected_route_ids": [scenario.map.blocks.ids[block] for block in route],
+    }
+    loop.match(names)
     # samples that are absent hold the origin of the map, seen from the ego
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
@@ -187,15 +179,13 @@ def compare_outputs(
 ) -> None:
     """Compare outputs, raw and derived, by name; headings of poses agree up to whole turns."""
     for name, value in ours.items():
-        label = f"{planner} {name} ({variant})"
         atol = OUTPUT["base" if name in UNSCALED.get(planner, ()) else variant]
-        theirs, others = stored[name], [i for i in range(value.shape[-1]) if i != 2]
-        if not name.startswith(("output_", "candidate_")):
-            stored.report.compare(label, where, value, theirs, atol=atol)
-            continue
-        stored.report.compare(label, where, value[..., others], theirs[..., others], atol=atol)
-        ours, theirs, label = value[..., 2], theirs[..., 2], f"{planner} {name} heading"
-        stored.report.compare(label, where, ours, theirs, atol=DERIVED_HEADING, angle=True)
+        theirs, compare = stored[name], stored.report.compare
+        if name.startswith(("output_", "candidate_")):
+            headings, label = (value[..., 2], theirs[..., 2]), f"{planner} {name} heading"
+            compare(label, where, *headings, atol=DERIVED_HEADING, angle=True)
+            value, theirs = (np.delete(poses, 2, axis=-1) for poses in (value, theirs))
+        compare(f"{planner} {name} ({variant})", where, value, theirs, atol=atol)
 
 
 def verify_forward(file: Source, scenes: Scenes, planner: str, radius: float, **args: Any) -> None:
