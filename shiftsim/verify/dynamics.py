@@ -6,7 +6,6 @@ One function per file of the folder, in the table `CHECKS`. Most arrays have a r
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from shiftsim.sim.noise import NOISE_NAMES, noise_from_normals, parse_noise
 from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, verify_files
 from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report
+from shiftsim.verify.worlds import ego_states
 from shiftsim.world import state
 from shiftsim.world.state import NUM_STATE, PACIFICA
 
@@ -55,35 +55,20 @@ NAMES = {  # of columns, by the array that lists them
 }
 
 
-class Check(NamedTuple):
-    """How one file is compared.
-
-    Attributes:
-        compare: Compares everything but the names of columns.
-        names: Arrays that name columns, of `NAMES`.
-        labels: Arrays that need not be compared.
-        unread: What else our code does not read.
-    """
-
-    compare: Callable[[Source], None]
-    names: str
-    labels: str
-    unread: str
-
-
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    parts = {f"{stem}.npz": partial(_verify_file, report, check) for stem, check in CHECKS.items()}
+    parts = {f"{stem}.npz": partial(_verify_file, report, *check) for stem, check in CHECKS.items()}
     worlds = {"idm_world_*": partial(verify_idm_world, report=report)}
     verify_files(folder, report, {**parts, **worlds, "meta.json": None})
 
 
-def _verify_file(report: Report, check: Check, path: Path) -> None:
+def _verify_file(
+    report: Report, compare: Callable[[Source], None], lists: str, labels: str, path: Path
+) -> None:
     file = read_arrays(path, report)
-    file.note("label", *check.labels.split())
-    file.note(f"{check.unread}: not read")
-    check.compare(file)
-    names, count = check.names.split(), len(file["case"])
+    file.note("label", *labels.split())
+    compare(file)
+    names, count = lists.split(), len(file["case"])
     file.match("file", {name: NAMES[name] for name in names})
     ragged = tuple(name.removesuffix("ptr") for name in file if name.endswith("_ptr"))
     for name, array in file.values.items():
@@ -124,14 +109,6 @@ def _centers(states: FloatArray) -> FloatArray:
     )
 
 
-def _states(columns: dict[int, FloatArray]) -> FloatArray:
-    """(R, 11) states of which some columns are given, the others 0."""
-    out = np.zeros((len(next(iter(columns.values()))), NUM_STATE))
-    for index, column in columns.items():
-        out[:, index] = column
-    return out
-
-
 def _bicycle(file: Source) -> None:
     """Steps and rollouts; a step is a rollout without an axis of time."""
     states = file.take("in_state", -1, NUM_STATE)
@@ -153,7 +130,7 @@ def _bicycle(file: Source) -> None:
 
 def _lqr_commands(file: Source) -> None:
     stamps, states = file.take("traj_time_us", -1), file["ego_state"]
-    plans = _states({i: file.take(f"traj_{n}", len(stamps)) for i, n in enumerate(_POSE)})
+    plans = ego_states({name: file[f"traj_{name}"] for name in _POSE})
     cases = zip(_cases(file, "traj"), _cases(file, "profile"), strict=True)
     tracked = []
     for case, (plan, profile) in enumerate(cases):
@@ -164,27 +141,20 @@ def _lqr_commands(file: Source) -> None:
         _, accel, rate = lqr.track(now, states[case], time_us, poses, lqr.NUPLAN)
         speed, curvature = lqr.fit_profiles(time_us, poses, lqr.NUPLAN)
         initial = states[case, state.VX]
-        tracked.append(
-            {
-                "lat_error": ref.lateral_error,
-                "heading_error": ref.heading_error,
-                "v0": initial,
-                "v_ref": ref.speed,
-                "kappa_ref": ref.curvature,
-                "stop_mode": lqr.is_stopping(initial, ref.speed, lqr.NUPLAN),
-                "accel_cmd": accel,
-                "steer_rate_cmd": rate,
-                "ego_time_us": now,
-            }
-        )
+        stops = lqr.is_stopping(initial, ref.speed, lqr.NUPLAN)
+        errors = ref.lateral_error, ref.heading_error
+        tracked.append((*errors, initial, ref.speed, ref.curvature, stops, accel, rate, now))
         ours = {
             "profile_time_s": (time_us[0] + np.arange(len(speed)) * lqr.NUPLAN.step_us) / 1e6,
             "profile_speed": speed,
             "profile_curvature": curvature,
         }
         file.at(profile).match(f"case {case}", ours, TOLERANCES)
-    columns = {name: [row[name] for row in tracked] for name in tracked[0]}
-    file.match_rows(columns, TOLERANCES)
+    names = (
+        *("lat_error", "heading_error", "v0", "v_ref", "kappa_ref", "stop_mode"),
+        *("accel_cmd", "steer_rate_cmd", "ego_time_us"),
+    )
+    file.match_rows(dict(zip(names, zip(*tracked, strict=True), strict=True)), TOLERANCES)
 
 
 def _closed_loop(file: Source) -> None:
@@ -200,12 +170,8 @@ def _closed_loop_noise(file: Source) -> None:
     names = [f"{pair[0]}-{pair[1]}" for pair in zip(file["process"], file["level"], strict=True)]
     if unknown := set(names) - set(NOISE_NAMES):
         raise DataError(f"unknown noise {unknown}")
-    noise = np.array(
-        [
-            noise_from_normals(parse_noise(name), normals)
-            for name, normals in zip(names, file["eps"], strict=True)
-        ]
-    )
+    pairs = zip(names, file["eps"], strict=True)
+    noise = [noise_from_normals(parse_noise(name), normals) for name, normals in pairs]
     ours = {"noise": noise, "cmd_applied": file["cmd"] + file["noise"]}
     file.match_rows(ours, TOLERANCES)
     _drive_loops(file, [False] * len(names), np.ascontiguousarray(file["noise"]))
@@ -221,7 +187,7 @@ def _drive_loops(file: Source, whole_plan: list[bool], noise: FloatArray) -> Non
     for case, whole in enumerate(whole_plan):
         _check_stamps(ref_time[case])
         _check_stamps(iter_time[case])
-        plan = _states(dict(enumerate(references[case].T)))
+        plan = ego_states(dict(zip(_POSE, references[case].T, strict=True)))
         window = len(plan) if whole else WINDOW_KNOTS
         driven = np.empty(states[case].shape)
         driven[0] = states[case, 0]
@@ -256,7 +222,7 @@ def _trajectory_interpolation(file: Source) -> None:
     file.match_rows({"query_out_state": out, "query_out_time_us": queries}, TOLERANCES)
 
 
-def _ego_state_frames(file: Source) -> None:
+def _ego_frames(file: Source) -> None:
     states = file.take("rear_state", -1, NUM_STATE)
     size = np.broadcast_to([PACIFICA.length, PACIFICA.width], (len(states), 2))
     corners = boxes_to_corners(state.center_poses(states[:, :3]), np.ascontiguousarray(size))
@@ -273,17 +239,9 @@ def _ego_state_frames(file: Source) -> None:
 
 
 def _comfort_signals(file: Source) -> None:
-    columns = {
-        state.HEADING: "heading",
-        state.VX: "vx",
-        state.AX: "ax",
-        state.AY: "ay",
-        state.YAW_RATE: "omega",
-        state.YAW_ACCEL: "alpha",
-    }
     stamps = file.take("sig_in_time_us", -1)
-    given = {index: file.take(f"sig_in_{n}", len(stamps)) for index, n in columns.items()}
-    states = _states(given)
+    names = ("heading", "vx", "ax", "ay", "omega", "alpha")
+    states = ego_states({name: file[f"sig_in_{name}"] for name in names})
     profiles = {"within_default": PROFILES["nuplan"], "within_deepplan": PROFILES["deepplan"]}
     flags: dict[str, list[list[bool]]] = {name: [] for name in profiles}
     for case, rows in enumerate(_cases(file, "sig")):
@@ -311,50 +269,16 @@ def _idm_steps(file: Source) -> None:
     file.match_rows({"accel_unclipped": accelerations, "forward_euler": after}, TOLERANCES)
 
 
-CHECKS = {
-    "bicycle_rollouts": Check(
-        _bicycle, "state_columns", "case", "in_state vy, ay, steer_rate, alpha"
-    ),
-    "bicycle_steps": Check(
-        _bicycle,
-        "state_columns centre_columns",
-        "case kind",
-        "in_state vy, ay, steer_rate, alpha",
-    ),
-    "closed_loop": Check(
-        _closed_loop,
-        "state_columns centre_columns",
-        "case shape",
-        "ref_pose behind the last window",
-    ),
-    "closed_loop_noise": Check(
-        _closed_loop_noise,
-        "state_columns centre_columns",
-        "case shape",
-        "ref_pose behind the last window",
-    ),
-    "comfort_signals": Check(
-        _comfort_signals, "flag_columns", "case sig_in_vx", "sig_in_time_us but for its mean step"
-    ),
-    "ego_state_frames": Check(
-        _ego_state_frames,
-        "state_columns centre_columns corner_order from_centre_columns",
-        "case",
-        "rear_state steer, steer_rate",
-    ),
-    "idm_steps": Check(  # odeint, rk45: integrators that no configuration uses
-        _idm_steps,
-        "param_columns agent_columns lead_columns",
-        "case odeint rk45",
-        "lead progress, length_rear where the gap is below min_gap",
-    ),
-    "lqr_commands": Check(
-        _lqr_commands,
-        "state_columns",
-        "case kind",
-        "ego_state vy, ax, ay, steer_rate, omega, alpha",
-    ),
-    "trajectory_interpolation": Check(
-        _trajectory_interpolation, "state_columns", "case", "knot_state steer_rate, omega, alpha"
-    ),
+_EGO = "state_columns centre_columns"
+_IDM = "param_columns agent_columns lead_columns"
+CHECKS = {  # file: what compares it, arrays that list `NAMES`, labels and what nothing uses
+    "bicycle_rollouts": (_bicycle, "state_columns", "case"),
+    "bicycle_steps": (_bicycle, _EGO, "case kind"),
+    "closed_loop": (_closed_loop, _EGO, "case shape"),
+    "closed_loop_noise": (_closed_loop_noise, _EGO, "case shape"),
+    "comfort_signals": (_comfort_signals, "flag_columns", "case sig_in_vx"),
+    "ego_state_frames": (_ego_frames, f"{_EGO} corner_order from_centre_columns", "case"),
+    "idm_steps": (_idm_steps, _IDM, "case odeint rk45"),
+    "lqr_commands": (_lqr_commands, "state_columns", "case kind"),
+    "trajectory_interpolation": (_trajectory_interpolation, "state_columns", "case"),
 }

@@ -221,6 +221,9 @@ class Groups:
     def __iter__(self) -> Iterator[tuple[str, ...]]:
         return iter(self._groups)
 
+    def __len__(self) -> int:
+        return len(self._groups)
+
     def get(self, *key: str) -> Source | None:
         """The rows of a key, if there are any."""
         self._asked.add(key)

@@ -64,44 +64,47 @@ def layer_of(road: VectorMap, name: str) -> tuple[Layer, range]:
 
 def verify_maps(expected: Path, maps: dict[str, VectorMap], report: Report) -> None:
     """Compare map_objects, map_lines and map_queries with maps by name."""
-    objects, lines, queries = (
-        Groups(expected / f"map_{name}.parquet", report, key)
-        for name, key in (
-            ("objects", ("map", "layer")),
-            ("lines", ("map", "layer", "id", "line")),
-            ("queries", ("map",)),
-        )
-    )
-    for name, road in maps.items():
-        for layer in _LAYERS:
-            _compare_layer(road, layer, f"{name}: {layer}", objects.get(name, layer), report)
-        for edge, edge_id in enumerate(road.edges.ids):
-            layer = "LANE" if edge < road.num_lanes else "LANE_CONNECTOR"
-            for line, attribute in _LINES.items():
-                key = (name, layer, edge_id, line)
-                with report.attempt("map_lines", " ".join(key)):
-                    xy = getattr(road, attribute).at(edge)
-                    columns = zip(_LINE, (*xy.T, _headings(xy)), strict=True)
-                    ours = {"index": np.arange(len(xy)), **dict(columns)}
-                    lines[key].match(" ".join(key), ours, _LINE)
-        rows = queries.get(name)
-        if rows is None:
-            report.skip(f"map_queries: no row of map {name}")
-            continue
-        answers = [_answer(road, x, y) for x, y in zip(rows["x"], rows["y"], strict=True)]
-        ours = {column: [answer[column] for answer in answers] for column in answers[0]}
-        rows.match(name, ours, _QUERY)
-    for table in (objects, lines, queries):
+    for name, key, compare in (
+        ("objects", ("map", "layer"), _compare_layers),
+        ("lines", ("map", "id", "line"), _compare_lines),
+        ("queries", ("map",), _compare_queries),
+    ):
+        table = Groups(expected / f"map_{name}.parquet", report, key)
+        for city, road in maps.items() if len(table) else ():
+            with report.attempt(f"map_{name}", city):
+                compare(road, city, table)
         table.finish()
 
 
-def _compare_layer(
-    road: VectorMap, name: str, where: str, rows: Source | None, report: Report
-) -> None:
-    layer, part = layer_of(road, name)
-    if rows is None:
-        report.compare("map_objects", f"{where}: number", len(part), 0)
-        return
+def _compare_layers(road: VectorMap, city: str, objects: Groups) -> None:
+    for name in _LAYERS:
+        rows = objects.get(city, name)
+        if rows is None:
+            count, report = len(layer_of(road, name)[1]), objects.table.report
+            report.compare("map_objects rows", f"{city} {name}", count, 0)
+        else:
+            _compare_layer(road, name, f"{city} {name}", rows)
+
+
+def _compare_lines(road: VectorMap, city: str, lines: Groups) -> None:
+    for edge, edge_id in enumerate(road.edges.ids):
+        layer = "LANE" if edge < road.num_lanes else "LANE_CONNECTOR"
+        for line, attribute in _LINES.items():
+            xy = getattr(road, attribute).at(edge)
+            columns = zip(_LINE, (*xy.T, _headings(xy)), strict=True)
+            ours = {"layer": [layer] * len(xy), "index": np.arange(len(xy)), **dict(columns)}
+            lines.match((city, edge_id, line), ours, _LINE)
+
+
+def _compare_queries(road: VectorMap, city: str, queries: Groups) -> None:
+    rows = queries[city,]
+    answers = [_answer(road, x, y) for x, y in zip(rows["x"], rows["y"], strict=True)]
+    ours = {column: [answer[column] for answer in answers] for column in answers[0]}
+    rows.match(city, ours, _QUERY)
+
+
+def _compare_layer(road: VectorMap, name: str, where: str, rows: Source) -> None:
+    (layer, part), report = layer_of(road, name), rows.report
     # rows may come in another order than in the map; nothing reads the order of this table
     rows = rows.at(np.argsort(rows["id"].astype(str), kind="stable"))
     ours = sorted(part, key=lambda index: layer.ids[index])

@@ -23,7 +23,7 @@ from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS, ego_states
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Trajectory, center_poses
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, Trajectory, center_poses
 
 EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
 # m, rad, m/s; the README of the folder allows 1e-3 m
@@ -162,21 +162,24 @@ def verify_planners(
             continue
         with report.attempt("plan", " ".join(key)):
             ego = egos[key]
-            seen = Seen(scenes[scene], ego, objects.get(*key) if challenge == "R" else None)
+            seen = Seen(scenes[scene], ego, objects.get(*key), challenge)
             _plan_again(" ".join(key), load_planner(spec), seen, plans[key])
     plans.finish(mode)
 
 
 class Seen:
-    """What a planner saw in a recorded run, from its ego states and its own objects, if any.
+    """What a planner saw in a recorded run, from its ego states and its own objects.
 
-    Without these a run shows the objects of the log.
+    A run that is not reactive shows the objects of the log.
     """
 
-    def __init__(self, scenario: Scenario, ego: Source, objects: Source | None) -> None:
+    def __init__(self, scenario: Scenario, ego: Source, objects: Source | None, challenge: str):
         self.scenario = scenario
         self.ego = ego_states({name: ego[name] for name in EGO_COLUMNS})
-        self._tracks = None if objects is None else tracks_of(objects, len(self.ego))
+        self._tracks = None
+        if challenge == "R":
+            count = len(self.ego)
+            self._tracks = Tracks.empty(count) if objects is None else tracks_of(objects, count)
 
     def at(self, iteration: int) -> Observation:
         """The present alone; the rule-based planners look at nothing else."""
