@@ -1,16 +1,15 @@
 """Networks with deterministic weights, and the manifests that say how they are made."""
 
+import json
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import DataError
 from shiftsim.planners.learned.checkpoint import load_weights
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
-from shiftsim.verify.files import read_fields
-from shiftsim.verify.report import Report
+from shiftsim.verify.files import Source
 
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
 OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale up, by variant
@@ -37,23 +36,27 @@ def num_elements(tensors: Any) -> int:
     return sum(int(tensor.numel()) for tensor in tensors)
 
 
-def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[str, Any]) -> None:
+def match_meta(file: Source, planner: str, ours: Mapping[str, object]) -> None:
+    """Compare the JSON text in the array `meta`."""
+    file.report.compare(f"{planner} meta", file.name, ours, json.loads(str(file["meta"])))
+
+
+def verify_manifest(manifest: Source, planner: str, others: Mapping[str, Any]) -> None:
     """Compare the manifest of a network: names, shapes, types, rules and weights.
 
     Args:
-        path: The file `state_dict.json`.
-        report: Receives the comparisons.
+        manifest: The file `state_dict.json`.
         planner: Name of the planner.
         others: Further fields: our value, a function that makes it from theirs, or None for a text
             that need not be compared.
     """
-    manifest, module = read_fields(path, report), network_module(planner)
+    report, module = manifest.report, network_module(planner)
     network = module.build_network(None)
     built = {name: value.detach().numpy() for name, value in network.state_dict().items()}
     rules = getattr(module, "RULES", None) or {}
     entries = manifest.each("keys" if "keys" in manifest else "entries")
     names = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
-    report.compare(f"{planner} state names", path.name, sorted(built), sorted(names))
+    report.compare(f"{planner} state names", manifest.name, sorted(built), sorted(names))
     parameters = {name for name, _ in network.named_parameters()}
     for name, entry in zip(names, entries, strict=True):
         if name not in built:
@@ -85,6 +88,5 @@ def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[st
             manifest.note("description", name)
         else:
             value = ours(manifest[name]) if callable(ours) else ours
-            manifest.match(path.name, {name: value}, quantity=f"{planner} manifest")
+            manifest.match(manifest.name, {name: value}, quantity=f"{planner} manifest")
     manifest.used.add("planner")
-    manifest.finish()
