@@ -15,14 +15,15 @@ from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.carl.raster import Raster
-from shiftsim.planners.learned.carl.roads import Roads, make_roads
+from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.carl.view import (
     CHANNELS,
+    EGO,
     LIGHT_VALUES,
     SIZE,
     Boxes,
     Scratch,
-    draw_ego,
+    draw_box,
     draw_objects,
     draw_roads,
     find_areas,
@@ -121,9 +122,9 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         lights = LIGHT_VALUES[status]
         draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, lights)
         draw_objects(self._pictures, frame, _boxes(observation), scratch)
-        speed = float(np.hypot(velocity[0], velocity[1]))
-        length, width = scene.vehicle.length, scene.vehicle.width
-        draw_ego(self._pictures, frame, center, length, width, speed, scratch)
+        value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
+        size = np.array([scene.vehicle.length, scene.vehicle.width])
+        draw_box(self._pictures[EGO], frame, center, size, value, scratch)
         return CarlFeatures(
             self._pictures,
             np.concatenate(

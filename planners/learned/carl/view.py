@@ -241,8 +241,8 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
     for is_static in (False, True):
         for index in range(len(boxes.kinds)):
             kind = boxes.kinds[index]
-            x, y, heading = boxes.poses[index, 0], boxes.poses[index, 1], boxes.poses[index, 2]
-            if (kind > _LAST_AGENT) != is_static or not in_picture(frame, x, y):
+            pose = boxes.poses[index]
+            if (kind > _LAST_AGENT) != is_static or not in_picture(frame, pose[0], pose[1]):
                 continue
             speed = np.hypot(boxes.velocities[index, 0], boxes.velocities[index, 1])
             channel, value = VEHICLES, level(speed, MAX_SPEED)
@@ -250,39 +250,21 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
                 channel, value = PEDESTRIANS, STANDING
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
-            length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
-            _draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
+            draw_box(rasters[channel], frame, pose, boxes.sizes[index], value, scratch)
 
 
 @kernel
-def draw_ego(
-    rasters: Raster,
-    frame: FloatArray,
-    center: FloatArray,
-    length: float,
-    width: float,
-    speed: float,
-    scratch: Scratch,
-) -> None:
-    """Draw the ego; `center` is (3,), `speed` that of its centre."""
-    value = level(speed, MAX_SPEED)
-    _draw_box(rasters[EGO], frame, center[0], center[1], center[2], length, width, value, scratch)
-
-
-@kernel
-def _draw_box(
+def draw_box(
     raster: Raster,
     frame: FloatArray,
-    x: float,
-    y: float,
-    heading: float,
-    length: float,
-    width: float,
+    pose: FloatArray,
+    size: FloatArray,
     value: int,
     scratch: Scratch,
 ) -> None:
+    """Draw a box of pose (3,) x, y [m], heading [rad], and size (2,) length, width [m]."""
     corners, pixels = np.empty((4, 2)), scratch.ring[:4]
-    box_corners(x, y, heading, length, width, corners)
+    box_corners(pose[0], pose[1], pose[2], size[0], size[1], corners)
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
