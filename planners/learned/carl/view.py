@@ -19,7 +19,7 @@ from shiftsim.planners.learned.carl.raster import (
     fill_box,
     make_crossings,
 )
-from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, Values, level
+from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
@@ -148,7 +148,7 @@ def draw_roads(
     frame: FloatArray,
     found: IntArray,
     on_route: BoolArray,
-    lights: Values,
+    lights: IntArray,
 ) -> None:
     """Draw what the map has, and the lights.
 
@@ -159,7 +159,7 @@ def draw_roads(
         frame: (4,) of the raster.
         found: Areas in it.
         on_route: (B,) blocks of the route.
-        lights: (E,) value of the light of every connector, 0 where it has none.
+        lights: (E,) LightStatus by edge, ABSENT where there is none.
     """
     scratch.filled[:] = False
     scratch.drawn[:] = False
@@ -179,7 +179,8 @@ def draw_roads(
                 continue
             for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
                 edge = roads.block_edges.items[entry]
-                _draw_edge(rasters, roads, scratch, frame, edge, lights[edge] if connectors else 0)
+                light = LIGHT_VALUES[lights[edge]] if connectors else 0
+                _draw_edge(rasters, roads, scratch, frame, edge, light)
 
 
 @kernel
@@ -241,8 +242,8 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
     for is_static in (False, True):
         for index in range(len(boxes.kinds)):
             kind = boxes.kinds[index]
-            pose = boxes.poses[index]
-            if (kind > _LAST_AGENT) != is_static or not in_picture(frame, pose[0], pose[1]):
+            x, y, heading = boxes.poses[index, 0], boxes.poses[index, 1], boxes.poses[index, 2]
+            if (kind > _LAST_AGENT) != is_static or not in_picture(frame, x, y):
                 continue
             speed = np.hypot(boxes.velocities[index, 0], boxes.velocities[index, 1])
             channel, value = VEHICLES, level(speed, MAX_SPEED)
@@ -250,21 +251,25 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
                 channel, value = PEDESTRIANS, STANDING
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
-            draw_box(rasters[channel], frame, pose, boxes.sizes[index], value, scratch)
+            length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
+            draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
 
 
 @kernel
 def draw_box(
     raster: Raster,
     frame: FloatArray,
-    pose: FloatArray,
-    size: FloatArray,
+    x: float,
+    y: float,
+    heading: float,
+    length: float,
+    width: float,
     value: int,
     scratch: Scratch,
 ) -> None:
-    """Draw a box of pose (3,) x, y [m], heading [rad], and size (2,) length, width [m]."""
+    """Draw a box."""
     corners, pixels = np.empty((4, 2)), scratch.ring[:4]
-    box_corners(pose[0], pose[1], pose[2], size[0], size[1], corners)
+    box_corners(x, y, heading, length, width, corners)
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
