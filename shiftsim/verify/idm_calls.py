@@ -82,7 +82,7 @@ def _verify_call(
     route_plan, road, made = planner.route_plan, scenario.map, planner.path
     assert route_plan is not None
     assert made is not None
-    edges = [road.edges.ids[edge] for edge in route_plan.edges]
+    edges = [road.edges.ids[edge] for edge in route_plan.path]
     report.compare("IDM path edges", where, edges, call["edges"])
     report.compare("IDM path found", where, route_plan.found, call["path_found"])
     report.compare(
@@ -92,8 +92,8 @@ def _verify_call(
         call["target_velocity"],
         atol=TOLERANCE,
     )
-    report.compare("IDM path points", where, len(made.progress), call["path_points"])
-    end = [made.end, *made.xy[-1].tolist(), float(made.heading[-1])]
+    report.compare("IDM path points", where, len(made.driven.progress), call["path_points"])
+    end = [made.end, *made.driven.xy[-1].tolist(), float(made.driven.heading[-1])]
     end[3] = (end[3] + np.pi) % (2.0 * np.pi) - np.pi
     report.compare("IDM path end", where, end, call["path_end"], atol=TOLERANCE)
     report.compare(

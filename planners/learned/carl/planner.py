@@ -33,7 +33,7 @@ from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import PerMap, route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
-from shiftsim.planners.route_correction import correct_route, find_start
+from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import (

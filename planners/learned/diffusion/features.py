@@ -37,7 +37,7 @@ from shiftsim.planners.learned.diffusion.kernels import (
 )
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
-from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap

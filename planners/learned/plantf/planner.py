@@ -26,7 +26,7 @@ from shiftsim.planners.learned.features import (
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
-from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import History, Observation, SceneInfo
 from shiftsim.world.state import AX, HEADING, PACIFICA, VX, Trajectory, center_poses
 

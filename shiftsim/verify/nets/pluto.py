@@ -9,7 +9,7 @@ from shiftsim.planners.learned.features import SAMPLES
 from shiftsim.planners.learned.plan_states import STEP
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS
-from shiftsim.planners.learned.pluto.proposals import STEPS
+from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.array_file import ArrayFile
 from shiftsim.verify.nets.common import ERRORS, FILE_COLUMNS, STATE, Scenes, verify_state_dict
 from shiftsim.verify.nets.pluto_loops import verify_loop

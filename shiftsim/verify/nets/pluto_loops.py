@@ -148,7 +148,7 @@ def _compare_from_stored(loop: Loop, at: str, planner: Pluto, seen: Observation)
     poses, speeds = file[f"{at}/agents_pred"], file[f"{at}/agents_vel"]
     if poses.shape != choice.agents[0].shape or speeds.shape != choice.agents[1].shape:
         return  # named as a mismatch before
-    world = planner.world_of(seen, (poses, speeds))
+    world = planner.world_of(seen, choice.agents._replace(poses=poses, speeds=speeds))
     place = Place(sight.drivable, loop.scenario.map.edges.polygons, line)
     candidates = np.ascontiguousarray(file[f"{at}/cand"])
     scores = score(candidates, file[f"{at}/lscore"], ego, world, place, loop.info.vehicle)

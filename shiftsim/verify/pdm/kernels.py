@@ -10,15 +10,14 @@ import shapely
 from shapely.ops import substring
 
 from shiftsim.errors import DataError, ShiftsimError
+from shiftsim.geometry.paths import make_path, project, window
 from shiftsim.planners.pdm.brake import brake_poses
-from shiftsim.planners.pdm.parameters import DEFAULT, DT, SCORED
-from shiftsim.planners.pdm.path import interpolate, make_path, offset_poses, project, window
-from shiftsim.planners.pdm.rollout import follow_many
-from shiftsim.planners.pdm.route import search_lanes
-from shiftsim.planners.proposals.comfort import SIGNALS, comfort, make_filters
-from shiftsim.planners.proposals.tracker import simulate_proposals
-from shiftsim.planners.route_correction import search
-from shiftsim.sim.dynamics.lqr import NUPLAN
+from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.rollout import follow, read_pose
+from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.proposals.comfort import SIGNALS, comfort
+from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
+from shiftsim.planners.routes.search import search_cheapest, search_levels
 from shiftsim.verify.array_file import EXACT, ArrayFile
 from shiftsim.verify.nuplan.reading import read_json
 from shiftsim.verify.pdm.steps import verify_step, verify_summary
@@ -77,44 +76,33 @@ def _idm(file: ArrayFile) -> None:
     fractions = np.array(DEFAULT.speed_fractions)
     limits = np.where(np.isnan(limits), DEFAULT.fallback_velocity, limits)
     targets = fractions[file.take("policy_idx", len(limits))] * limits
-    ours = follow_many(
-        file.take("prev_progress_velocity", len(limits), 2),
-        file.take("lead_progress_velocity_rear", len(limits), 3),
-        targets,
-        DEFAULT.following,
-    )
+    before = file.take("prev_progress_velocity", len(limits), 2)
+    leads = file.take("lead_progress_velocity_rear", len(limits), 3)
     expected = file.take("next_progress_velocity", len(limits), 2)
-    for case, row in enumerate(ours):
-        file.compare("next_progress_velocity", case, row, expected[case])
+    ours = np.empty(2)
+    for case, target in enumerate(targets):
+        follow(before[case], leads[case], target, DEFAULT.following, ours)
+        file.compare("next_progress_velocity", case, ours, expected[case])
 
 
 def _tracker(file: ArrayFile) -> None:
     poses = file.take("proposal_poses", -1, -1, SCORED + 1, 3)
     shape = poses.shape[:2]
     ego = file.take("ego_state", shape[0], NUM_STATE)
-    speeds, curvatures = np.empty((*shape, SCORED)), np.empty((*shape, SCORED))
-    states = np.empty((*shape, SCORED + 1, NUM_STATE))
     expected = {
-        "velocity_profile": (speeds, file.take("velocity_profile", *shape, SCORED)),
-        "curvature_profile": (curvatures, file.take("curvature_profile", *shape, SCORED)),
-        "simulated_states": (
-            states,
-            file.take("simulated_states", *shape, SCORED + 1, NUM_STATE),
-        ),
+        "velocity_profile": file.take("velocity_profile", *shape, SCORED),
+        "curvature_profile": file.take("curvature_profile", *shape, SCORED),
+        "simulated_states": file.take("simulated_states", *shape, SCORED + 1, NUM_STATE),
     }
     for case in range(shape[0]):
-        simulate_proposals(
-            poses[case], ego[case], NUPLAN, DT, speeds[case], curvatures[case], states[case]
-        )
-        for name, (ours, theirs) in expected.items():
-            file.compare(name, case, ours[case], theirs[case])
+        driven = drive_proposals(poses[case], ego[case])
+        for (name, theirs), ours in zip(expected.items(), driven, strict=True):
+            file.compare(name, case, ours, theirs[case])
 
 
 def _comfort(file: ArrayFile) -> None:
     states = file.take("states", -1, SCORED + 1, NUM_STATE)
-    signals = np.empty((len(states), len(SIGNALS), SCORED + 1))
-    bounded = np.empty((len(states), len(SIGNALS)), np.bool_)
-    comfort(states, make_filters(), DEFAULT.comfort, signals, bounded)
+    signals, bounded = comfort(states, DEFAULT.comfort)
     expected = file.take("is_comfortable", len(states), len(SIGNALS))
     for case in range(len(states)):
         file.compare("is_comfortable", case, bounded[case], expected[case], EXACT)
@@ -141,7 +129,7 @@ def _path(file: ArrayFile) -> None:
         file.compare("progress", case, path.progress, file[f"{case}_progress"])
         at = np.empty((len(file[f"{case}_query_s"]), 3))
         for row, progress in enumerate(file.take(f"{case}_query_s", -1).tolist()):
-            interpolate(path, progress, at[row])
+            read_pose(path, progress, at[row])
         file.compare("poses", case, at, file[f"{case}_poses"], COORDINATE_TOLERANCE)
         points = file.take(f"{case}_query_xy", -1, 2).tolist()
         along = [project(path, x, y, 0)[0] for x, y in points]
@@ -183,18 +171,18 @@ def _search(case: dict[str, Any]) -> tuple[bool, list[int]]:
     if case["kind"] == "bfs_roadblock":
         neighbours = after if case["forward"] else before
         goals = {int(target) for target in case["targets"]}
-        blocks = search(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
+        blocks = search_levels(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
         return blocks.found, blocks.path if case["forward"] else blocks.path[::-1]
     allowed = {int(edge) for edge in case["candidates"]}
     if not len(case["length"]) == len(case["block"]) == case["n"]:
         raise DataError("graph_search.json: a lane has no length or no block")
-    lanes = search_lanes(
+    lanes = search_cheapest(
         case["start"],
         lambda edge: [n for n in after[edge] if n in allowed],
         case["length"].__getitem__,
         lambda edge: case["block"][edge] == case["target_block"],
     )
-    return lanes.found, lanes.edges
+    return lanes.found, lanes.path
 
 
 _CHECKS: dict[str, Callable[[ArrayFile], None]] = {

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
+from shiftsim.geometry.paths import make_path
 from shiftsim.metrics import judge, measure
-from shiftsim.planners.pdm.parameters import STEP_US, STEPS
-from shiftsim.planners.pdm.path import make_path
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.step import Step
+from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.array_file import ArrayFile
@@ -213,7 +213,7 @@ def _compare_step(
         "speed_limit_mps": limit,
         "collided_ids": ",".join(planner.collided),
         "n_map_tokens": len(sight.tokens),
-        "n_drivable_tokens": len(sight.road.admitted),
+        "n_drivable_tokens": len(sight.place.selected),
     }
     for column, value in ours.items():
         given = run.steps[column][index]
@@ -243,9 +243,11 @@ def _compare_scores(
     )
     for column, position in _DRIVEN.items():
         ends = run.proposals[column][rows]
-        report.compare(f"PDM {column}", where, step.driven[:, -1, position], ends, atol=TOLERANCE)
+        report.compare(
+            f"PDM {column}", where, step.driven.states[:, -1, position], ends, atol=TOLERANCE
+        )
     ego = seen.history.ego[-1]
-    sight = (planner.seen.occupants, planner.seen.road)
+    sight = (planner.seen.forecast, planner.seen.place)
     return compare_scores(report, where, ego, step, sight, theirs, choice)
 
 
@@ -263,12 +265,12 @@ def _compare_arrays(
     assert planner.route is not None
     names = {**_ARRAYS, "ego_areas": "ego_areas"}
     stored = {o: file[f"{n}_{index}"] for n, o in names.items() if f"{n}_{index}" in file.arrays}
-    compare_arrays(report, where, step, planner.seen.road, stored)
+    compare_arrays(report, where, step, stored)
     if (name := f"map_tokens_{index}") in file.arrays:
         report.compare("PDM map tokens", where, planner.seen.tokens, file[name].tolist())
     if (name := f"drivable_tokens_{index}") in file.arrays:
         ids = [*scenario.map.edges.ids, *scenario.map.car_parks.ids]
-        ours = [ids[area] for area in planner.seen.road.admitted.tolist()]
+        ours = [ids[area] for area in planner.seen.place.selected.tolist()]
         report.compare("PDM drivable tokens", where, ours, file[name].tolist())
 
 

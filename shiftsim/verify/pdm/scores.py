@@ -11,12 +11,13 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.pdm.forecast import Occupants, touches_boxes
-from shiftsim.planners.pdm.parameters import DEFAULT, DT
-from shiftsim.planners.pdm.scorer import TTC_STEPS, Road, normalise, weigh
+from shiftsim.planners.pdm.forecast import Forecast
+from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, normalise, weigh
 from shiftsim.planners.pdm.scorer import score as rate
 from shiftsim.planners.pdm.step import Step
-from shiftsim.planners.proposals.comfort import make_filters
+from shiftsim.planners.proposals.contacts import Others, ego_box, touches_boxes
+from shiftsim.planners.proposals.tracker import DT
 from shiftsim.verify.report import Report
 from shiftsim.world.state import HEADING, PACIFICA, VX, VY, X, Y, center_poses
 
@@ -47,7 +48,7 @@ def compare_scores(
     where: str,
     ego: FloatArray,
     step: Step,
-    seen: tuple[Occupants, Road],
+    seen: tuple[Forecast, Place],
     theirs: Recorded,
     choice: tuple[int, bool],
 ) -> bool:
@@ -104,12 +105,12 @@ def _exempt(
     report: Report,
     where: str,
     step: Step,
-    seen: tuple[Occupants, Road],
+    seen: tuple[Forecast, Place],
     theirs: Recorded,
     kind: str,
 ) -> np.ndarray:
     """(P,) proposals whose sub-score differs because of an unstable bearing; each is noted."""
-    ours, (occupants, road) = step.scores, seen
+    ours, (forecast, place) = step.scores, seen
     if kind == "ttc":
         score, index = (ours.ttc, theirs.ttc), (ours.ttc_index, theirs.ttc_index)
     else:
@@ -117,13 +118,14 @@ def _exempt(
         index = ours.collision_index, theirs.collision_index
     out = np.zeros(len(ours.total), np.bool_)
     for row in np.flatnonzero((score[0] != score[1]) | (index[0] != index[1])).tolist():
-        first = _unstable(step.driven[row], occupants, TTC_STEPS if kind == "ttc" else (0,))
+        states, others = step.driven.states, forecast.others
+        first = _unstable(states[row], others, TTC_STEPS if kind == "ttc" else (0,))
         if not first:
             continue
-        ignored = occupants.ignored.copy()
+        ignored = others.ignored.copy()
         ignored[list(first)] = True
-        blind = occupants._replace(ignored=ignored)
-        rest = rate(step.driven, road, blind, PACIFICA, DEFAULT, make_filters())
+        blind = others._replace(ignored=ignored)
+        rest = rate(states, place, blind, ego_box(PACIFICA), DEFAULT)
         without = (rest.ttc_index if kind == "ttc" else rest.collision_index)[row]
         is_hit = np.isfinite(index[1][row])
         if index[1][row] in {without, *first.values()} and is_hit == (score[1][row] < 1.0):
@@ -132,13 +134,13 @@ def _exempt(
     return out
 
 
-def _unstable(driven: FloatArray, occupants: Occupants, ahead: tuple[int, ...]) -> dict[int, float]:
+def _unstable(driven: FloatArray, others: Others, ahead: tuple[int, ...]) -> dict[int, float]:
     """Boxes exactly ahead or behind when the ego, or its projection, first touches them.
 
     Returns:
         Time index of the touch by box.
     """
-    touched = occupants.ignored[: len(occupants.kinds)].copy()
+    touched = others.ignored.copy()
     size = np.array([PACIFICA.length, PACIFICA.width])
     corners = boxes_to_corners(center_poses(driven[:, :3]), size)
     out: dict[int, float] = {}
@@ -148,9 +150,9 @@ def _unstable(driven: FloatArray, occupants: Occupants, ahead: tuple[int, ...]) 
         for later in ahead:
             forecast = (index + later) // 2
             box = corners[index] + later * travel
-            for hit in np.flatnonzero(touches_boxes(box, occupants.boxes[forecast]) & ~touched):
+            for hit in np.flatnonzero(touches_boxes(box, others.boxes[forecast]) & ~touched):
                 touched[hit] = True
-                dx, dy = occupants.centers[forecast, hit] - row[[X, Y]]
+                dx, dy = others.centers[forecast, hit] - row[[X, Y]]
                 turn = np.arctan2(abs(cos * dy - sin * dx), abs(cos * dx + sin * dy))
                 if turn < UNSTABLE_BEARING:
                     out[int(hit)] = float(index)

@@ -8,18 +8,22 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
-    Occupants,
-    make_occupants,
+    Forecast,
+    make_forecast,
     select_tracks,
     touched,
 )
-from shiftsim.planners.pdm.parameters import DEFAULT, SCORED, STEP_US, STEPS
-from shiftsim.planners.pdm.path import make_path, offset_poses
-from shiftsim.planners.pdm.scorer import Road, place_ego
+from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.rollout import Scene
+from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.pdm.scorer import Place
 from shiftsim.planners.pdm.step import Step, plan_step
-from shiftsim.planners.proposals.areas import areas_of, near_areas, on_multiple_lanes
+from shiftsim.planners.proposals.areas import areas_of
+from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.verify.array_file import ArrayFile
 from shiftsim.verify.nuplan.reading import read_json
 from shiftsim.verify.pdm.scores import Recorded, compare_scores
@@ -41,10 +45,10 @@ class Planned(NamedTuple):
     """One step that was planned again: what it saw, and what it came to."""
 
     tokens: list[str]
-    occupants: Occupants
+    forecast: Forecast
     collided: list[str]
     step: Step
-    road: Road
+    place: Place
 
 
 def verify_step(path: Path, report: Report) -> dict[str, Any]:
@@ -100,21 +104,22 @@ def _plan(inputs: dict[str, Any]) -> Planned:
         np.arange(len(ids)),
     )
     lights = [_open(rings[ids.index(name)]) for name in inputs["red_light_lane_ids"]]
-    occupants = make_occupants(tracks, chosen, lights)
+    forecast = make_forecast(tracks, chosen, lights)
     tokens = [tracks.tokens[i] for i in chosen.tolist()]
     tokens += [LIGHT_TOKEN + name for name in inputs["red_light_lane_ids"]]
     footprint = boxes_to_corners(center, np.array([PACIFICA.length, PACIFICA.width]))
-    hit = touched(occupants, footprint)
-    occupants.ignored[hit] = True
+    hit = touched(forecast, footprint)
+    forecast.ignored[hit] = True
     line = np.array(inputs["centerline"], np.float64)
     paths = [make_path(line), *(make_path(offset_poses(line, s)) for s in DEFAULT.lateral_offsets)]
     crossings = make_polygons([[np.array(r, np.float64)] for r in inputs["intersections"]])
     limit = inputs["speed_limit_mps"]
     limit = DEFAULT.fallback_velocity if limit is None else limit
-    road = Road(areas, np.arange(len(ids)), crossings, paths[0])
+    place = Place(areas, np.arange(len(ids)), crossings, paths[0])
     targets = limit * np.array(DEFAULT.speed_fractions)
-    step = plan_step(ego, targets, paths, occupants, road, PACIFICA, DEFAULT)
-    return Planned(tokens, occupants, [tokens[i] for i in hit], step, road)
+    scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
+    step = plan_step(ego, targets, scene, place, PACIFICA, DEFAULT)
+    return Planned(tokens, forecast, [tokens[i] for i in hit], step, place)
 
 
 def _open(ring: FloatArray) -> FloatArray:
@@ -142,12 +147,12 @@ def _tracks(objects: list[dict[str, Any]]) -> Tracks:
 def _compare(
     file: ArrayFile, report: Report, where: str, ego: FloatArray, time_us: int, planned: Planned
 ) -> None:
-    step, occupants = planned.step, planned.occupants
+    step, forecast = planned.step, planned.forecast
     report.compare("PDM map tokens", where, planned.tokens, file["map_tokens"].tolist())
     report.compare("PDM collided", where, planned.collided, file["collided_ids"].tolist())
-    boxes = occupants.boxes[[index // 2 for index in SHOWN_FORECASTS]]
+    boxes = forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
     report.compare("PDM map boxes", where, boxes, file["map_boxes"], atol=TOLERANCE)
-    compare_arrays(report, where, step, planned.road, {name: file[name] for name in STEP_ARRAYS})
+    compare_arrays(report, where, step, {name: file[name] for name in STEP_ARRAYS})
     multi, weighted = file.take("multi", 3, -1), file.take("weighted", 3, -1)
     theirs = Recorded(
         total=file["scores"],
@@ -162,7 +167,7 @@ def _compare(
         ttc_index=file["ttc_idx"],
     )
     choice = (int(file["best"]), bool(file["braked"]))
-    if compare_scores(report, where, ego, step, (occupants, planned.road), theirs, choice):
+    if compare_scores(report, where, ego, step, (forecast, planned.place), theirs, choice):
         plan = file["trajectory_rear"]
         report.compare("PDM plan", where, step.poses, plan, atol=TOLERANCE)
     times = time_us + STEP_US * np.arange(STEPS + 1)
@@ -172,36 +177,20 @@ def _compare(
 STEP_ARRAYS = ("proposal_poses", "idm", "lead", "simulated", "ego_areas")
 
 
-def compare_arrays(
-    report: Report, where: str, step: Step, road: Road, theirs: dict[str, np.ndarray]
-) -> None:
+def compare_arrays(report: Report, where: str, step: Step, theirs: dict[str, np.ndarray]) -> None:
     """Compare proposals, leads, driven states and areas of one step with arrays by name."""
     made, scored = step.proposals, slice(0, SCORED + 1)
-    count = len(step.driven)
+    count = len(step.driven.states)
     # the best proposal goes on to 8 s; what is recorded ends where proposals are compared
     ours = {
         "proposal_poses": made.poses[:, :, scored].reshape(count, SCORED + 1, 3),
         "idm": made.motion[:, :, scored].reshape(count, SCORED + 1, 2),
         "lead": made.leads[:, :, scored].reshape(count, SCORED + 1, 3),
-        "simulated": step.driven,
-        "ego_areas": _ego_areas(step, road),
+        "simulated": step.driven.states,
+        "ego_areas": step.scores.flags,
     }
     for name, array in theirs.items():
         report.compare(f"PDM {name}", where, ours[name], array, atol=TOLERANCE)
-
-
-def _ego_areas(step: Step, road: Road) -> np.ndarray:
-    """(P, T, 3) on multiple lanes, off the road, on no lane of the route."""
-    shape = step.driven.shape[:2]
-    corners, centers = np.empty((*shape, 4, 2)), np.empty((*shape, 2))
-    size = (PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center)
-    place_ego(step.driven, size, corners, centers)
-    lanes = near_areas(road.areas, road.admitted, corners)
-    boxes = corners.reshape(-1, 4, 2)
-    multiple = [on_multiple_lanes(road.areas, lanes, box) for box in boxes]
-    return np.stack(
-        [np.reshape(multiple, shape), step.scores.off_road, step.scores.oncoming], axis=-1
-    )
 
 
 def verify_summary(path: Path, report: Report, steps: dict[str, dict[str, Any]]) -> None:

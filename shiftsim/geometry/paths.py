@@ -1,7 +1,7 @@
-"""The paths PDM-Closed drives along: poses by progress, projection, and offset copies.
+"""Paths to drive along: poses by progress, and projection.
 
-Vertices are grouped in short runs with bounding boxes, so that a projection looks at a few segments
-instead of all of them (pdm-closed.md §4.3).
+Vertices are grouped in short runs with bounding boxes, so that a search along a path looks at a few
+segments instead of all of them.
 """
 
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.polylines import arc_lengths, interpolate
 from shiftsim.geometry.rings import point_segment_distance
 
-MIN_PROGRESS = 1e-5  # m, nuPlan: keeps clear of a duplicate vertex at the very start
 RUN = 8  # segments per bounding box
 _SLACK = 1e-6  # m, more than rounding can change a distance by
 
 
-class PdmPath(NamedTuple):
+class Path(NamedTuple):
     """A polyline with headings. K vertices, duplicates allowed.
 
     Attributes:
@@ -32,47 +32,54 @@ class PdmPath(NamedTuple):
     runs: FloatArray
 
 
-def make_path(poses: FloatArray) -> PdmPath:
-    """A path through poses (K, 3) x [m], y [m], heading [rad]; K >= 2."""
+def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:
+    """A path through poses (K, 3), K >= 2; progress (K,) is their arc length unless given [m]."""
     xy = np.ascontiguousarray(poses[:, :2])
-    steps = np.hypot(*np.diff(xy, axis=0).T)
-    progress = np.concatenate([[0.0], np.cumsum(steps)])
-    low = np.minimum(xy[:-1], xy[1:])
-    high = np.maximum(xy[:-1], xy[1:])
-    starts = np.arange(0, len(low), RUN)
-    runs = np.hstack([np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)])
-    return PdmPath(xy, np.unwrap(poses[:, 2]), progress, runs)
-
-
-def offset_poses(poses: FloatArray, offset: float) -> FloatArray:
-    """Poses (K, 3) moved sideways, to the left where `offset` is positive [m]."""
-    out = poses.copy()
-    out[:, 0] += offset * np.cos(poses[:, 2] + np.pi / 2.0)
-    out[:, 1] += offset * np.sin(poses[:, 2] + np.pi / 2.0)
-    return out
+    if progress is None:
+        progress = arc_lengths(xy, np.array([0, len(xy)]))
+    runs = np.empty(((len(xy) - 2) // RUN + 1, 4))
+    bound_runs(xy, runs)
+    return Path(xy, np.unwrap(poses[:, 2]), progress, runs)
 
 
 @lean_kernel
-def interpolate(path: PdmPath, progress: float, out: FloatArray) -> None:
-    """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN."""
-    if progress != progress:
-        # nuPlan: a speed limit of 0 makes progress undefined (pdm-closed.md §11 Q6)
-        out[0], out[1], out[2] = 0.0, 0.0, 0.0
-        return
+def bound_runs(xy: FloatArray, runs: FloatArray) -> None:
+    """Write the bounds of the runs of a polyline (K, 2) into `runs` (R, 4)."""
+    for run in range(len(runs)):
+        low_x = low_y = np.inf
+        high_x = high_y = -np.inf
+        for index in range(run * RUN, min((run + 1) * RUN + 1, len(xy))):
+            low_x, high_x = min(low_x, xy[index, 0]), max(high_x, xy[index, 0])
+            low_y, high_y = min(low_y, xy[index, 1]), max(high_y, xy[index, 1])
+        runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3] = low_x, low_y, high_x, high_y
+
+
+@lean_kernel
+def is_run_within(runs: FloatArray, run: int, x: float, y: float, limit: float) -> bool:
+    """Whether the bounds of a run come within `limit` [m] of a point."""
+    dx = max(runs[run, 0] - x, 0.0, x - runs[run, 2])
+    dy = max(runs[run, 1] - y, 0.0, y - runs[run, 3])
+    return not dx * dx + dy * dy > limit * limit
+
+
+@lean_kernel
+def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
+    """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
-    s = min(max(progress, MIN_PROGRESS), path.progress[last])
+    s = min(max(progress, path.progress[0]), path.progress[last])
     upper = min(max(int(np.searchsorted(path.progress, s)), 1), last)
     lower = upper - 1
     ahead = s - path.progress[lower]
     span = path.progress[upper] - path.progress[lower]
-    out[0] = (path.xy[upper, 0] - path.xy[lower, 0]) / span * ahead + path.xy[lower, 0]
-    out[1] = (path.xy[upper, 1] - path.xy[lower, 1]) / span * ahead + path.xy[lower, 1]
-    turn = (path.heading[upper] - path.heading[lower]) / span * ahead + path.heading[lower]
-    out[2] = np.arctan2(np.sin(turn), np.cos(turn))
+    return (
+        interpolate(path.xy[lower, 0], path.xy[upper, 0], span, ahead),
+        interpolate(path.xy[lower, 1], path.xy[upper, 1], span, ahead),
+        interpolate(path.heading[lower], path.heading[upper], span, ahead),
+    )
 
 
 @lean_kernel
-def project(path: PdmPath, x: float, y: float, guess: int) -> tuple[float, float, int]:
+def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, int]:
     """The point of the path nearest to (x, y); the first one on ties.
 
     Args:
@@ -89,10 +96,7 @@ def project(path: PdmPath, x: float, y: float, guess: int) -> tuple[float, float
     bound = _project_on_run(path, guess, x, y)[0] + _SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        limit = min(bound, best + _SLACK)
-        dx = max(path.runs[run, 0] - x, 0.0, x - path.runs[run, 2])
-        dy = max(path.runs[run, 1] - y, 0.0, y - path.runs[run, 3])
-        if dx * dx + dy * dy > limit * limit:
+        if not is_run_within(path.runs, run, x, y, min(bound, best + _SLACK)):
             continue
         distance, progress = _project_on_run(path, run, x, y)
         if distance < best:
@@ -101,7 +105,7 @@ def project(path: PdmPath, x: float, y: float, guess: int) -> tuple[float, float
 
 
 @lean_kernel
-def _project_on_run(path: PdmPath, run: int, x: float, y: float) -> tuple[float, float]:
+def _project_on_run(path: Path, run: int, x: float, y: float) -> tuple[float, float]:
     best, found = np.inf, 0.0
     for index in range(run * RUN, min((run + 1) * RUN, len(path.xy) - 1)):
         ax, ay = path.xy[index, 0], path.xy[index, 1]
@@ -118,7 +122,7 @@ def _project_on_run(path: PdmPath, run: int, x: float, y: float) -> tuple[float,
 
 
 @lean_kernel
-def window(path: PdmPath, low: float, high: float) -> tuple[int, int]:
+def window(path: Path, low: float, high: float) -> tuple[int, int]:
     """First vertex, and one past the last one, with a progress in [low, high], both clamped."""
     end = path.progress[-1]
     first = int(np.searchsorted(path.progress, min(max(low, 0.0), end)))

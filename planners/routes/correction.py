@@ -1,13 +1,10 @@
-"""Route correction, which PDM-Closed and the learned planners share (pdm-closed.md §3).
+"""Route correction, which PDM-Closed and the learned planners share.
 
 They differ in where they look for the block the ego starts on, and in how often they correct. The
-route may lack blocks at its start, have gaps, or cross itself. nuPlan's searches keep no set of
-visited blocks; here each level of a search holds a block once, ordered by its first and by its last
-appearance, which decides the same things at linear cost.
+route may lack blocks at its start, have gaps, or cross itself.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,9 +13,10 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
-from shiftsim.planners.pdm.route import nearest_vertex
+from shiftsim.planners.routes.lanes import HINT, deviation
+from shiftsim.planners.routes.search import search_levels
 from shiftsim.world.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
-from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.map import VectorMap
 
 MAX_HEADING_ERROR = np.pi / 4.0  # rad
 MAX_DISPLACEMENT = 3.0  # m
@@ -27,17 +25,16 @@ NUM_GOALS = 3  # route blocks that a search forward may reach
 MAX_OVERLAP = 1.0  # m^2, of two roadblock connectors of a route without loops
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(NamedTuple):
     """Where a route begins.
 
     Attributes:
         block: The block the ego starts on.
-        candidates: Blocks it may as well start on, once per lane that qualifies.
+        others: Blocks it may as well start on, once per lane that qualifies.
     """
 
     block: int
-    candidates: list[int]
+    others: list[int]
 
 
 def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str) -> list[int]:
@@ -55,14 +52,14 @@ def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str
     if not route:
         raise PlannerError(
             f"{planner}: the route of scenario {token!r} is empty",
-            hint="correct the route of the scenario, or leave it out",
+            hint=HINT,
         )
     for name in route:
         if name not in road.blocks.index:
             raise PlannerError(
                 f"{planner}: map {road.name!r} has no roadblock {name!r}, which is on the route "
                 f"of scenario {token!r}",
-                hint="correct the route of the scenario, or leave it out",
+                hint=HINT,
             )
     return [road.blocks.index[name] for name in dict.fromkeys(route)]
 
@@ -90,7 +87,7 @@ class RouteCorrector:
         """The route corrected for a rear axle (3,); blocks may repeat."""
         square = square_around(float(rear_axle[0]), float(rear_axle[1]), self._half_width)
         start = find_start(self._road, self._blocks, rear_axle, square)
-        key = (start.block, *start.candidates) if start.block not in self._on_route else ()
+        key = (start.block, *start.others) if start.block not in self._on_route else ()
         if key not in self._known:
             self._known[key] = tuple(correct_route(self._road, self._blocks, start))
         return self._known[key]
@@ -119,7 +116,7 @@ def find_start(
     Raises:
         PlannerError: The map has no blocks.
     """
-    found = _candidates(
+    found = _find_blocks(
         road.blocks.polygons,
         road.num_roadblocks,
         road.block_edges,
@@ -128,20 +125,14 @@ def find_start(
         np.asarray(rear_axle[:3], np.float64),
         area,
     )
-    if not len(found.blocks):
+    blocks, best = found
+    if not len(blocks):
         raise PlannerError(f"map {road.name!r} has no roadblocks")
-    return Start(int(found.blocks[found.best]), found.blocks.tolist())
-
-
-class _Found(NamedTuple):
-    """Blocks that may be the start, and which of them is."""
-
-    blocks: IntArray
-    best: int
+    return Start(int(blocks[best]), blocks.tolist())
 
 
 @kernel
-def _candidates(
+def _find_blocks(
     blocks: Polygons,
     num_roadblocks: int,
     block_edges: Lists,
@@ -149,16 +140,19 @@ def _candidates(
     route: IntArray,
     rear_axle: FloatArray,
     area: FloatArray,
-) -> _Found:
-    """Blocks that touch the area, once per lane that qualifies; those on the route if any do."""
+) -> tuple[IntArray, int]:
+    """Blocks that touch the area, once per lane that qualifies, and which of them is the start.
+
+    Only those on the route where any of them is.
+    """
     x, y, heading = rear_axle[0], rear_axle[1], rear_axle[2]
     near = meeting(blocks, area)
     if len(near) == 0:
         near = _nearest_blocks(blocks, num_roadblocks, x, y)
-    room = 0
+    capacity = 0
     for block in near:
-        room += block_edges.ptr[block + 1] - block_edges.ptr[block] + 1
-    names, distances = np.empty((3, room), np.int64), np.empty((3, room))
+        capacity += block_edges.ptr[block + 1] - block_edges.ptr[block] + 1
+    names, distances = np.empty((3, capacity), np.int64), np.empty((3, capacity))
     counts = np.zeros(3, np.int64)  # on the route, beside it, all
     for block in near:
         kind = 1
@@ -168,7 +162,7 @@ def _candidates(
         least = np.inf
         for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
             edge = block_edges.items[entry]
-            displacement, error = nearest_vertex(baselines, edge, x, y, heading)
+            displacement, error = deviation(baselines, edge, 1, x, y, heading)
             least = min(least, displacement)
             if error < MAX_HEADING_ERROR and displacement < MAX_DISPLACEMENT:
                 names[kind, counts[kind]], distances[kind, counts[kind]] = block, displacement
@@ -180,7 +174,7 @@ def _candidates(
     for index in range(counts[kind]):
         if distances[kind, index] < distances[kind, best]:
             best = index
-    return _Found(names[kind, : counts[kind]].copy(), best)
+    return names[kind, : counts[kind]].copy(), best
 
 
 @kernel
@@ -199,23 +193,23 @@ def _nearest_blocks(blocks: Polygons, num_roadblocks: int, x: float, y: float) -
 
 
 def _lead_in(road: VectorMap, blocks: list[int], start: Start) -> list[int]:
-    """Blocks between the start and the route (§3.2)."""
-    incoming = search(road.block_incoming.at, blocks[0], set(start.candidates), BACKWARD_DEPTH)
+    """Blocks between the start and the route."""
+    incoming = search_levels(road.block_incoming.at, blocks[0], set(start.others), BACKWARD_DEPTH)
     if incoming.found:
         return incoming.path[:0:-1] + blocks
     goals = blocks[:NUM_GOALS]
-    outgoing = search(road.block_outgoing.at, start.block, set(goals), FORWARD_DEPTH)
+    outgoing = search_levels(road.block_outgoing.at, start.block, set(goals), FORWARD_DEPTH)
     if outgoing.found:
         return outgoing.path + blocks[goals.index(outgoing.path[-1]) + 1 :]
     return blocks
 
 
 def _fill_gaps(road: VectorMap, blocks: list[int]) -> list[int]:
-    """Blocks between consecutive ones that are not connected (§3.3)."""
+    """Blocks between consecutive ones that are not connected."""
     out = blocks[:1]
     for before, after in pairwise(blocks):
         if before not in road.block_incoming.at(after):
-            bridge = search(road.block_outgoing.at, before, {after}, FORWARD_DEPTH)
+            bridge = search_levels(road.block_outgoing.at, before, {after}, FORWARD_DEPTH)
             if bridge.found:
                 out += bridge.path[1:-1]
         out.append(after)
@@ -223,7 +217,7 @@ def _fill_gaps(road: VectorMap, blocks: list[int]) -> list[int]:
 
 
 def _cut_loops(road: VectorMap, blocks: list[int]) -> list[int]:
-    """The route up to the first connector that overlaps one before it (§3.4)."""
+    """The route up to the first connector that overlaps one before it."""
     passed: list[shapely.Polygon] = []
     for index, block in enumerate(blocks):
         if block < road.num_roadblocks:
@@ -233,49 +227,3 @@ def _cut_loops(road: VectorMap, blocks: list[int]) -> list[int]:
             return blocks[:index]
         passed.append(area)
     return blocks
-
-
-@dataclass(frozen=True, slots=True)
-class Search:
-    """Result of a search through blocks.
-
-    Attributes:
-        path: Blocks from the start to the goal, or to the block queued last.
-        found: Whether a goal was reached.
-    """
-
-    path: list[int]
-    found: bool
-
-
-def search(
-    neighbours: Callable[[int], Iterable[int]], start: int, goals: set[int], max_depth: int
-) -> Search:
-    """Breadth-first search by levels, the start being level 1 (§3.5).
-
-    A goal is seen when its level is expanded, the first one queued wins; the parent of a block on a
-    level is the last block that queued it.
-    """
-    firsts, lasts = [start], [start]
-    parents: list[dict[int, int]] = [{}]
-    end = start
-    for _ in range(max_depth):
-        reached = next((block for block in firsts if block in goals), NONE)
-        if reached != NONE:
-            return Search(_trace(parents, reached), True)
-        queued = [(int(after), block) for block in lasts for after in neighbours(block)]
-        if not queued:
-            break
-        end = queued[-1][0]
-        parents.append(dict(queued))
-        firsts = list(dict.fromkeys(int(after) for block in firsts for after in neighbours(block)))
-        lasts = list(dict.fromkeys(after for after, _ in reversed(queued)))[::-1]
-    return Search(_trace(parents, end), False)
-
-
-def _trace(parents: list[dict[int, int]], block: int) -> list[int]:
-    """Blocks from the start to `block`, which lies on the last level."""
-    blocks = [block]
-    for level in reversed(parents[1:]):
-        blocks.append(level[blocks[-1]])
-    return blocks[::-1]

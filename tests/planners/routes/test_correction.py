@@ -9,7 +9,7 @@ from worlds import straight_road
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.route_correction import (
+from shiftsim.planners.routes.correction import (
     RouteCorrector,
     correct_route,
     find_start,
@@ -25,7 +25,7 @@ def names(road, blocks):
 
 def start_of(road, route, pose, area):
     start = find_start(road, known_blocks(road, route, "token", "test"), np.array(pose), area)
-    return road.blocks.ids[start.block], names(road, start.candidates)
+    return road.blocks.ids[start.block], names(road, start.others)
 
 
 def test_the_wider_the_search_the_more_blocks_may_be_the_start():
