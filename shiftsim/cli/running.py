@@ -44,8 +44,8 @@ Seeds = Annotated[str | None, typer.Option(help="Noise seeds, such as 0,1,2. [0]
 Traffic = Annotated[
     str | None,
     typer.Option(
-        help="nonreactive (nr), reactive (r), reactive-fixed, constant-velocity, or "
-        "package.module:Model. [nonreactive]"
+        help="nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. "
+        "[nonreactive]"
     ),
 ]
 Controller = Annotated[

@@ -62,7 +62,7 @@ def _compare_world(world: dict[str, Any], name: str, report: Report) -> None:
     report.compare("idm_world frames", name, steps, len(expected["vehicles"]))
     traffic, tracks = IdmTraffic(), scenario.tracks
     traffic.start(scenario, tracks, 0)
-    order = order_observed(tracks.kinds, tracks.valid[0], traffic.parameters.open_loop)
+    order = order_observed(tracks.kinds, tracks.valid[0])
     ours = [tracks.tokens[i] for i in order.tolist()]
     report.compare("idm_world order", name, ours, expected["order_frame0"])
     for iteration, vehicles in enumerate(expected["vehicles"][:steps]):

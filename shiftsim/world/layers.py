@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.polylines import arc_lengths
+from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.geometry.predicates import orientation
 from shiftsim.geometry.rings import (
     EXTERIOR,
@@ -165,6 +165,12 @@ def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntAr
                 items[fill[cell]] = poly
                 fill[cell] += 1
     return ptr, items
+
+
+@lean_kernel
+def project_on_line(lines: Polylines, line: int, x: float, y: float) -> float:
+    """Arc length of the point of a line nearest to (x, y); the first one on ties [m]."""
+    return project_on_polyline(lines.xy, lines.arc, lines.ptr[line], lines.ptr[line + 1], x, y)
 
 
 @lean_kernel

@@ -13,8 +13,15 @@ import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import MapError
-from shiftsim.geometry.polylines import project_on_polyline
-from shiftsim.world.layers import Layer, Lists, Polylines, make_layer, make_lists, make_polylines
+from shiftsim.world.layers import (
+    Layer,
+    Lists,
+    Polylines,
+    make_layer,
+    make_lists,
+    make_polylines,
+    project_on_line,
+)
 
 NONE = -1  # "no such object" in index arrays
 
@@ -211,10 +218,7 @@ class VectorMap:
 
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""
-        lines = self.baselines
-        return float(
-            project_on_polyline(lines.xy, lines.arc, lines.ptr[edge], lines.ptr[edge + 1], x, y)
-        )
+        return float(project_on_line(self.baselines, edge, x, y))
 
 
 def build_map(

@@ -106,9 +106,7 @@ def drive(scenario: Scenario, ego_rows: Group) -> Observed:
     traffic.start(scenario, tracks, 0)
     for iteration in range(len(ego) - 1):
         traffic.step(iteration, ego[iteration], tracks, iteration + 1)
-    orders = [
-        order_observed(tracks.kinds, row, traffic.parameters.open_loop) for row in tracks.valid
-    ]
+    orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
     rows = np.repeat(np.arange(len(ego)), [len(order) for order in orders])
     return Observed(rows, np.concatenate(orders), tracks)
 
