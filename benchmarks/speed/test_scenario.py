@@ -12,9 +12,10 @@ from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.reading import StoreWriter
 from shiftsim.metrics import compute_metrics
+from shiftsim.runs.config import make_config
 from shiftsim.planners.registry import run_planner
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.task import TaskRunner
+from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
 from shiftsim.verify.nuplan.reading import load_scenes
@@ -48,7 +49,7 @@ def runner(scenes, tmp_path_factory):
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
     planners = {"constant-velocity": run_planner("constant-velocity", {})}
     noises = {"none": parse_noise("none")}
-    return TaskRunner(path, planners, noises, "nonreactive", "lqr", "nuplan", (), "all")
+    return TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
 
 
 NAMES = (
@@ -65,8 +66,8 @@ def test_whole_scenario(measure, runner, name):
     task = Task(token=name, planner="constant-velocity", noise="none", seed=0)
 
     def whole():
-        runner._last = None  # read the scenario again each time
-        (result,) = runner((task,))
+        runner._scenarios._last = None  # read the scenario again each time
+        (result,) = runner(Batch((task,)))
         assert result.status == "ok", result.traceback
 
     measure(whole, calls=1, target=WHOLE_TARGET)

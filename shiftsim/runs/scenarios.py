@@ -1,16 +1,133 @@
-"""Splits: named lists of scenario tokens."""
+"""The scenarios of a run: the store they are in, and splits, which are named lists of their tokens.
 
-import difflib
+A run knows its store by hash. A bundled run holds a store of its own with the scenarios it used and
+their maps, so that the folder alone is enough to score, view and plot it anywhere.
+"""
+
 import hashlib
 import json
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
-from shiftsim.errors import ConfigError, one_of
-from shiftsim.files import read_toml
+from shiftsim.data.store.reading import (
+    ScenarioStore,
+    StoreWriter,
+    open_store,
+    window_row,
+)
+from shiftsim.data.store.review import REVIEW
+from shiftsim.errors import ConfigError, DataError, nearest, one_of
+from shiftsim.files import read_toml, store_path
+from shiftsim.runs.config import DEFAULT_STORE
+from shiftsim.runs.results import Run
+
+BUNDLE = "store"  # folder below that of the run
+
+
+def open_named_store(name: str) -> ScenarioStore:
+    """A store by name, path or URL; the demo store is made when it is not there yet.
+
+    Raises:
+        DataError: It is not there, or damaged.
+    """
+    if "://" in name:
+        return open_store(name)
+    path = store_path(name)
+    if name == DEFAULT_STORE and not path.exists():
+        from shiftsim.data.demo.store import demo_store
+
+        path = demo_store(path)
+    if not path.exists():
+        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
+        raise DataError(
+            f"no store {name!r} at {str(path)!r}",
+            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
+        )
+    return open_store(path)
+
+
+def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
+    """The store that a run was made with, or its bundle, which then has the hash of that store.
+
+    Args:
+        run: The run.
+        store: Name or path, where the store has moved.
+
+    Raises:
+        DataError: It is not there, or is another one.
+    """
+    bundle = run.path / BUNDLE
+    if store is None and bundle.is_dir():
+        found = open_store(bundle)
+        wanted = run.manifest.get("bundle", {}).get("hash")
+    else:
+        found = _open(run, store)
+        wanted = run.manifest["determining"]["store"]
+    if found.hash != wanted:
+        raise DataError(
+            f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
+            hint="name the right one with --store, or run again",
+        )
+    found.hash = run.manifest["determining"]["store"]
+    return found
+
+
+def _open(run: Run, store: str | None) -> ScenarioStore:
+    place = store or run.manifest["store"]
+    if "://" in place:
+        return open_store(place)
+    path = store_path(place)
+    if not path.exists():
+        raise DataError(
+            f"the store of run {run.path.name!r} is not at {str(path)!r}",
+            hint="say where it is with --store",
+        )
+    return open_store(path)
+
+
+def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
+    """Copy scenarios with their recordings and maps into a run folder.
+
+    Args:
+        store: The store.
+        folder: The run folder.
+        tokens: The scenarios.
+
+    Returns:
+        What the manifest says about it.
+    """
+    target = folder / BUNDLE
+    if not target.exists():
+        partial = folder / f".{BUNDLE}.tmp"
+        shutil.rmtree(partial, ignore_errors=True)
+        _copy(store, partial, set(tokens))
+        partial.rename(target)
+    return {"hash": open_store(target).hash}
+
+
+def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
+    columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
+    used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
+    with StoreWriter(target) as writer:
+        for city in sorted({city for _, _, city in used}):
+            writer.add_map(store.map(city))
+        for recording in sorted({recording for _, recording, _ in used}):
+            rows = [
+                window_row(store.window(token), city)
+                for token, name, city in used
+                if name == recording
+            ]
+            copied = target / ".recording"
+            shutil.copytree(store.recording_folder(recording), copied)
+            writer.take_recording(copied, recording, rows)
+    if (store.path / REVIEW).is_file():
+        (target / REVIEW).parent.mkdir()
+        shutil.copyfile(store.path / REVIEW, target / REVIEW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +174,8 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
     if path.is_file():
         return read_split(path)
     known = sorted([store.name, *(found.stem for found in (store / "splits").glob("*.toml"))])
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = nearest(name, known)
+    hint = f"did you mean {near!r}? " if near else ""
     raise ConfigError(
         f"split {name!r} unknown",
         hint=f"{hint}available: {', '.join(known)}, or a .toml or .txt file",

@@ -1,23 +1,65 @@
-"""Does this installation work: versions, memory, and kernels against values of nuPlan's own code.
+"""Commands that try this installation: doctor, and verify on whole folders of reference outputs.
 
-The few reference values that come with the package are compared by the code that `shiftsim verify`
-uses for whole folders of them.
+The few reference values that come with the package are compared by the code that `verify` uses.
 """
 
 import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated
 
-import shiftsim.verify
+import typer
+
 from shiftsim.arrays import cache_folder
-from shiftsim.runs.config import default_workers
+from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, say_json
+from shiftsim.files import PACKAGE
+from shiftsim.runs.workers import default_workers
 
-REFERENCE = Path(shiftsim.verify.__file__).parent / "reference"
+REFERENCE = PACKAGE / "verify" / "reference"
+_DATA = 2
 
-Advance = Callable[[int, int, str], None]
+
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
+    mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
+    maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
+    require_all: Annotated[
+        bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
+    ] = False,
+    debug: Debug = False,
+) -> None:
+    """Compare with reference outputs of nuPlan's own code.
+
+    Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
+    3 not all covered (with --require-all).
+    """
+    from shiftsim.errors import one_of
+    from shiftsim.verify import MODES
+    from shiftsim.verify import verify as compare
+
+    if mode is not None:
+        one_of("mode", mode, MODES)
+    result = compare(folder, mode=mode, scenes=scenes, maps=maps)
+    for line in result.lines():
+        say(line)
+    raise typer.Exit(result.exit_code(require_all=require_all))
+
+
+def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
+    """Versions, cores and memory, and whether the kernels compute what they should."""
+    from shiftsim.cli.diagnosis import examine
+
+    with progress_bar(quiet=quiet or as_json) as advance:
+        found = examine(advance)
+    if as_json:
+        say_json(asdict(found))
+    else:
+        for line in found.lines():
+            say(line)
+    if not found.is_well:
+        raise typer.Exit(_DATA)
 
 
 @dataclass(frozen=True)
@@ -50,10 +92,6 @@ class Diagnosis:
     def is_well(self) -> bool:
         """Whether results can be trusted."""
         return self.cases > 0 and not self.mismatches
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON values."""
-        return asdict(self)
 
     def lines(self) -> list[str]:
         """As text."""
