@@ -164,13 +164,17 @@ def _clockwise_hull(ring: FloatArray) -> FloatArray:
 
 
 class LightLookup:
-    """Traffic lights by edge; the ids of one scenario are looked up once."""
+    """Traffic lights by edge; the ids of one scenario are looked up once.
+
+    Attributes:
+        edges: Those that lights are listed for.
+    """
 
     def __init__(self, road: VectorMap, default: LightStatus = LightStatus.UNKNOWN) -> None:
         """Take the map of the scenario, and the status of edges for which no light is listed."""
         self._road, self._default = road, int(default)
         self._ids: tuple[str, ...] | None = None
-        self._columns = self._edges = np.zeros(0, np.int64)
+        self._columns = self.edges = np.zeros(0, np.int64)
         self._status = np.full(len(road.edges), self._default)
 
     def at(self, lights: TrafficLights) -> IntArray:
@@ -182,12 +186,12 @@ class LightLookup:
             index = self._road.edges.index
             pairs = [(c, index[i]) for c, i in enumerate(lights.connector_ids) if i in index]
             found = np.array(pairs, np.int64).reshape(-1, 2)
-            self._columns, self._edges = found[:, 0].copy(), found[:, 1].copy()
+            self._columns, self.edges = found[:, 0].copy(), found[:, 1].copy()
             self._ids = lights.connector_ids
             self._status[:] = self._default
         codes = lights.status[0, self._columns].astype(np.int64)
         codes[codes == LightStatus.ABSENT] = self._default
-        self._status[self._edges] = codes
+        self._status[self.edges] = codes
         return self._status
 
 

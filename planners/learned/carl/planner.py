@@ -15,14 +15,14 @@ from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.carl.raster import Raster
-from shiftsim.planners.learned.carl.roads import Roads, make_roads
+from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.carl.view import (
     CHANNELS,
-    LIGHT_VALUES,
+    EGO,
     SIZE,
     Boxes,
     Scratch,
-    draw_ego,
+    draw_box,
     draw_objects,
     draw_roads,
     find_areas,
@@ -118,12 +118,11 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         status = self._lights.at(observation.lights)
         self._blindness = self._why_blind(scene.map, status)
         self._pictures.fill(0)
-        lights = LIGHT_VALUES[status]
-        draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, lights)
+        draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, status)
         draw_objects(self._pictures, frame, _boxes(observation), scratch)
-        speed = float(np.hypot(velocity[0], velocity[1]))
-        length, width = scene.vehicle.length, scene.vehicle.width
-        draw_ego(self._pictures, frame, center, length, width, speed, scratch)
+        value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
+        box = (*center.tolist(), scene.vehicle.length, scene.vehicle.width)
+        draw_box(self._pictures[EGO], frame, *box, value, scratch)
         return CarlFeatures(
             self._pictures,
             np.concatenate(
@@ -179,10 +178,10 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         """Why the official code would have failed at the raster; empty where it would not."""
         if not len(self.found):
             return "no road within the raster"
-        unknown = np.flatnonzero(status == LightStatus.UNKNOWN)
-        connectors = unknown[unknown >= road.num_lanes]
         # nuPlan rule 360: the official code fails at an unknown status; here it is not drawn
-        if len(connectors) and np.isin(road.block_of[connectors], self.found).any():
+        listed = self._lights.edges
+        unknown = listed[(status[listed] == LightStatus.UNKNOWN) & (listed >= road.num_lanes)]
+        if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
             return "a light in the raster has an unknown status"
         return ""
 

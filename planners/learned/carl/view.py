@@ -19,7 +19,7 @@ from shiftsim.planners.learned.carl.raster import (
     fill_box,
     make_crossings,
 )
-from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, Values, level
+from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
@@ -148,7 +148,7 @@ def draw_roads(
     frame: FloatArray,
     found: IntArray,
     on_route: BoolArray,
-    lights: Values,
+    lights: IntArray,
 ) -> None:
     """Draw what the map has, and the lights.
 
@@ -159,7 +159,7 @@ def draw_roads(
         frame: (4,) of the raster.
         found: Areas in it.
         on_route: (B,) blocks of the route.
-        lights: (E,) value of the light of every connector, 0 where it has none.
+        lights: (E,) LightStatus by edge, ABSENT where there is none.
     """
     scratch.filled[:] = False
     scratch.drawn[:] = False
@@ -179,7 +179,8 @@ def draw_roads(
                 continue
             for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
                 edge = roads.block_edges.items[entry]
-                _draw_edge(rasters, roads, scratch, frame, edge, lights[edge] if connectors else 0)
+                light = LIGHT_VALUES[lights[edge]] if connectors else 0
+                _draw_edge(rasters, roads, scratch, frame, edge, light)
 
 
 @kernel
@@ -251,26 +252,11 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
             length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
-            _draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
+            draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
 
 
 @kernel
-def draw_ego(
-    rasters: Raster,
-    frame: FloatArray,
-    center: FloatArray,
-    length: float,
-    width: float,
-    speed: float,
-    scratch: Scratch,
-) -> None:
-    """Draw the ego; `center` is (3,), `speed` that of its centre."""
-    value = level(speed, MAX_SPEED)
-    _draw_box(rasters[EGO], frame, center[0], center[1], center[2], length, width, value, scratch)
-
-
-@kernel
-def _draw_box(
+def draw_box(
     raster: Raster,
     frame: FloatArray,
     x: float,
@@ -281,6 +267,7 @@ def _draw_box(
     value: int,
     scratch: Scratch,
 ) -> None:
+    """Draw a box."""
     corners, pixels = np.empty((4, 2)), scratch.ring[:4]
     box_corners(x, y, heading, length, width, corners)
     for corner in range(4):

@@ -15,6 +15,8 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.diffusion.kernels import (
     AGENT_COLUMNS,
     AGENTS,
+    BICYCLE,
+    CONE,
     GREEN,
     LANE_COLUMNS,
     OBJECT_COLUMNS,
@@ -23,9 +25,8 @@ from shiftsim.planners.learned.diffusion.kernels import (
     RED,
     SAMPLES,
     UNKNOWN,
+    VEHICLE,
     LaneLines,
-    choose_agents,
-    choose_objects,
     fill_agents,
     fill_lanes,
     fill_objects,
@@ -44,6 +45,7 @@ from shiftsim.world.state import Tracks
 
 RADIUS = 100.0  # m, half side of the square from which lanes are taken
 LANES, ROUTE_LANES = 70, 25
+SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
 START_SQUARE = 1.0  # m, half side of the square that is searched for the start of the route
 
 # one-hot position of each LightStatus; nuPlan rule 332: yellow counts as unknown
@@ -189,12 +191,39 @@ def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, 
     kinds, valid = _plain(tracks.kinds), _plain(tracks.valid)
     poses, sizes = _plain(tracks.poses), _plain(tracks.sizes)
     present, now = valid[-1], poses[-1]
-    chosen = choose_agents(present, now, kinds, anchor)
+    chosen = _choose_agents(present, now, kinds, anchor)
     velocities = _plain(tracks.velocities)
     fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
-    static = choose_objects(present, now, kinds, anchor)
+    static = _by_distance(present & (kinds >= CONE), now, anchor)[:OBJECTS]
     fill_objects(static, now, sizes[-1], kinds, anchor, objects)
     return agents, objects, chosen
+
+
+def _choose_agents(
+    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
+) -> Any:
+    """Tracks that the network sees, nearest first.
+
+    Args:
+        present: (N,) whether each track is there now.
+        poses: (N, 3) their present poses.
+        kinds: (N,) their kinds.
+        anchor: (3,) rear axle.
+    """
+    order = _by_distance(present & (kinds <= BICYCLE), poses, anchor)
+    if len(order) <= AGENTS:
+        return order
+    slow = kinds[order] != VEHICLE
+    # nuPlan rule 336: of a crowd, few pedestrians and bicycles are kept
+    allowed = max(SLOW_AGENTS, AGENTS - int(np.count_nonzero(~slow)))
+    return order[~slow | (np.cumsum(slow) <= allowed)][:AGENTS]
+
+
+def _by_distance(chosen: BoolArray, poses: FloatArray, anchor: FloatArray) -> IntArray:
+    """Chosen tracks by their distance to the rear axle."""
+    tracks = np.flatnonzero(chosen)
+    dx, dy = (poses[tracks, :2] - anchor[:2]).T
+    return tracks[np.argsort(np.sqrt(dx * dx + dy * dy), kind="stable")]
 
 
 def _first_rows(array: Any, rows: IntArray) -> Any:

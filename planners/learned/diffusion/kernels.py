@@ -12,7 +12,6 @@ from shiftsim.world.layers import Polygons, Polylines, distance_to, meets_convex
 POINTS = 20  # of a lane
 AGENTS, SAMPLES, AGENT_COLUMNS = 32, 21, 11
 OBJECTS, OBJECT_COLUMNS = 5, 10
-SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
 GREEN, RED, UNKNOWN = 0, 2, 3  # one-hot positions of a light
 LANE_COLUMNS = 12
 VEHICLE, PEDESTRIAN, BICYCLE, CONE, BARRIER, SIGN, GENERIC = range(7)  # state.AgentKind
@@ -212,70 +211,6 @@ def fill_lanes(
         if not np.isnan(lanes.limits[edge]):
             limits[index, 0] = lanes.limits[edge]
             known[index, 0] = True
-
-
-@kernel
-def choose_agents(
-    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
-) -> IntArray:
-    """Tracks that the network sees, nearest first.
-
-    Of a crowd, few pedestrians and bicycles are kept (nuPlan rule 336).
-
-    Args:
-        present: (N,) whether each track is there now.
-        poses: (N, 3) their present poses.
-        kinds: (N,) their kinds.
-        anchor: (3,) rear axle.
-    """
-    order = _by_distance(present, poses, kinds, anchor, VEHICLE, BICYCLE)
-    if len(order) <= AGENTS:
-        return order
-    slow = 0
-    for track in order:
-        slow += kinds[track] != VEHICLE
-    allowed = max(SLOW_AGENTS, AGENTS - (len(order) - slow))
-    out = np.empty(AGENTS, np.int64)
-    count, taken = 0, 0
-    for track in order:
-        if kinds[track] != VEHICLE:
-            if taken >= allowed:
-                continue
-            taken += 1
-        if count < AGENTS:
-            out[count] = track
-            count += 1
-    return out[:count]
-
-
-@kernel
-def choose_objects(
-    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
-) -> IntArray:
-    """Static objects that the network sees, nearest first; arguments as above."""
-    return _by_distance(present, poses, kinds, anchor, CONE, GENERIC)[:OBJECTS]
-
-
-@kernel
-def _by_distance(
-    present: BoolArray,
-    poses: FloatArray,
-    kinds: IntArray,
-    anchor: FloatArray,
-    first_kind: int,
-    last_kind: int,
-) -> IntArray:
-    """Present tracks of some kinds by distance to the rear axle."""
-    tracks = np.empty(len(kinds), np.int64)
-    distances = np.empty(len(kinds))
-    count = 0
-    for track in range(len(kinds)):
-        if present[track] and first_kind <= kinds[track] <= last_kind:
-            tracks[count] = track
-            dx, dy = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
-            distances[count] = np.sqrt(dx * dx + dy * dy)
-            count += 1
-    return tracks[:count][np.argsort(distances[:count], kind="mergesort")]
 
 
 @kernel
