@@ -35,29 +35,17 @@ _MAP_MARGIN = 200.0  # m around the map in which objects are expected
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What became of one recording.
+    """What became of one recording."""
 
-    Attributes:
-        name: Name of the recording.
-        duration_s: Its length [s].
-        tracks: Tracks in it.
-        windows: Windows that fit.
-        seen: (window, track) pairs looked at.
-        candidates: Pairs that pass category, presence, speed and overlap.
-        accepted: Scenarios.
-        rejected: Count of the other pairs by the rule they failed.
-        warnings: Count by kind of what was repaired.
-    """
-
-    name: str
-    duration_s: float
-    tracks: int
-    windows: int
-    seen: int
-    candidates: int
-    accepted: int
-    rejected: dict[str, int]
-    warnings: dict[str, int]
+    name: str  # name of the recording
+    duration_s: float  # its length [s]
+    tracks: int  # tracks in it
+    windows: int  # windows that fit
+    seen: int  # (window, track) pairs looked at
+    candidates: int  # pairs that pass category, presence, speed and overlap
+    accepted: int  # scenarios
+    rejected: dict[str, int]  # count of the other pairs by the rule they failed
+    warnings: dict[str, int]  # count by kind of what was repaired
 
 
 @dataclass(frozen=True)

@@ -40,48 +40,29 @@ BAY_ANGLE = np.pi / 3  # of diagonal parking spaces
 
 @dataclass(frozen=True)
 class Street:
-    """A road between junctions.
+    """A road between junctions."""
 
-    Attributes:
-        name: Without digits at the end.
-        id: From 1 to 9.
-        start: x [m], y [m], heading [rad].
-        pieces: Geometry.
-        width: Of every lane [m].
-        limit: Speed limit [km/h].
-        lanes: Per direction.
-        is_one_way: Whether there are only the lanes along the reference line.
-        is_main: Whether it has priority.
-        junctions: At its begin and its end, 0 for none.
-        stop: How far before a junction vehicles wait [m].
-        crossings: First and last s of the places where pedestrians cross [m].
-        is_marked: Whether these are crosswalks of the map.
-        parking: Width of the strip for parking on both sides, diagonal above 3 m [m].
-        stalls: First and last s of stretches with parked cars [m].
-        empty: Numbers of the parking spaces that are free.
-        sidewalk: Width, 0 for none [m].
-        has_stop_sign: At its begin.
-        narrow: First and last s of a place where vehicles cannot meet [m].
-    """
-
-    name: str
-    id: int
-    start: tuple[float, float, float]
-    pieces: tuple[Piece, ...]
-    width: float
-    limit: float
-    lanes: int = 1
-    is_one_way: bool = False
-    is_main: bool = True
-    junctions: tuple[int, int] = (0, 0)
-    stop: float = 9.0
+    name: str  # without digits at the end
+    id: int  # from 1 to 9
+    start: tuple[float, float, float]  # x [m], y [m], heading [rad]
+    pieces: tuple[Piece, ...]  # geometry
+    width: float  # of every lane [m]
+    limit: float  # speed limit [km/h]
+    lanes: int = 1  # per direction
+    is_one_way: bool = False  # whether there are only the lanes along the reference line
+    is_main: bool = True  # whether it has priority
+    junctions: tuple[int, int] = (0, 0)  # at its begin and its end, 0 for none
+    stop: float = 9.0  # how far before a junction vehicles wait [m]
+    # first and last s of the places where pedestrians cross [m]
     crossings: tuple[tuple[float, float], ...] = ()
-    is_marked: bool = True
-    parking: float = 0.0
+    is_marked: bool = True  # whether these are crosswalks of the map
+    parking: float = 0.0  # width of the strip for parking on both sides, diagonal above 3 m [m]
+    # first and last s of stretches with parked cars [m]
     stalls: tuple[tuple[float, float], ...] = ()
-    empty: tuple[int, ...] = ()
-    sidewalk: float = 3.0
-    has_stop_sign: bool = False
+    empty: tuple[int, ...] = ()  # numbers of the parking spaces that are free
+    sidewalk: float = 3.0  # width, 0 for none [m]
+    has_stop_sign: bool = False  # at its begin
+    # first and last s of a place where vehicles cannot meet [m]
     narrow: tuple[float, float] | None = None
 
     @property
@@ -154,24 +135,17 @@ class Leg:
 
 @dataclass
 class Town:
-    """A generated town.
+    """A generated town."""
 
-    Attributes:
-        name: Of the town.
-        streets: By name.
-        network: All roads.
-        connectors: Connecting road and lane behind it by junction, street, lane, next street.
-        zones: Connecting roads and narrow places that cannot be used at once.
-        walks: By name.
-        bays: (n, 3) poses of parking spaces by street.
-    """
-
-    name: str
-    streets: dict[str, Street] = field(default_factory=dict)
-    network: RoadNetwork = field(default_factory=lambda: RoadNetwork(""))
+    name: str  # of the town
+    streets: dict[str, Street] = field(default_factory=dict)  # by name
+    network: RoadNetwork = field(default_factory=lambda: RoadNetwork(""))  # all roads
+    # connecting road and lane behind it by junction, street, lane, next street
     connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
+    # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
-    walks: dict[str, Walk] = field(default_factory=dict)
+    walks: dict[str, Walk] = field(default_factory=dict)  # by name
+    # (n, 3) poses of parking spaces by street
     bays: dict[str, FloatArray] = field(default_factory=dict)
     _paths: dict[str, Path] = field(default_factory=dict)
 

@@ -144,18 +144,12 @@ def _id(value: object, layer: str, column: str) -> str:
 
 @dataclass
 class FeatureLayer:
-    """One layer to be written.
+    """One layer to be written."""
 
-    Attributes:
-        name: Table name.
-        geometry: `POLYGON`, `LINESTRING` or `POINT`.
-        columns: SQL type by column name, besides `fid` and `geom`.
-        rows: fid, geometry in metres and values by column; missing ones are NULL.
-    """
-
-    name: str
-    geometry: str
-    columns: Mapping[str, str]
+    name: str  # table name
+    geometry: str  # `POLYGON`, `LINESTRING` or `POINT`
+    columns: Mapping[str, str]  # SQL type by column name, besides `fid` and `geom`
+    # fid, geometry in metres and values by column; missing ones are NULL
     rows: list[tuple[int, shapely.Geometry, Mapping[str, Value]]] = field(default_factory=list)
 
 
