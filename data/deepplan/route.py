@@ -24,30 +24,19 @@ _MAX_CELLS = 1_000_000  # of the raster that finds a better placement
 
 @dataclass(frozen=True)
 class Route:
-    """A route.
+    """A route."""
 
-    Attributes:
-        ids: Roadblock and roadblock connector ids, in order.
-        num_driven: How many of them the ego drives on; the others were appended.
-    """
-
-    ids: tuple[str, ...]
-    num_driven: int
+    ids: tuple[str, ...]  # roadblock and roadblock connector ids, in order
+    num_driven: int  # how many of them the ego drives on; the others were appended
 
 
 @dataclass(frozen=True)
 class Placement:
-    """How well moving vehicles and drivable area lie on each other.
+    """How well moving vehicles and drivable area lie on each other."""
 
-    Attributes:
-        share: Share of the points on drivable area.
-        shift: (2,) what to add to the points for the best fit [m].
-        best_share: Share of the points on drivable area then, as far as a raster tells.
-    """
-
-    share: float
-    shift: FloatArray
-    best_share: float
+    share: float  # share of the points on drivable area
+    shift: FloatArray  # (2,) what to add to the points for the best fit [m]
+    best_share: float  # share of the points on drivable area then, as far as a raster tells
 
 
 def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> Route | None:

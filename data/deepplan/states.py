@@ -22,17 +22,11 @@ _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second ord
 
 @dataclass(frozen=True)
 class Samples:
-    """Boxes of runs at given times. G samples, local frame.
+    """Boxes of runs at given times. G samples, local frame."""
 
-    Attributes:
-        poses: (G, 3) box centre x [m], y [m], heading [rad].
-        velocities: (G, 2) [m/s].
-        heights: (G,) z of the box centre [m].
-    """
-
-    poses: FloatArray
-    velocities: FloatArray
-    heights: FloatArray
+    poses: FloatArray  # (G, 3) box centre x [m], y [m], heading [rad]
+    velocities: FloatArray  # (G, 2) [m/s]
+    heights: FloatArray  # (G,) z of the box centre [m]
 
 
 def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatArray) -> Samples:

@@ -16,19 +16,13 @@ _KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
 
 @dataclass(frozen=True)
 class Boxes:
-    """Objects of a span of rows, box by box, each frame in the order nuPlan lists it. B boxes.
+    """Objects of a span of rows, box by box, each frame in the order nuPlan lists it. B boxes."""
 
-    Attributes:
-        row: (B,) row of the log.
-        token: B track tokens.
-        kind: (B,) AgentKind codes.
-        values: (B, 8) centre x, y [m], heading [rad], velocity x, y in the map frame [m/s],
-            length, width, height [m].
-    """
-
-    row: IntArray
-    token: list[str]
-    kind: IntArray
+    row: IntArray  # (B,) row of the log
+    token: list[str]  # B track tokens
+    kind: IntArray  # (B,) AgentKind codes
+    # (B, 8) centre x, y [m], heading [rad], velocity x, y in the map frame [m/s], length, width,
+    # height [m]
     values: FloatArray
 
 

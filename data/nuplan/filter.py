@@ -27,21 +27,13 @@ _USED = ("scenario_types", "scenario_tokens", "log_names", "map_names", "remove_
 
 @dataclass(frozen=True)
 class ScenarioFilter:
-    """A choice of scenarios; None means no restriction.
+    """A choice of scenarios; None means no restriction."""
 
-    Attributes:
-        tokens: Scenario tokens.
-        types: Scenario types.
-        logs: Log names.
-        maps: Map names.
-        remove_invalid_goals: Whether scenes without a goal are left out.
-    """
-
-    tokens: frozenset[str] | None = None
-    types: frozenset[str] | None = None
-    logs: frozenset[str] | None = None
-    maps: frozenset[str] | None = None
-    remove_invalid_goals: bool = False
+    tokens: frozenset[str] | None = None  # scenario tokens
+    types: frozenset[str] | None = None  # scenario types
+    logs: frozenset[str] | None = None  # log names
+    maps: frozenset[str] | None = None  # map names
+    remove_invalid_goals: bool = False  # whether scenes without a goal are left out
 
 
 def read_filter(path: Path) -> ScenarioFilter:

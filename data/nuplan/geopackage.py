@@ -144,18 +144,13 @@ def _id(value: object, layer: str, column: str) -> str:
 
 @dataclass
 class FeatureLayer:
-    """One layer to be written.
+    """One layer to be written."""
 
-    Attributes:
-        name: Table name.
-        geometry: `POLYGON`, `LINESTRING` or `POINT`.
-        columns: SQL type by column name, besides `fid` and `geom`.
-        rows: fid, geometry in metres and values by column; missing ones are NULL.
-    """
-
-    name: str
-    geometry: str
-    columns: Mapping[str, str]
+    name: str  # table name
+    geometry: str  # `POLYGON`, `LINESTRING` or `POINT`
+    columns: dict[str, str]  # SQL type by column name, besides `fid` and `geom`
+    defaults: dict[str, Value]  # values by column where a row has none; else NULL
+    # fid, geometry in metres and values by column
     rows: list[tuple[int, shapely.Geometry, Mapping[str, Value]]] = field(default_factory=list)
 
 
@@ -191,7 +186,7 @@ def write_geopackage(
         tables[layer.name] = f'{_FID}, "geom" {kind}{columns}'
         blobs = _blobs(shapes)
         rows[layer.name] = [
-            (fid, blob, *(values.get(name) for name in layer.columns))
+            (fid, blob, *(values.get(name, layer.defaults.get(name)) for name in layer.columns))
             for (fid, _, values), blob in zip(layer.rows, blobs, strict=True)
         ]
     no_bounds = (None,) * 5

@@ -49,29 +49,17 @@ _IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
 
 @dataclass
 class Log:
-    """An open log. R rows, ordered by time.
+    """An open log. R rows, ordered by time."""
 
-    Attributes:
-        database: The file.
-        name: Log name, the file name without its ending.
-        map_name: Map it was recorded on.
-        tokens: R tokens of the lidar rows, 16 hexadecimal digits.
-        time_us: (R,) time stamps [us].
-        types: R scenario types, `unknown` without a tag.
-        scenes: R tokens of the scenes.
-        is_offered: (R,) whether nuPlan offers the row as a scenario.
-        row_of: Row by token.
-    """
-
-    database: Database
-    name: str
-    map_name: str
-    tokens: list[str]
-    time_us: IntArray
-    types: list[str]
-    scenes: list[bytes]
-    is_offered: BoolArray
-    row_of: dict[str, int] = field(init=False)
+    database: Database  # the file
+    name: str  # log name, the file name without its ending
+    map_name: str  # map it was recorded on
+    tokens: list[str]  # R tokens of the lidar rows, 16 hexadecimal digits
+    time_us: IntArray  # (R,) time stamps [us]
+    types: list[str]  # R scenario types, `unknown` without a tag
+    scenes: list[bytes]  # R tokens of the scenes
+    is_offered: BoolArray  # (R,) whether nuPlan offers the row as a scenario
+    row_of: dict[str, int] = field(init=False)  # row by token
 
     def __post_init__(self) -> None:
         self.row_of = {token: row for row, token in enumerate(self.tokens)}

@@ -31,21 +31,13 @@ EGO = "ego"
 
 @dataclass(frozen=True)
 class ScenarioEntry:
-    """One scenario that a log offers.
+    """One scenario that a log offers."""
 
-    Attributes:
-        token: Token of its anchor row.
-        scenario_type: Its tag; `unknown` without one.
-        log_name: The log.
-        city: Map name.
-        time_us: Time stamp of the anchor [us].
-    """
-
-    token: str
-    scenario_type: str
-    log_name: str
-    city: str
-    time_us: int
+    token: str  # token of its anchor row
+    scenario_type: str  # its tag; `unknown` without one
+    log_name: str  # the log
+    city: str  # map name
+    time_us: int  # time stamp of the anchor [us]
 
 
 def list_scenarios(

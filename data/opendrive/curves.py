@@ -40,15 +40,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """The reference line of one road.
+    """The reference line of one road."""
 
-    Attributes:
-        geometries: Its records, by s.
-        stretched: Whether a paramPoly3 that is much longer or shorter than it states is run through
-            evenly from end to end; else it is cut off where the stated length is used up.
-    """
-
-    geometries: tuple[Geometry, ...]
+    geometries: tuple[Geometry, ...]  # its records, by s
+    # whether a paramPoly3 that is much longer or shorter than it states is run through evenly from
+    # end to end; else it is cut off where the stated length is used up
     stretched: bool = True
 
     @property

@@ -17,19 +17,12 @@ _LEADING_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)")
 
 @dataclass
 class Reader:
-    """Reads attributes of one file and keeps count of what was wrong.
+    """Reads attributes of one file and keeps count of what was wrong."""
 
-    Attributes:
-        source: Name of the file.
-        place: Road or junction at hand, for messages.
-        warnings: Count by kind.
-        counts: Records by kind.
-    """
-
-    source: str
-    place: str = "header"
-    warnings: Counter[str] = field(default_factory=Counter)
-    counts: Counter[str] = field(default_factory=Counter)
+    source: str  # name of the file
+    place: str = "header"  # road or junction at hand, for messages
+    warnings: Counter[str] = field(default_factory=Counter)  # count by kind
+    counts: Counter[str] = field(default_factory=Counter)  # records by kind
 
     def error(self, what: str, hint: str) -> ConversionError:
         """An error that names file and place."""

@@ -55,33 +55,22 @@ class LaneRun:
 
 @dataclass
 class ConnectorRun:
-    """A lane connector: pieces in the direction of travel, from one lane to another.
+    """A lane connector: pieces in the direction of travel, from one lane to another."""
 
-    Attributes:
-        pieces: In the direction of travel.
-        source: Lane it comes from.
-        target: Lane it leads to.
-        junctions: OpenDRIVE junctions it lies in; empty for a seam.
-    """
-
-    pieces: list[Piece]
-    source: int
-    target: int
-    junctions: frozenset[str] = frozenset()
+    pieces: list[Piece]  # in the direction of travel
+    source: int  # lane it comes from
+    target: int  # lane it leads to
+    junctions: frozenset[str] = frozenset()  # openDRIVE junctions it lies in; empty for a seam
 
 
 @dataclass
 class LaneGraph:
-    """Lanes and connectors of the map.
+    """Lanes and connectors of the map."""
 
-    Attributes:
-        lanes: Lanes; those of one roadblock follow each other.
-        connectors: Lane connectors.
-        dropped: Drivable lanes that are part of neither: short, narrow, or dead ends in junctions.
-    """
-
+    # lanes; those of one roadblock follow each other
     lanes: list[LaneRun] = field(default_factory=list)
-    connectors: list[ConnectorRun] = field(default_factory=list)
+    connectors: list[ConnectorRun] = field(default_factory=list)  # lane connectors
+    # drivable lanes that are part of neither: short, narrow, or dead ends in junctions
     dropped: list[Piece] = field(default_factory=list)
 
 

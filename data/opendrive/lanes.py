@@ -30,15 +30,10 @@ class LaneKey(NamedTuple):
 
 @dataclass(frozen=True)
 class SectionBorders:
-    """Borders of all lanes of a section at K places.
+    """Borders of all lanes of a section at K places."""
 
-    Attributes:
-        inner: Per lane, (K,) distance t of the border next to the centre [m].
-        outer: Per lane, (K,) distance t of the other border [m].
-    """
-
-    inner: dict[int, FloatArray]
-    outer: dict[int, FloatArray]
+    inner: dict[int, FloatArray]  # per lane, (K,) distance t of the border next to the centre [m]
+    outer: dict[int, FloatArray]  # per lane, (K,) distance t of the other border [m]
 
 
 def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> FloatArray:

@@ -50,19 +50,13 @@ class Origin:
 
 @dataclass(frozen=True)
 class MapReport:
-    """What the conversion did.
+    """What the conversion did."""
 
-    Attributes:
-        warnings: What was repaired, inferred or left out: count by kind.
-        origins: Pieces of OpenDRIVE lanes behind every lane and connector.
-        checks: Self-checks: name and whether the map passes.
-        figures: Numbers behind the checks.
-    """
-
-    warnings: dict[str, int]
-    origins: tuple[Origin, ...]
+    warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
+    origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
+    # self-checks: name and whether the map passes
     checks: dict[str, bool] = field(default_factory=dict)
-    figures: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
 
 
 def build_road_map(

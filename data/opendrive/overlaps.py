@@ -31,17 +31,11 @@ _MAX_VANISHED = 8  # lanes in a row that lie within crossings
 
 @dataclass(frozen=True)
 class Trace:
-    """Points along a chain of pieces, to find places on it.
+    """Points along a chain of pieces, to find places on it."""
 
-    Attributes:
-        xy: (K, 2) centre points [m].
-        distance: (K,) along the reference lines from the start [m].
-        height: (K,) of the road [m].
-    """
-
-    xy: FloatArray
-    distance: FloatArray
-    height: FloatArray
+    xy: FloatArray  # (K, 2) centre points [m]
+    distance: FloatArray  # (K,) along the reference lines from the start [m]
+    height: FloatArray  # (K,) of the road [m]
 
     def nearest(self, points: FloatArray) -> list[int]:
         """Index of the nearest point for each of `points` (N, 2)."""

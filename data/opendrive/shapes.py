@@ -36,17 +36,11 @@ _NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 
 @dataclass(frozen=True)
 class SectionShape:
-    """Borders of one lane section at common places.
+    """Borders of one lane section at common places."""
 
-    Attributes:
-        s: (K,) places on the road, ascending [m].
-        inner: Per lane, (K, 2) border next to the centre [m].
-        outer: Per lane, (K, 2) other border [m].
-    """
-
-    s: FloatArray
-    inner: dict[int, FloatArray]
-    outer: dict[int, FloatArray]
+    s: FloatArray  # (K,) places on the road, ascending [m]
+    inner: dict[int, FloatArray]  # per lane, (K, 2) border next to the centre [m]
+    outer: dict[int, FloatArray]  # per lane, (K, 2) other border [m]
 
 
 class Shapes:

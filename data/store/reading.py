@@ -14,18 +14,9 @@ import pyarrow as pa
 
 from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
-from shiftsim.data.store import schema
+from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.review import REVIEW, read_reviews, require_blocks
-from shiftsim.data.store.tables import (
-    SCENARIOS,
-    Table,
-    digest,
-    map_file,
-    read_manifest,
-    recording_folder,
-    report_file,
-)
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
@@ -58,15 +49,15 @@ class ScenarioStore:
         self.path = path
         self.source = source or str(path.resolve())
         self._fetch = fetch
-        manifest = read_manifest(path)
+        manifest = tables.read_manifest(path)
         self.hash = str(manifest["hash"])
-        self._table = Table(path / SCENARIOS, schema.SCENARIOS).read()
+        self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
         self.reviews = read_reviews(path)
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
-        self._egos: dict[tuple[str, str], Table] = {}
+        self._egos: dict[tuple[str, str], tables.Table] = {}
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -138,11 +129,11 @@ class ScenarioStore:
 
     def map_file(self, city: str) -> Path:
         """File of a map."""
-        return self._fetched(map_file(self.path, city))
+        return self._fetched(tables.map_file(self.path, city))
 
     def recording_folder(self, name: str) -> Path:
         """Folder of a recording."""
-        return self._fetched(recording_folder(self.path, name))
+        return self._fetched(tables.recording_folder(self.path, name))
 
     def _fetched(self, place: Path) -> Path:
         self._fetch(place.relative_to(self.path).as_posix())
@@ -154,7 +145,7 @@ class ScenarioStore:
             self._recordings[name] = open_recording(self.recording_folder(name))
         return self._recordings[name]
 
-    def _ego(self, recording: str, name: str) -> Table:
+    def _ego(self, recording: str, name: str) -> tables.Table:
         key = (recording, name)
         if key not in self._egos:
             _limit(self._egos)
@@ -207,10 +198,10 @@ def window_of(row: dict[str, Any]) -> Window:
 
 def read_report(store: Path, city: str) -> dict[str, Any]:
     """What a store says about the conversion of a city; empty where it says nothing."""
-    path = report_file(store, city)
+    path = tables.report_file(store, city)
     try:
-        manifest = read_manifest(store)
-        if manifest["files"].get(path.relative_to(store).as_posix()) != digest(path):
+        manifest = tables.read_manifest(store)
+        if manifest["files"].get(path.relative_to(store).as_posix()) != tables.digest(path):
             return {}
         content: dict[str, Any] = json.loads(path.read_text("utf-8"))
     except (DataError, OSError, ValueError):

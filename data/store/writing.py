@@ -11,25 +11,9 @@ from typing import Any
 import pyarrow as pa
 
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import schema
+from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import window_of
-from shiftsim.data.store.tables import (
-    FRAMES,
-    MANIFEST,
-    PARTIAL,
-    SCENARIOS,
-    TRACKS,
-    Table,
-    digest,
-    ego_file,
-    map_file,
-    read_manifest,
-    recording_folder,
-    report_file,
-    write_blocks,
-    write_json,
-)
 from shiftsim.data.store.tracks import write_ego, write_recording
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
@@ -70,12 +54,16 @@ class StoreWriter:
         self._rows: dict[str, dict[str, Any]] = {}
         self._files: dict[str, str] = {}
         self._cities: dict[str, str] = {}
-        if (self.path / MANIFEST).exists():
-            self._files = dict(read_manifest(self.path)["files"])
-            table = Table(self.path / SCENARIOS, schema.SCENARIOS).read()
+        if (self.path / tables.MANIFEST).exists():
+            self._files = dict(tables.read_manifest(self.path)["files"])
+            table = tables.Table(self.path / tables.SCENARIOS, schema.SCENARIOS).read()
             self._rows = {row["token"]: row for row in table.to_pylist()}
             self._cities = {row["recording"]: row["city"] for row in self._rows.values()}
-        elif self.path.is_dir() and any(self.path.iterdir()) and not (self.path / PARTIAL).is_dir():
+        elif (
+            self.path.is_dir()
+            and any(self.path.iterdir())
+            and not (self.path / tables.PARTIAL).is_dir()
+        ):
             raise DataError(
                 f"{self.path}: the folder is not empty and not a store",
                 hint="give a new folder, or a store to add to",
@@ -105,23 +93,23 @@ class StoreWriter:
 
     def add_map(self, road: VectorMap) -> None:
         """Write a map."""
-        path = map_file(self.path, road.name)
+        path = tables.map_file(self.path, road.name)
         write_map(path, road)
         self._note(path)
 
     def add_recording(self, recording: Recording) -> None:
         """Write a recording."""
-        folder = recording_folder(self.path, recording.log_name)
+        folder = tables.recording_folder(self.path, recording.log_name)
         write_recording(folder, recording)
-        self._note(folder / FRAMES)
-        self._note(folder / TRACKS)
+        self._note(folder / tables.FRAMES)
+        self._note(folder / tables.TRACKS)
         self._cities[recording.log_name] = recording.city
 
     def add_ego(self, ego: EgoTrace) -> None:
         """Write the states of an ego."""
-        folder = recording_folder(self.path, ego.log_name)
+        folder = tables.recording_folder(self.path, ego.log_name)
         write_ego(folder, ego)
-        self._note(ego_file(folder, ego.name))
+        self._note(tables.ego_file(folder, ego.name))
 
     def add_window(self, window: Window) -> None:
         """Add a scenario; its recording and ego are added before.
@@ -129,8 +117,8 @@ class StoreWriter:
         Raises:
             DataError: The recording or the ego is not in the store.
         """
-        folder = recording_folder(self.path, window.log_name)
-        for path in (folder / FRAMES, ego_file(folder, window.ego)):
+        folder = tables.recording_folder(self.path, window.log_name)
+        for path in (folder / tables.FRAMES, tables.ego_file(folder, window.ego)):
             if self._name(path) not in self._files:
                 raise DataError(
                     f"scenario {window.token!r}: the store does not have {self._name(path)}",
@@ -148,7 +136,7 @@ class StoreWriter:
             log_name: Name of the recording.
             rows: `window_row` of its scenarios.
         """
-        target = recording_folder(self.path, log_name)
+        target = tables.recording_folder(self.path, log_name)
         below = f"{self._name(target)}/"
         self._files = {n: d for n, d in self._files.items() if not n.startswith(below)}
         self._rows = {t: row for t, row in self._rows.items() if row["recording"] != log_name}
@@ -161,20 +149,20 @@ class StoreWriter:
 
     def add_report(self, city: str, content: dict[str, Any]) -> None:
         """Write what is to be known about the conversion of a city."""
-        path = report_file(self.path, city)
-        write_json(path, content)
+        path = tables.report_file(self.path, city)
+        tables.write_json(path, content)
         self._note(path)
 
     def close(self) -> None:
         """Write the list of scenarios and the manifest."""
         rows = [self._rows[token] for token in sorted(self._rows)]
         table = pa.Table.from_pylist(rows, schema=schema.SCENARIOS)
-        write_blocks(self.path / SCENARIOS, [table])
-        self._note(self.path / SCENARIOS)
+        tables.write_blocks(self.path / tables.SCENARIOS, [table])
+        self._note(self.path / tables.SCENARIOS)
         files = dict(sorted(self._files.items()))
         content = hashlib.sha256(json.dumps(files).encode()).hexdigest()
-        write_json(
-            self.path / MANIFEST,
+        tables.write_json(
+            self.path / tables.MANIFEST,
             {
                 "format": schema.FORMAT,
                 "version": schema.VERSION,
@@ -187,4 +175,4 @@ class StoreWriter:
         return path.relative_to(self.path).as_posix()
 
     def _note(self, path: Path) -> None:
-        self._files[self._name(path)] = digest(path)
+        self._files[self._name(path)] = tables.digest(path)
