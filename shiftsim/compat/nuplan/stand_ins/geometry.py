@@ -4,11 +4,17 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import total_ordering
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
+
+
+def part(path: str, doc: str) -> Any:
+    """A property that is an attribute of a part: `part("center.x", "Of the centre [m].")`."""
+    return property(attrgetter(path), doc=doc)
 
 
 @total_ordering
@@ -45,7 +51,7 @@ class TimeDuration:
     @property
     def time_s(self) -> float:
         """The span [s]."""
-        return self.time_us / 1e6  # nuPlan: a division here, a product in TimePoint (§12 Q1)
+        return self.time_us / 1e6  # nuPlan rule 571: a division here, a product in TimePoint
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, TimeDuration):
@@ -109,7 +115,7 @@ class TimePoint:
     __radd__ = __add__
 
     def __sub__(self, other: object) -> Any:
-        # nuPlan: the difference of two time points is a time point, not a duration
+        # nuPlan rule 572: the difference of two time points is a time point, not a duration
         if isinstance(other, (TimeDuration, TimePoint)):
             return TimePoint(self.time_us - other.time_us)
         return NotImplemented
@@ -220,15 +226,9 @@ class TemporalStateSE2(StateSE2):
 
     time_point: TimePoint
 
-    @property
-    def time_us(self) -> int:
-        """Microseconds since the epoch."""
-        return self.time_point.time_us
+    time_us = part("time_point.time_us", "Microseconds since the epoch.")
 
-    @property
-    def time_seconds(self) -> float:
-        """Seconds since the epoch."""
-        return self.time_us * 1e-6
+    time_seconds = part("time_point.time_s", "Seconds since the epoch.")
 
 
 class StateVector2D:
