@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import MissingExtraError
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
-from shiftsim.report.palette import Look, looks
+from shiftsim.report.palette import Look, looks, new_figure, save_picture
 from shiftsim.report.paper import METRICS, traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate, Interval
@@ -24,7 +23,6 @@ _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 2, 2)), (0, (7, 2, 2, 2, 2, 2)))
 _SIZES = {"*": 1.7, "P": 1.2, "X": 1.2, "D": 0.85}  # markers of equal weight to the eye
 _SPREAD = 0.62  # how much of a place on the axis the planners share
-_DPI = 150
 _GREY = "0.45"
 
 
@@ -45,8 +43,7 @@ class Figure:
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""
         path = folder / f"{self.name}.{ending}"
-        plain = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-        self.drawn.savefig(path, dpi=_DPI, metadata=plain[ending])
+        save_picture(self.drawn, path)
         return path
 
 
@@ -56,12 +53,6 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    try:
-        import matplotlib.figure  # noqa: F401  # to fail here with a hint
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
-        ) from error
     out = []
     styles = looks(dict.fromkeys(group.planner for group in groups))
     for data in _named_apart(distinct_sets(groups)):
@@ -239,9 +230,7 @@ def _dot(
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure as Drawing
-
-    figure = Drawing(figsize=(size[0] * columns + 0.6, size[1] * rows + 1.1), layout="constrained")
+    figure = new_figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 1.1))
     return figure, figure.subplots(rows, columns, squeeze=False, sharey=True)
 
 
