@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import total_ordering
 from operator import attrgetter
 from typing import Any
 
@@ -17,11 +16,11 @@ def part(path: str, doc: str) -> Any:
     return property(attrgetter(path), doc=doc)
 
 
-@total_ordering
+@dataclass(init=False, order=True, unsafe_hash=True, repr=False, slots=True)
 class TimeDuration:
     """A span of time, whole microseconds; made with `from_us`, `from_ms` or `from_s`."""
 
-    __slots__ = ("time_us",)
+    time_us: int
 
     def __init__(self, *, time_us: int, _direct: bool = True) -> None:
         if _direct:
@@ -79,15 +78,6 @@ class TimeDuration:
         if isinstance(divisor, (int, float)):
             return self.from_s(self.time_s // divisor)
         return NotImplemented
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, TimeDuration) and self.time_us == other.time_us
-
-    def __lt__(self, other: object) -> Any:
-        return self.time_us < other.time_us if isinstance(other, TimeDuration) else NotImplemented
-
-    def __hash__(self) -> int:
-        return hash(self.time_us)
 
     def __repr__(self) -> str:
         return f"TimeDuration({self.time_s}s)"
