@@ -1,6 +1,6 @@
 """Figures of the published benchmark, to be shown beside own ones."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 
@@ -21,14 +21,14 @@ class Published:
     """
 
     source: str
-    cities: Mapping[str, tuple[str, ...]]
+    cities: Mapping[str, Sequence[str]]
     scenarios: Mapping[str, int]
-    columns: tuple[str, ...]
-    semantic_shift: Mapping[str, Mapping[str, tuple[float, ...]]]
-    noises: tuple[str, ...]
-    robustness: Mapping[str, Mapping[str, Mapping[str, tuple[tuple[float, ...], ...]]]]
-    sets: tuple[str, ...]
-    comparison: Mapping[str, tuple[str, ...]]
+    columns: Sequence[str]
+    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]
+    noises: Sequence[str]
+    robustness: Mapping[str, Mapping[str, Mapping[str, Sequence[Sequence[float]]]]]
+    sets: Sequence[str]
+    comparison: Mapping[str, Sequence[str]]
 
     def abbreviation(self, city: str) -> str:
         """The paper's abbreviation of a city; empty for other cities."""

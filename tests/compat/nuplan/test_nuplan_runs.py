@@ -101,5 +101,5 @@ def test_maps_and_their_objects_outlive_a_scenario():
     lanes = set()
     for _ in range(3):
         shiftsim.simulate(scenario, wrapped)
-        lanes.add(id(wrapped._planner._road.edge(0)))
+        lanes.add(id(wrapped._planner._road.object("edges", 0)))
     assert len(lanes) == 1
