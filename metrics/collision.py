@@ -96,6 +96,7 @@ def flat_tracks(tracks: Tracks) -> FlatTracks:
 
 def first_contacts(ego: Ego, tracks: FlatTracks) -> Contacts:
     """When and how the ego first touches each track."""
+    # nuPlan rule 83: only the first contact with a track is classified
     count = len(tracks.is_static)
     out = Contacts(np.full(count, len(ego.states)), np.zeros(count, np.int64), np.zeros(count))
     _first_contacts(ego, tracks, out)

@@ -53,7 +53,7 @@ def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
     if not edges:
         return None
     starts = [_project(map, edge, x, y) for edge in edges]
-    # nuPlan rule 38: the difference of headings is not wrapped
+    # nuPlan rule 120: the difference of headings is not wrapped
     return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
 
 
@@ -144,7 +144,7 @@ def make_fleet(
     target = default_target
     for agent, start in enumerate(starts):
         limit = float(map.speed_limits[start.edge])
-        # nuPlan rule 39: an agent without a limit inherits that of the agent before it
+        # nuPlan rule 121: an agent without a limit inherits that of the agent before it
         target = limit if np.isfinite(limit) and limit != 0.0 else target
         fleet.target[agent] = target
         fleet.route[agent, 0] = start.edge

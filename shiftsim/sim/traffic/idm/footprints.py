@@ -42,7 +42,7 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
     after = first_after(path, size, first)
     if after == size or not path[0, PROGRESS] < last:
-        # nuPlan rule 45: at an end of the path two vertices are left
+        # nuPlan rule 127: at an end of the path two vertices are left
         head = size - 2 if after == size else 0
         for vertex in range(2):
             line[vertex, 0] = path[head + vertex, 0]

@@ -40,7 +40,7 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
     if not fleet.progress[agent] < path_end and not _in_corridor(
         footprints, agent, half_width, size, scratch
     ):
-        return OFF_PATH, 0.0  # nuPlan rule 46
+        return OFF_PATH, 0.0  # nuPlan rule 128
     found = _list_near(footprints, agent, half_width, size, scratch)
     best, lead = np.inf, FREE
     for _ in range(found):

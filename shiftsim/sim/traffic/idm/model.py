@@ -79,7 +79,7 @@ class IdmTraffic:
         replayed = np.flatnonzero(is_replayed)
         graph = lane_graph(scenario.map)
         self._scene = make_scene(self._parameters, graph, fleet, agents, replayed)
-        # nuPlan rule 47: the first gaps are measured between boxes on the lanes, not footprints
+        # nuPlan rule 129: the first gaps are measured between boxes on the lanes, not footprints
         for agent, start in enumerate(placed):
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
         lights, edges = scenario.traffic_lights, scenario.map.edges.index
@@ -100,7 +100,7 @@ class IdmTraffic:
         scene = self._scene
         if scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
-        # nuPlan rule 48: the ego is one step old, lights and replayed tracks are one step ahead
+        # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
         scene.graph.status[self._light_edges] = self._lights[iteration + 1]
         end, what, first = -1, 0, BEGIN
         while end != DONE:

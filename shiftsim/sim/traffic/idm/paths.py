@@ -54,7 +54,7 @@ def finish_path(path: FloatArray, size: int) -> int:
     """
     progress = 0.0
     kept = 0
-    for vertex in range(size - 1):  # nuPlan rule 40: the last vertex is always lost
+    for vertex in range(size - 1):  # nuPlan rule 122: the last vertex is always lost
         x, y = path[vertex, 0], path[vertex, 1]
         heading = path[vertex, HEADING]
         dx, dy = path[vertex + 1, 0] - x, path[vertex + 1, 1] - y
@@ -130,7 +130,7 @@ def choose_successor(graph: LaneGraph, edge: int) -> int:
     best, chosen = np.inf, -1
     for entry in range(graph.outgoing.ptr[edge], graph.outgoing.ptr[edge + 1]):
         following = graph.outgoing.items[entry]
-        # nuPlan rule 44: with lights only green is open, without any listed state but red
+        # nuPlan rule 126: with lights only green is open, without any listed state but red
         if graph.has_lights[following]:
             if graph.status[following] != _GREEN:
                 continue
@@ -174,7 +174,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
     after = first_after(path, size, progress)
     if after == size:
-        # nuPlan rule 45: at its very end a path is left with its last two vertices
+        # nuPlan rule 127: at its very end a path is left with its last two vertices
         for column in range(3):
             path[0, column] = path[size - 2, column]
             path[1, column] = path[size - 1, column]

@@ -50,7 +50,7 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
         if not fleet.alive[agent]:
             continue
         if agent != first:
-            # nuPlan rule 41: agents move one after the other, and see where those before them went
+            # nuPlan rule 123: agents move one after the other, and see where those before them went
             lead, gap = find_lead(scene, agent)
             if lead == OFF_PATH:
                 return STRAYED, agent
@@ -92,14 +92,14 @@ def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, spa
     heading = fleet.pose[agent, 2]
     lead_speed, lead_heading = 0.0, heading
     if lead < 0:
-        # nuPlan rule 42: on a free road the agent brakes for the end of its path
+        # nuPlan rule 124: on a free road the agent brakes for the end of its path
         path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
         gap = path_end - fleet.progress[agent] - 0.5 * fleet.size[agent, 0]
     elif lead < len(scene.agents):
         lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
     elif lead == len(scene.agents):
         lead_speed, lead_heading = np.hypot(ego[VX], ego[VY]), ego[EGO_HEADING]
-    # nuPlan rule 43: replayed tracks stand still, whatever their velocity
+    # nuPlan rule 125: replayed tracks stand still, whatever their velocity
     limit = scene.graph.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]
     if limit > 0.0:
         fleet.target[agent] = limit
