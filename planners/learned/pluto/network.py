@@ -1,4 +1,4 @@
-"""The network of PLUTO (planner-pluto.md §3), with the names and shapes of its checkpoint."""
+"""The network of PLUTO, with the names and shapes of its checkpoint."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from shiftsim.planners.learned.network.blocks import (
     history_steps,
 )
 from shiftsim.planners.learned.network.rows import Linear, Scenes, without_padding
+from shiftsim.planners.learned.pluto.inputs import Inputs
 from shiftsim.planners.learned.pluto.network_decoder import (
     FourierEmbedding,
     MlpLayer,
@@ -69,67 +70,6 @@ DRIVE_SCALES = {
     "planning_decoder.pi_head.mlp.3.weight": 6.0,
     "planning_decoder.pi_head.mlp.3.bias": 6.0,
 }
-
-
-class Inputs(NamedTuple):
-    """One batch: B scenes, A rows of agents of which the first is the ego, M polygons, K points.
-
-    Attributes:
-        position: (B, A, 21, 2) in the ego frame [m].
-        heading: (B, A, 21) [rad].
-        velocity: (B, A, 21, 2) [m/s].
-        shape: (B, A, 21, 2) width, length [m].
-        valid: (B, A, 21)
-        category: (B, A) indices of kinds.
-        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
-        points: (B, M, 3, K, 2) centre line, left and right boundary [m].
-        vectors: (B, M, K, 2) along the centre line, to the next point [m].
-        orientations: (B, M, K) of these vectors [rad].
-        centers: (B, M, 3) pose that stands for the polygon.
-        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
-        on_route: (B, M) 1 where the polygon is on the route.
-        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
-        has_limit: (B, M)
-        limit: (B, M) speed limit [m/s].
-        point_valid: (B, M, K)
-        object_pose: (B, S, 3) static objects x [m], y [m], heading [rad].
-        object_shape: (B, S, 2) width, length [m].
-        object_category: (B, S)
-        object_valid: (B, S)
-        line_points: (B, R, 120, 2) reference lines [m].
-        line_vectors: (B, R, 120, 2) to the next point [m].
-        line_orientations: (B, R, 120) [rad].
-        line_valid: (B, R, 120)
-        counts: How many agents, polygons, static objects and lines each scene has, the rest is
-            padding; None where nothing is.
-    """
-
-    position: Tensor
-    heading: Tensor
-    velocity: Tensor
-    shape: Tensor
-    valid: Tensor
-    category: Tensor
-    current_state: Tensor
-    points: Tensor
-    vectors: Tensor
-    orientations: Tensor
-    centers: Tensor
-    kind: Tensor
-    on_route: Tensor
-    light: Tensor
-    has_limit: Tensor
-    limit: Tensor
-    point_valid: Tensor
-    object_pose: Tensor
-    object_shape: Tensor
-    object_category: Tensor
-    object_valid: Tensor
-    line_points: Tensor
-    line_vectors: Tensor
-    line_orientations: Tensor
-    line_valid: Tensor
-    counts: Sequence[Sequence[int]] | None = None
 
 
 class Outputs(NamedTuple):
@@ -220,16 +160,7 @@ class PlutoNetwork(nn.Module):
         tokens[there] = x
         prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
         free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
-        trajectory, probability = self.planning_decoder(
-            seen.line_points,
-            seen.line_vectors,
-            seen.line_orientations,
-            seen.line_valid,
-            num_lines,
-            x,
-            scenes,
-            egos,
-        )
+        trajectory, probability = self.planning_decoder(seen, num_lines, x, scenes, egos)
         return Outputs(trajectory, probability, prediction, free, egos)
 
     def _encode(

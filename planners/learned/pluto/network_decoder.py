@@ -1,4 +1,4 @@
-"""The decoder of PLUTO's network: trajectories along reference lines (planner-pluto.md §3.3)."""
+"""The decoder of PLUTO's network: trajectories along reference lines."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder
 from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, present
+from shiftsim.planners.learned.pluto.inputs import Inputs
 
 NUM_FREQUENCIES = 64
 LINE_CHANNELS = 6
@@ -137,7 +138,7 @@ def make_lines(
     # a scene without any line that has points attends to all of them, and nothing reads it
     attended = valid | ~valid.any(dim=1, keepdim=True)
     logits = torch.zeros(valid.shape, device=valid.device).masked_fill(~attended, -torch.inf)
-    if misordered_masks:  # by mode, where the queries are ordered by scene (planner-pluto.md §3.3)
+    if misordered_masks:  # nuPlan rule 251: by mode, where the queries are ordered by scene
         logits = logits.repeat(modes, 1).reshape(len(valid), modes, -1)
     else:
         logits = logits[:, None]
@@ -168,10 +169,7 @@ class PlanningDecoder(nn.Module):
 
     def forward(
         self,
-        points: Tensor,
-        vectors: Tensor,
-        orientations: Tensor,
-        valid: Tensor,
+        seen: Inputs,
         counts: Sequence[int],
         tokens: Tensor,
         scenes: Scenes,
@@ -180,10 +178,7 @@ class PlanningDecoder(nn.Module):
         """Decode.
 
         Args:
-            points: (B, R, 120, 2) of the lines [m].
-            vectors: (B, R, 120, 2) to the next point [m].
-            orientations: (B, R, 120) [rad].
-            valid: (B, R, 120) points that exist.
+            seen: What the network reads.
             counts: How many lines of each scene are no padding.
             tokens: (T, 128) of the scenes.
             scenes: How they lie.
@@ -192,7 +187,7 @@ class PlanningDecoder(nn.Module):
         Returns:
             Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
         """
-        modes = self.m_emb.shape[2]
+        valid, modes = seen.line_valid, self.m_emb.shape[2]
         shape = (*valid.shape[:2], modes)
         trajectory = tokens.new_zeros(*shape, self.steps, 6)
         logits = tokens.new_full(shape, NEVER)
@@ -200,7 +195,7 @@ class PlanningDecoder(nn.Module):
             return trajectory, logits
         lines = make_lines(valid.any(dim=-1), counts, modes, misordered_masks=self.misordered_masks)
         there = present(counts, valid.shape[1], valid.device)
-        embedded = self._embed_lines(points, vectors, orientations, valid)[there]
+        embedded = self._embed_lines(seen)[there]
         wide = (len(embedded), modes, DIM)
         x = self.q_proj(
             torch.cat([embedded[:, None].expand(wide), self.m_emb[0].expand(wide)], dim=-1)
@@ -215,15 +210,14 @@ class PlanningDecoder(nn.Module):
         logits[there] = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
         return trajectory, logits
 
-    def _embed_lines(
-        self, points: Tensor, vectors: Tensor, orientations: Tensor, valid: Tensor
-    ) -> Tensor:
+    def _embed_lines(self, seen: Inputs) -> Tensor:
         """(B, R, 128)."""
+        points, angles = seen.line_points, seen.line_orientations
         parts = (
             points - points[:, :, :1],
-            vectors,
-            torch.stack([orientations.cos(), orientations.sin()], dim=-1),
+            seen.line_vectors,
+            torch.stack([angles.cos(), angles.sin()], dim=-1),
         )
-        start = torch.cat([points[:, :, 0], orientations[:, :, :1]], dim=-1)
-        out: Tensor = self.r_encoder(torch.cat(parts, dim=-1), valid) + self.r_pos_emb(start)
-        return out
+        start = torch.cat([points[:, :, 0], angles[:, :, :1]], dim=-1)
+        encoded: Tensor = self.r_encoder(torch.cat(parts, dim=-1), seen.line_valid)
+        return encoded + self.r_pos_emb(start)

@@ -20,7 +20,7 @@ from shiftsim.planners.learned.features import SAMPLES, AgentFeatures, PerMap, a
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
-from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
+from shiftsim.planners.learned.pluto.inputs import Inputs, scene_inputs, stack
 from shiftsim.planners.learned.pluto.proposals import (
     Output,
     best_proposals,
@@ -101,7 +101,7 @@ class Choice:
     braked: bool
 
 
-class Pluto(LearnedPlanner[SceneInputs, Output]):
+class Pluto(LearnedPlanner[Inputs, Output]):
     """PLUTO with its rule-based choice.
 
     Attributes:
@@ -143,7 +143,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         self.route = self.sight = self.choice = None
         self.degraded = ""
 
-    def features(self, observation: Observation) -> SceneInputs:
+    def features(self, observation: Observation) -> Inputs:
         """Arrays of the network; what they were made from is kept in `sight`."""
         scene = self._scene
         if scene is None:
@@ -180,14 +180,12 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
             return f"the history has {len(history.ego)} samples, not {SAMPLES}"
         return ""
 
-    def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
+    def infer(self, features: Sequence[Inputs]) -> list[Output]:
         """One forward pass."""
         import torch
 
-        from shiftsim.planners.learned.pluto.network import Inputs
-
         with torch.inference_mode():
-            outputs = self._network(Inputs(*stack(features, self._device)))
+            outputs = self._network(stack(features, self._device))
         arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
         return [
             Output(

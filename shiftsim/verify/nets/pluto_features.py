@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.planners.learned.map_features import CROSSWALK, RoadFeatures
-from shiftsim.planners.learned.pluto.inputs import SceneInputs
+from shiftsim.planners.learned.pluto.inputs import Inputs
 from shiftsim.planners.learned.pluto.planner import Pluto, Sight
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.nets.common import FEATURE, Loop
@@ -15,7 +15,7 @@ LAYERS = ("LANE", "LANE_CONNECTOR", "CROSSWALK")
 
 
 def compare_features(
-    loop: Loop, at: str, planner: Pluto, inputs: SceneInputs, seen: Observation
+    loop: Loop, at: str, planner: Pluto, inputs: Inputs, seen: Observation
 ) -> None:
     """Compare everything stored for one iteration that is made before the network.
 
@@ -60,7 +60,7 @@ def compare_features(
     _compare_static(loop, at, inputs)
 
 
-def _agents(inputs: SceneInputs) -> dict[str, Any]:
+def _agents(inputs: Inputs) -> dict[str, Any]:
     return {
         "agent.valid_mask": inputs.valid,
         "agent.position": inputs.position,
@@ -73,7 +73,7 @@ def _agents(inputs: SceneInputs) -> dict[str, Any]:
 
 
 def _where_valid(
-    file: Any, at: str, inputs: SceneInputs, name: str, ours: Any, theirs: Any
+    file: Any, at: str, inputs: Inputs, name: str, ours: Any, theirs: Any
 ) -> tuple[Any, Any]:
     """Entries of samples that exist; the others hold the origin of the map, moved."""
     mask = file[f"{at}/feature/agent.valid_mask"]
@@ -106,7 +106,7 @@ def _map(loop: Loop, near: RoadFeatures) -> dict[str, Any]:
     }
 
 
-def _lines(inputs: SceneInputs) -> dict[str, Any]:
+def _lines(inputs: Inputs) -> dict[str, Any]:
     return {
         "reference_line.position": inputs.line_points,
         "reference_line.vector": inputs.line_vectors,
@@ -127,7 +127,7 @@ def _compare_lines(loop: Loop, at: str, sight: Sight) -> None:
         loop.compare("pluto reference lines", name, line, loop.file[name], LINE)
 
 
-def _compare_static(loop: Loop, at: str, inputs: SceneInputs) -> None:
+def _compare_static(loop: Loop, at: str, inputs: Inputs) -> None:
     """Compare the static objects; nuPlan walks through a set, so their order means nothing."""
     prefix = f"{at}/feature/static_objects."
     names = ("position", "heading", "shape", "category", "valid_mask")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.planners.learned.pluto.inputs import SceneInputs, stack
+from shiftsim.planners.learned.pluto.inputs import Inputs, stack
 from shiftsim.planners.learned.pluto.planner import Choice, Pluto
 from shiftsim.planners.learned.pluto.proposals import Output
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, aggregate, nearest_line, score
@@ -77,20 +77,16 @@ def _compare_failure(loop: Loop, planner: Pluto, iteration: int) -> None:
     loop.compare("pluto failure", "makeshift", bool(planner.degraded), True)
 
 
-def _compare_network(
-    loop: Loop, at: str, inputs: SceneInputs, output: Output, network: Any
-) -> None:
+def _compare_network(loop: Loop, at: str, inputs: Inputs, output: Output, network: Any) -> None:
     """Compare what the planner's network said, where it is stored."""
     import torch
-
-    from shiftsim.planners.learned.pluto.network import Inputs
 
     prefix = f"{at}/net/"
     stored = [name for name in loop.file.arrays if name.startswith(prefix)]
     if not stored:
         return
     with torch.inference_mode():
-        made = network(Inputs(*stack([inputs], "cpu")))
+        made = network(stack([inputs], "cpu"))
         hidden = network.hidden_proj(made.ego)[0].numpy()
     ours = {name: getattr(output, name) for name in RAW} | {"hidden": hidden}
     present = np.concatenate([inputs.position[1:, -1], inputs.heading[1:, -1:]], axis=1)

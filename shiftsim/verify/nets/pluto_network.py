@@ -60,7 +60,7 @@ def network_inputs(arrays: dict[str, Any]) -> Any:
     """A batch for the network, from arrays by the names of the official features."""
     import torch
 
-    from shiftsim.planners.learned.pluto.network import Inputs
+    from shiftsim.planners.learned.pluto.inputs import Inputs
 
     def take(name: str) -> Any:
         return torch.from_numpy(np.ascontiguousarray(arrays[name]))
