@@ -1,4 +1,4 @@
-"""The arrays that PLUTO's network reads, of one scene and of a batch."""
+"""The arrays that PLUTO's network reads, of one scene and of a batch (planner-pluto.md §2)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,67 +15,34 @@ from shiftsim.world.state import AX, STEERING, VX, YAW_RATE
 Array = np.ndarray
 
 
-class Inputs(NamedTuple):
-    """B scenes, A rows of agents of which the first is the ego, M polygons, K points.
+class SceneInputs(NamedTuple):
+    """Fields of `nets.pluto.Inputs` without the axis of the batch; float32, int64 and bool."""
 
-    Arrays of one scene, without the axis B, or tensors of a batch; float32, int64 and bool.
-
-    Attributes:
-        position: (B, A, 21, 2) in the ego frame [m].
-        heading: (B, A, 21) [rad].
-        velocity: (B, A, 21, 2) [m/s].
-        shape: (B, A, 21, 2) width, length [m].
-        valid: (B, A, 21)
-        category: (B, A) indices of kinds.
-        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
-        points: (B, M, 3, K, 2) centre line, left and right boundary [m].
-        vectors: (B, M, K, 2) along the centre line, to the next point [m].
-        orientations: (B, M, K) of these vectors [rad].
-        centers: (B, M, 3) pose that stands for the polygon.
-        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
-        on_route: (B, M) 1 where the polygon is on the route.
-        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
-        has_limit: (B, M)
-        limit: (B, M) speed limit [m/s].
-        point_valid: (B, M, K)
-        object_pose: (B, S, 3) static objects x [m], y [m], heading [rad].
-        object_shape: (B, S, 2) width, length [m].
-        object_category: (B, S)
-        object_valid: (B, S)
-        line_points: (B, R, 120, 2) reference lines [m].
-        line_vectors: (B, R, 120, 2) to the next point [m].
-        line_orientations: (B, R, 120) [rad].
-        line_valid: (B, R, 120)
-        counts: How many agents, polygons, static objects and lines each scene has, the rest is
-            padding; None where nothing is.
-    """
-
-    position: Any
-    heading: Any
-    velocity: Any
-    shape: Any
-    valid: Any
-    category: Any
-    current_state: Any
-    points: Any
-    vectors: Any
-    orientations: Any
-    centers: Any
-    kind: Any
-    on_route: Any
-    light: Any
-    has_limit: Any
-    limit: Any
-    point_valid: Any
-    object_pose: Any
-    object_shape: Any
-    object_category: Any
-    object_valid: Any
-    line_points: Any
-    line_vectors: Any
-    line_orientations: Any
-    line_valid: Any
-    counts: Sequence[Sequence[int]] | None = None
+    position: Array
+    heading: Array
+    velocity: Array
+    shape: Array
+    valid: Array
+    category: Array
+    current_state: Array
+    points: Array
+    vectors: Array
+    orientations: Array
+    centers: Array
+    kind: Array
+    on_route: Array
+    light: Array
+    has_limit: Array
+    limit: Array
+    point_valid: Array
+    object_pose: Array
+    object_shape: Array
+    object_category: Array
+    object_valid: Array
+    line_points: Array
+    line_vectors: Array
+    line_orientations: Array
+    line_valid: Array
 
 
 def scene_inputs(
@@ -84,7 +51,7 @@ def scene_inputs(
     road: RoadFeatures,
     static: StaticObjects,
     lines: LineFeatures,
-) -> Inputs:
+) -> SceneInputs:
     """What the network reads.
 
     Args:
@@ -94,7 +61,7 @@ def scene_inputs(
         static: Static objects.
         lines: Reference lines.
     """
-    return Inputs(
+    return SceneInputs(
         position=agents.position,
         heading=agents.heading,
         velocity=agents.velocity,
@@ -140,16 +107,15 @@ def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> Array:
     return out
 
 
-def stack(scenes: Sequence[Inputs], device: str) -> Inputs:
-    """A batch; scenes with fewer rows are filled up with zeros."""
+def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
+    """Values of `nets.pluto.Inputs`; scenes with fewer rows are filled up with zeros."""
     import torch
 
     out: list[Any] = []
-    for arrays in list(zip(*scenes, strict=True))[:-1]:
+    for _, *arrays in zip(SceneInputs._fields, *scenes, strict=True):
         batch = np.zeros((len(arrays), *np.max([a.shape for a in arrays], axis=0)), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
         out.append(torch.from_numpy(batch).to(device))
     parts = ("category", "kind", "object_category", "line_valid")
-    counts = [[len(getattr(scene, name)) for scene in scenes] for name in parts]
-    return Inputs._make([*out, counts])
+    return [*out, [[len(getattr(scene, name)) for scene in scenes] for name in parts]]

@@ -17,7 +17,7 @@ from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLig
 torch = pytest.importorskip("torch")
 
 from shiftsim.planners.learned.pluto.inputs import stack  # noqa: E402  # needs torch
-from shiftsim.planners.learned.pluto.network import build_network  # noqa: E402  # needs torch
+from shiftsim.planners.learned.pluto.network import Inputs, build_network  # noqa: E402  # needs torch
 from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto  # noqa: E402  # needs torch
 
 pytestmark = pytest.mark.learned
@@ -136,10 +136,10 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
     one = two._replace(**{name: getattr(two, name)[:1] for name in of_lines})
     official, ours = build_network({"misordered_masks": True}), build_network()
     for network in (official, ours):
-        network.load_state_dict(rough._network.state_dict())
+        network.load_state_dict(rough.network.state_dict())
         network.eval()
     alike, unlike = (
-        [network(stack(batch, "cpu")).trajectory for network in (official, ours)]
+        [network(Inputs(*stack(batch, "cpu"))).trajectory for network in (official, ours)]
         for batch in ([two, two], [two, one])
     )
     assert torch.equal(*alike)
