@@ -33,7 +33,7 @@ from shiftsim.planners.pdm.route import (
 from shiftsim.planners.pdm.scorer import Place
 from shiftsim.planners.pdm.step import Step, plan_step
 from shiftsim.planners.proposals.areas import select_areas
-from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import known_blocks
 from shiftsim.planners.routes.lanes import red_lanes

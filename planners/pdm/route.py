@@ -8,7 +8,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import PlannerError
 from shiftsim.planners.proposals.areas import Areas, covering, index_ranks, make_areas
-from shiftsim.planners.proposals.contacts import EgoBox
+from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.routes.lanes import HINT, deviation, lane_at, lanes_of
 from shiftsim.planners.routes.search import Search, search_cheapest

@@ -16,7 +16,7 @@ from shiftsim.planners.pdm.route import (
     start_route,
 )
 from shiftsim.planners.proposals.areas import select_areas
-from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.routes.paths import centerline
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
