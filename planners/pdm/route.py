@@ -86,7 +86,7 @@ def current_lane(
     tied = [area for area, error in zip(areas, errors, strict=True) if error == least]
     if len(tied) > 1:
         tied = in_index_order(route, selected, tied)
-    return int(route.areas.edge[tied[0]])
+    return int(route.areas.lane[tied[0]])
 
 
 def lanes_at(
@@ -98,7 +98,7 @@ def lanes_at(
     under = found[: covering(areas, selected, x, y, found)].tolist()
     under = [area for area in under if areas.on_route[area]]
     lines, heading = road.baselines, float(ego[2])
-    return under, [deviation(lines, int(areas.edge[a]), 1, x, y, heading)[1] for a in under]
+    return under, [deviation(lines, int(areas.lane[a]), 1, x, y, heading)[1] for a in under]
 
 
 def in_index_order(route: Route, selected: IntArray, chosen: list[int]) -> list[int]:

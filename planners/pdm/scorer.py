@@ -81,7 +81,7 @@ def score(
     states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    no_limits = np.zeros(len(place.areas.edge))
+    no_limits = np.zeros(len(place.areas.lane))
     at = find_places(states, size, place.areas, place.selected, no_limits, by_center=True)
     rows = np.arange(states.shape[1]) // 2
     seen = (rows[-1] * 2 + TTC_STEPS[-1]) // 2 + 1  # forecast maps that are looked at

@@ -42,19 +42,19 @@ class Slabs(NamedTuple):
 
 
 class Areas(NamedTuple):
-    """Areas of all edges of a map, then of its car parks.
+    """Areas of all lanes and connectors of a map, then of its car parks.
 
     Attributes:
         polygons: The areas.
         slabs: Their rings.
-        on_route: (M,) whether the route holds an edge of that id.
-        edge: (M,) the edge of that id; for a car park usually -1.
+        on_route: (M,) whether the route holds a lane of that id.
+        lane: (M,) the lane of that id; for a car park usually -1.
     """
 
     polygons: Polygons
     slabs: Slabs
     on_route: BoolArray
-    edge: IntArray
+    lane: IntArray
 
 
 def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
@@ -69,11 +69,11 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
         )
     # nuPlan rule 181: membership is a test on ids, which car parks may share with lanes
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
-    edge = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
-    return areas_of(polygons, np.isin(edge, np.array(route_lanes)), edge)
+    lane = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
+    return areas_of(polygons, np.isin(lane, np.array(route_lanes)), lane)
 
 
-def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
+def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     """Areas from polygons, and the fields of `Areas`."""
     starts, stops = polygons.ring_ptr[:-1], polygons.ring_ptr[1:]
     num_slabs = (stops - starts) // EDGES_PER_SLAB + 1
@@ -84,7 +84,7 @@ def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
     edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
     _slice(polygons.xy, rings, grid, fill, edge_ends)
     slabs = Slabs(polygons.xy, rings, grid, edge_ptr, edge_ends, polygons.poly_ptr, polygons.bounds)
-    return Areas(polygons, slabs, on_route, edge)
+    return Areas(polygons, slabs, on_route, lane)
 
 
 @lean_kernel
@@ -115,11 +115,11 @@ def _slice(
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
     """Areas of the blocks and the car parks that touch a square around (x, y) [m], in their order.
 
-    Edges come by block, in the order of the blocks.
+    Lanes come by block, in the order of the blocks.
     """
     square = square_around(x, y, half_width)
-    edges = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
-    return np.concatenate([*edges, meeting(road.car_parks.polygons, square) + len(road.edges)])
+    lanes = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
+    return np.concatenate([*lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
 
 
 def near_areas(areas: Areas, selected: IntArray, points: FloatArray) -> IntArray:

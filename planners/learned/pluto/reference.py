@@ -64,7 +64,7 @@ class RouteLanes(NamedTuple):
         blocks: Blocks of the corrected route, each once.
         starts: Connectors, then lanes of these blocks, in the order of the map.
         has_block: (B,) whether a block is one of these.
-        is_on: (E,) whether an edge belongs to one of these blocks.
+        is_on: (E,) whether a lane belongs to one of these blocks.
         areas: Areas of the map, those of the route marked.
         limits: (M,) speed limits [m/s].
         paths: Made so far, by their lanes.
@@ -93,9 +93,9 @@ def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> Route
     has_block = np.zeros(len(road.blocks), np.bool_)
     has_block[unique] = True
     is_on = (road.block_of != NONE) & has_block[road.block_of]
-    edges = np.flatnonzero(is_on)
-    starts = np.concatenate([edges[edges >= road.num_lanes], edges[edges < road.num_lanes]])
-    on_route = np.isin(made.areas.edge, edges)
+    lanes = np.flatnonzero(is_on)
+    starts = np.concatenate([lanes[lanes >= road.num_lanes], lanes[lanes < road.num_lanes]])
+    on_route = np.isin(made.areas.lane, lanes)
     areas = made.areas._replace(on_route=on_route)
     return RouteLanes(unique, starts, has_block, is_on, areas, made.limits, {})
 
@@ -132,7 +132,7 @@ def reference_lines(
         road.edges.polygons, road.baselines, route.starts, rear, center[0], center[1], found
     )
     starts = found[:count].tolist()
-    after = {edge for start in starts for edge in road.outgoing.at(start).tolist()}
+    after = {lane for start in starts for lane in road.outgoing.at(start).tolist()}
     lines, lengths = [], []
     for start in starts:
         if start in after:
@@ -151,17 +151,17 @@ def reference_lines(
 def _paths_from(
     road: VectorMap, is_on: BoolArray, start: int, behind: float
 ) -> list[tuple[int, ...]]:
-    """Sequences of lanes of the route from one lane on, depth first in the order of the edges."""
+    """Sequences of lanes of the route from one lane on, depth first in the order of the map."""
     paths: list[tuple[int, ...]] = []
     stack: list[tuple[tuple[int, ...], float]] = [((start,), road.baselines.length(start) - behind)]
     while stack:
         path, length = stack.pop()
-        following = [edge for edge in road.outgoing.at(path[-1]).tolist() if is_on[edge]]
+        following = [lane for lane in road.outgoing.at(path[-1]).tolist() if is_on[lane]]
         if not following or len(path) == MAX_LANES or length > LINE_LENGTH:
             paths.append(path)
             continue
         stack += [
-            ((*path, edge), length + road.baselines.length(edge)) for edge in reversed(following)
+            ((*path, lane), length + road.baselines.length(lane)) for lane in reversed(following)
         ]
     return paths
 

@@ -63,12 +63,12 @@ class Place(NamedTuple):
 
     Attributes:
         drivable: Drivable areas of the step.
-        edges: Areas of lanes and connectors.
+        lanes: Areas of lanes and connectors.
         baseline: (K, 2) line along which progress is measured [m].
     """
 
     drivable: Drivable
-    edges: Polygons
+    lanes: Polygons
     baseline: FloatArray
 
 
@@ -95,7 +95,7 @@ def score(
     size, areas = ego_box(vehicle), drivable.areas
     at = find_places(driven, size, areas, drivable.selected, drivable.limits, by_center=False)
     near = near_others(at, others, driven.shape[1], DT * TTC_STEPS[-1])
-    red = run_lights(at.corners, place.edges, world.lights)
+    red = run_lights(at.corners, place.lanes, world.lights)
     clear, fault_times = collisions(at, others, near, red)
     ttc = times_to_collision(at, others, near)
     factors = np.stack([clear, on_road(at.flags[..., OFF_ROAD]), direction(driven, at.flags)])

@@ -64,7 +64,7 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
         "start_candidates": [block_ids[block] for block in route.start.others],
         "corrected": [block_ids[block] for block in route.corrected],
         "route_lanes": [edge_ids[edge] for edge in route.lanes.tolist()],
-        "intersecting_lanes": [edge_ids[route.areas.edge[area]] for area in ordered],
+        "intersecting_lanes": [edge_ids[route.areas.lane[area]] for area in ordered],
         "heading_errors": [errors[under.index(area)] for area in ordered],
         "current_lane": edge_ids[lane],
         "n_centerline": len(line),
