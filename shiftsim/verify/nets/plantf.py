@@ -129,7 +129,7 @@ def network_inputs(planner: str, arrays: Source) -> Any:
 
     kind = network_module(planner).Inputs
     values = {}
-    for field in set(INPUTS) & set({item.name for item in fields(kind)}):
+    for field in set(INPUTS) & {item.name for item in fields(kind)}:
         if field == "object_pose":
             pose = (arrays["static_objects.position"], arrays["static_objects.heading"][..., None])
             array = np.concatenate(pose, axis=-1)
