@@ -17,7 +17,7 @@ from shiftsim.geometry.rings import ring_distance
 from shiftsim.planners.pdm.corridor import Corridor, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks
 from shiftsim.planners.pdm.parameters import FollowingModel
-from shiftsim.planners.proposals.contacts import EgoBox
+from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS
 from shiftsim.world.state import VX
 

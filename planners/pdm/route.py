@@ -1,15 +1,14 @@
 """The lanes PDM-Closed follows: corrected route, current lane, centerline."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.planners.proposals.areas import Areas, covering, index_ranks, make_areas
-from shiftsim.planners.proposals.contacts import EgoBox
+from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.routes.lanes import HINT, deviation, lane_at, lanes_of
 from shiftsim.planners.routes.search import Search, search_cheapest
@@ -87,7 +86,7 @@ def current_lane(
     tied = [area for area, error in zip(areas, errors, strict=True) if error == least]
     if len(tied) > 1:
         tied = in_index_order(route, selected, tied)
-    return int(route.areas.edge[tied[0]])
+    return int(route.areas.lane[tied[0]])
 
 
 def lanes_at(
@@ -99,7 +98,7 @@ def lanes_at(
     under = found[: covering(areas, selected, x, y, found)].tolist()
     under = [area for area in under if areas.on_route[area]]
     lines, heading = road.baselines, float(ego[2])
-    return under, [deviation(lines, int(areas.edge[a]), 1, x, y, heading)[1] for a in under]
+    return under, [deviation(lines, int(areas.lane[a]), 1, x, y, heading)[1] for a in under]
 
 
 def in_index_order(route: Route, selected: IntArray, chosen: list[int]) -> list[int]:
@@ -122,12 +121,6 @@ def follow_route(road: VectorMap, route: list[int], current: int) -> Search:
         road.baselines.length,
         lambda lane: bool(road.block_of[lane] == goal),
     )
-
-
-def centerline(road: VectorMap, lanes: Iterable[int]) -> FloatArray:
-    """Poses (K, 3) along the baselines of lanes x [m], y [m], heading [rad]."""
-    lines = [road.baselines.at(lane) for lane in lanes]
-    return np.concatenate([np.column_stack([xy, vertex_headings(xy)]) for xy in lines])
 
 
 def offset_poses(poses: FloatArray, offset: float) -> FloatArray:

@@ -7,30 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing, circle_around
 from shiftsim.geometry.paths import Path, project
 from shiftsim.planners.pdm.parameters import PdmParameters
-from shiftsim.planners.proposals.areas import (
-    MULTIPLE,
-    OFF_ROAD,
-    OFF_ROUTE,
-    Areas,
-    find_places,
-    near_areas,
-)
+from shiftsim.planners.proposals.areas import Areas
 from shiftsim.planners.proposals.comfort import comfort
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
-    EgoBox,
     Others,
     first_faults,
     hits,
     near_others,
-    place_ego,
     project_box,
 )
+from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, Places, find_places
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.state import VX, VY, X, Y
@@ -89,26 +81,18 @@ def score(
     states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    count, steps = states.shape[:2]
-    corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
-    place_ego(states, size, corners, centers)
-    flags, limits = np.empty((count, steps, 3), np.bool_), np.zeros(len(place.areas.edge))
-    lanes = near_areas(place.areas, place.selected, corners)
-    find_places(place.areas, lanes, limits, corners, centers, flags, np.empty((count, steps)))
-    off_lane = flags[..., MULTIPLE] | flags[..., OFF_ROAD]
-    rows = np.arange(steps) // 2
-    seen = (steps - 1 + TTC_STEPS[-1]) // 2 + 1  # forecast maps that are looked at
-    near = near_others(states, corners, others, seen, DT * TTC_STEPS[-1])
-    no_collision, collision_index = np.empty(count), np.empty(count)
+    no_limits = np.zeros(len(place.areas.lane))
+    at = find_places(states, size, place.areas, place.selected, no_limits, by_center=True)
+    rows = np.arange(states.shape[1]) // 2
+    seen = (rows[-1] * 2 + TTC_STEPS[-1]) // 2 + 1  # forecast maps that are looked at
+    near = near_others(at, others, seen, DT * TTC_STEPS[-1])
     # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
-    first_faults(states, corners, off_lane, others, near, rows, True, no_collision, collision_index)
-    ttc_index = np.empty(count)
-    _first_violations(states, corners, off_lane, others, near, place.intersections, ttc_index)
-    raw, off_route = np.empty(count), np.empty(count)
-    _travel(centers, flags[..., OFF_ROUTE].copy(), place.centerline, raw, off_route)
+    no_collision, collision_index = first_faults(at, others, near, rows, True)
+    ttc_index = _first_violations(at, others, near, place.intersections)
+    raw, off_route = _travel(at, place.centerline)
     low, high = params.direction_limits
     direction = np.where(off_route < low, 1.0, np.where(off_route < high, 0.5, 0.0))
-    drivable = np.where(flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
+    drivable = np.where(at.flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
     factor = no_collision * drivable * direction
     progress = normalise(raw, factor)
     ttc = np.where(np.isfinite(ttc_index), 0.0, 1.0)
@@ -124,7 +108,7 @@ def score(
         raw_progress=raw,
         collision_index=collision_index,
         ttc_index=ttc_index,
-        flags=flags,
+        flags=at.flags,
     )
 
 
@@ -149,28 +133,21 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 @kernel
 def _first_violations(
-    states: FloatArray,
-    corners: FloatArray,
-    off_lane: BoolArray,
-    others: Others,
-    near: IntArray,
-    intersections: Polygons,
-    first: FloatArray,
-) -> None:
+    places: Places, others: Others, near: IntArray, intersections: Polygons
+) -> FloatArray:
     """First time indices (P,) at which the time to collision is too short, inf if none."""
-    box = np.empty((4, 2))
-    forgiven = np.empty(len(near), np.bool_)
-    for proposal in range(states.shape[0]):
-        first[proposal] = NEVER
+    first = np.full(len(places.states), NEVER)
+    box, forgiven = np.empty((4, 2)), np.empty(len(near), np.bool_)
+    for proposal in range(len(first)):
         for entry in range(len(near)):
             forgiven[entry] = False
-        for step in range(states.shape[1]):
-            state = states[proposal, step]
+        for step in range(places.states.shape[1]):
+            state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
             speed = np.hypot(state[VX], state[VY])
             if speed < TTC_STOPPED:
                 continue
             for ahead in TTC_STEPS:
-                project_box(corners[proposal, step], state, 0.1 * ahead * speed, box)
+                project_box(places.corners[proposal, step], state, 0.1 * ahead * speed, box)
                 row, circle = (step + ahead) // 2, circle_around(box)
                 for entry in range(len(near)):
                     index = near[entry]
@@ -178,34 +155,30 @@ def _first_violations(
                         continue
                     middle = others.centroids[row, index]
                     angle = bearing(state, middle[0], middle[1])
-                    if angle < AHEAD or (
-                        not angle > BEHIND
-                        and (off_lane[proposal, step] or in_any(intersections, state[X], state[Y]))
-                    ):
+                    counts = angle < AHEAD
+                    if not counts and not angle > BEHIND:
+                        counts = off_lane or in_any(intersections, state[X], state[Y])
+                    if counts:
                         first[proposal] = min(first[proposal], float(step))
                     else:
                         forgiven[entry] = True
             if first[proposal] < NEVER:
                 break
+    return first
 
 
-@lean_kernel
-def _travel(
-    centers: FloatArray,
-    oncoming: BoolArray,
-    centerline: Path,
-    progress: FloatArray,
-    off_route: FloatArray,
-) -> None:
-    """Progress along the centerline (§8.5) and longest way off the route (§8.3), both (P,) [m]."""
-    last = centers.shape[1] - 1
+@kernel
+def _travel(places: Places, centerline: Path) -> tuple[FloatArray, FloatArray]:
+    """Progress along the centerline and longest way off the route, both (P,) [m]."""
+    centers, last = places.centers, places.centers.shape[1] - 1
+    progress, off_route = np.empty(len(centers)), np.empty(len(centers))
     for row in range(len(centers)):
         start = project(centerline, centers[row, 0, 0], centers[row, 0, 1], 0)
         end = project(centerline, centers[row, last, 0], centers[row, last, 1], start[2])
         progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
         for step in range(last + 1):
-            if not oncoming[row, step]:
+            if not places.flags[row, step, OFF_ROUTE]:
                 stretch = 0.0
             elif step > 0:
                 dx = centers[row, step, 0] - centers[row, step - 1, 0]
@@ -213,3 +186,4 @@ def _travel(
                 stretch += np.hypot(dx, dy)
             longest = max(longest, stretch)
         off_route[row] = longest
+    return progress, off_route

@@ -10,16 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import meets_bounds
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.rings import BOUNDARY, EXTERIOR, INTERIOR, ray_crossings
 from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
-MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
-_ALL_CORNERS, _WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
 
 
 class Slabs(NamedTuple):
@@ -31,6 +28,8 @@ class Slabs(NamedTuple):
         grid: (R, 2) y of the lowest slab [m], slabs per metre.
         edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
         edge_ends: Vertices at which the edges of a slab end.
+        poly_ptr: (M + 1,) first ring of each area.
+        bounds: (M, 4) of the areas: min x, min y, max x, max y [m].
     """
 
     xy: FloatArray
@@ -38,22 +37,24 @@ class Slabs(NamedTuple):
     grid: FloatArray
     edge_ptr: IntArray
     edge_ends: IntArray
+    poly_ptr: IntArray
+    bounds: FloatArray
 
 
 class Areas(NamedTuple):
-    """Areas of all edges of a map, then of its car parks.
+    """Areas of all lanes and connectors of a map, then of its car parks.
 
     Attributes:
         polygons: The areas.
         slabs: Their rings.
-        on_route: (M,) whether the route holds an edge of that id.
-        edge: (M,) the edge of that id; for a car park usually -1.
+        on_route: (M,) whether the route holds a lane of that id.
+        lane: (M,) the lane of that id; for a car park usually -1.
     """
 
     polygons: Polygons
     slabs: Slabs
     on_route: BoolArray
-    edge: IntArray
+    lane: IntArray
 
 
 def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
@@ -68,11 +69,11 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
         )
     # nuPlan rule 181: membership is a test on ids, which car parks may share with lanes
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
-    edge = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
-    return areas_of(polygons, np.isin(edge, np.array(route_lanes)), edge)
+    lane = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
+    return areas_of(polygons, np.isin(lane, np.array(route_lanes)), lane)
 
 
-def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
+def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     """Areas from polygons, and the fields of `Areas`."""
     starts, stops = polygons.ring_ptr[:-1], polygons.ring_ptr[1:]
     num_slabs = (stops - starts) // EDGES_PER_SLAB + 1
@@ -82,7 +83,8 @@ def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
     edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
     _slice(polygons.xy, rings, grid, fill, edge_ends)
-    return Areas(polygons, Slabs(polygons.xy, rings, grid, edge_ptr, edge_ends), on_route, edge)
+    slabs = Slabs(polygons.xy, rings, grid, edge_ptr, edge_ends, polygons.poly_ptr, polygons.bounds)
+    return Areas(polygons, slabs, on_route, lane)
 
 
 @lean_kernel
@@ -113,30 +115,29 @@ def _slice(
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
     """Areas of the blocks and the car parks that touch a square around (x, y) [m], in their order.
 
-    Edges come by block, in the order of the blocks.
+    Lanes come by block, in the order of the blocks.
     """
     square = square_around(x, y, half_width)
-    edges = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
-    return np.concatenate([*edges, meeting(road.car_parks.polygons, square) + len(road.edges)])
+    lanes = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
+    return np.concatenate([*lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
 
 
 def near_areas(areas: Areas, selected: IntArray, points: FloatArray) -> IntArray:
     """Those of the selected areas whose bounds overlap the bounds of points (..., 2)."""
-    (x, y), bounds = points.reshape(-1, 2).T, areas.polygons.bounds[selected]
+    (x, y), bounds = points.reshape(-1, 2).T, areas.slabs.bounds[selected]
     near = (bounds[:, 0] <= x.max()) & (bounds[:, 2] >= x.min())
     near &= (bounds[:, 1] <= y.max()) & (bounds[:, 3] >= y.min())
     return selected[near]
 
 
 @lean_kernel
-def _locate(slabs: Slabs, first: int, last: int, x: float, y: float) -> int:
-    """Where a point lies relative to rings `first` … `last` - 1: INTERIOR, BOUNDARY or EXTERIOR.
-
-    The point must be within their bounds.
-    """
-    xy, rings, grid, edge_ptr, edge_ends = slabs
+def locate(slabs: Slabs, area: int, x: float, y: float) -> int:
+    """Where a point lies relative to an area: INTERIOR, BOUNDARY or EXTERIOR."""
+    xy, rings, grid, edge_ptr, edge_ends, poly_ptr, bounds = slabs
+    if not (bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]):
+        return EXTERIOR  # also where a coordinate is NaN
     inside = False
-    for ring in range(first, last):
+    for ring in range(poly_ptr[area], poly_ptr[area + 1]):
         place = (y - grid[ring, 0]) * grid[ring, 1]
         if not place >= 0.0:
             continue
@@ -169,99 +170,12 @@ def covering(areas: Areas, selected: IntArray, x: float, y: float, out: IntArray
 
     They are in the order of `selected`; at most `len(out)` are found.
     """
-    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
     found = 0
     for area in selected:
-        if found < len(out) and _in_bounds(bounds[area], x, y):
-            if _locate(areas.slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
-                out[found] = area
-                found += 1
+        if found < len(out) and locate(areas.slabs, area, x, y) != EXTERIOR:
+            out[found] = area
+            found += 1
     return found
-
-
-@kernel
-def find_places(
-    areas: Areas,
-    near: IntArray,
-    limits: FloatArray,
-    corners: FloatArray,
-    points: FloatArray,
-    flags: BoolArray,
-    speed_limits: FloatArray,
-) -> None:
-    """On which areas every pose of every proposal is.
-
-    Args:
-        areas: All areas of the map.
-        near: Those that count.
-        limits: (M,) speed limits of all areas [m/s].
-        corners: (P, T, 4, 2) corners of the ego [m].
-        points: (P, T, 2) where the ego is on the route or off it, and which limit it has [m].
-        flags: (P, T, 3) receives whether the ego is on several lanes, off the road, off the route.
-        speed_limits: (P, T) receives the largest limit at its point, 0 off the road [m/s].
-    """
-    slabs, bounds, poly_ptr = areas.slabs, areas.polygons.bounds, areas.polygons.poly_ptr
-    highest = 0.0
-    for area in near:
-        highest = max(highest, limits[area])
-    guess = -1  # the area that held the whole ego last is tried first
-    for row in range(corners.shape[0]):
-        for step in range(corners.shape[1]):
-            box = corners[row, step]
-            x, y = points[row, step, 0], points[row, step, 1]
-            num_touched, held, is_on_route, limit = 0, 0, False, 0.0
-            for entry in range(-1, len(near)):
-                area = guess if entry < 0 else near[entry]
-                if area < 0 or (entry >= 0 and area == guess):
-                    continue
-                is_known = is_on_route and limit >= highest
-                if (held == _WHOLE and is_known) or not meets_bounds(box, bounds[area]):
-                    continue
-                first, last = poly_ptr[area], poly_ptr[area + 1]
-                if not is_known and _holds(slabs, bounds[area], first, last, x, y):
-                    limit = max(limit, limits[area])
-                    is_on_route = is_on_route or areas.on_route[area]
-                if held == _WHOLE:
-                    continue
-                only_whole = num_touched > 1 and held == _ALL_CORNERS  # may change anything
-                within = _corners_within(slabs, bounds[area], first, last, box, only_whole)
-                if within == _ALL_CORNERS:
-                    held, guess = _WHOLE, area
-                elif within > 0:
-                    held |= within
-                    num_touched += 1
-            flags[row, step, MULTIPLE] = num_touched > 1 and held != _WHOLE
-            flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
-            flags[row, step, OFF_ROUTE] = not is_on_route
-            speed_limits[row, step] = limit
-
-
-@lean_kernel
-def _corners_within(
-    slabs: Slabs, bounds: FloatArray, first: int, last: int, box: FloatArray, only_all: bool
-) -> int:
-    """Which corners of a box (4, 2) the rings `first` … `last` - 1 hold, a bit for each.
-
-    With `only_all` the search ends at the first corner that they do not hold.
-    """
-    within = 0
-    for corner in range(4):
-        if _holds(slabs, bounds, first, last, box[corner, 0], box[corner, 1]):
-            within |= 1 << corner
-        elif only_all:
-            return 0
-    return within
-
-
-@lean_kernel
-def _holds(slabs: Slabs, bounds: FloatArray, first: int, last: int, x: float, y: float) -> bool:
-    """Whether the rings `first` … `last` - 1 hold a point in their interior."""
-    return _in_bounds(bounds, x, y) and _locate(slabs, first, last, x, y) == INTERIOR
-
-
-@lean_kernel
-def _in_bounds(bounds: FloatArray, x: float, y: float) -> bool:
-    return bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

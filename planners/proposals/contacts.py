@@ -8,21 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, circle_around, front_touches
+from shiftsim.geometry.boxes import BEHIND, bearing, circle_around, front_touches
 from shiftsim.geometry.rings import convex_intersect
-from shiftsim.world.state import HEADING, VX, VY, VehicleParameters, X, Y
+from shiftsim.planners.proposals.places import Places
+from shiftsim.world.state import HEADING, VX, VY
 
 STOPPED = 5e-2  # m/s, of the ego and of others in a collision
 TTC_STOPPED = 5e-3  # m/s, of the ego
 NEVER = np.inf
-
-
-class EgoBox(NamedTuple):
-    """The ego's box: length, width, and distance from the rear axle to its centre [m]."""
-
-    length: float
-    width: float
-    rear_axle_to_center: float
 
 
 class Others(NamedTuple):
@@ -47,23 +40,6 @@ class Others(NamedTuple):
     ignored: BoolArray
 
 
-def ego_box(vehicle: VehicleParameters) -> EgoBox:
-    """The box of a vehicle."""
-    return EgoBox(vehicle.length, vehicle.width, vehicle.rear_axle_to_center)
-
-
-@lean_kernel
-def place_ego(states: FloatArray, size: EgoBox, corners: FloatArray, centers: FloatArray) -> None:
-    """Write corners (P, T, 4, 2) and centres (P, T, 2) of driven states (P, T, 11) [m]."""
-    for row in range(states.shape[0]):
-        for step in range(states.shape[1]):
-            heading = states[row, step, HEADING]
-            x = states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
-            y = states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
-            centers[row, step, 0], centers[row, step, 1] = x, y
-            box_corners(x, y, heading, size.length, size.width, corners[row, step])
-
-
 @lean_kernel
 def project_box(corners: FloatArray, state: FloatArray, travel: float, out: FloatArray) -> None:
     """Write a box (4, 2) of the ego, moved `travel` [m] along the heading of its state (11,)."""
@@ -86,18 +62,16 @@ def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
 
 
 @kernel
-def near_others(
-    states: FloatArray, corners: FloatArray, others: Others, rows: int, horizon: float
-) -> IntArray:
+def near_others(places: Places, others: Others, rows: int, horizon: float) -> IntArray:
     """Those that can touch an ego box, or its projection, at any time.
 
     Args:
-        states: (P, T, 11) driven states.
-        corners: (P, T, 4, 2) corners of the ego [m].
+        places: Of the proposals.
         others: The others.
         rows: Of time, that count.
         horizon: Of the projection [s].
     """
+    states, corners = places.states, places.corners
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
     for row in range(corners.shape[0]):
@@ -163,36 +137,27 @@ def is_at_fault(
 
 @kernel
 def first_faults(
-    states: FloatArray,
-    corners: FloatArray,
-    off_lane: BoolArray,
-    others: Others,
-    near: IntArray,
-    rows: IntArray,
-    forgives: bool,
-    scores: FloatArray,
-    first: FloatArray,
-) -> None:
+    places: Places, others: Others, near: IntArray, rows: IntArray, forgives: bool
+) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions.
 
     Args:
-        states: (P, T, 11) driven states.
-        corners: (P, T, 4, 2) corners of the ego [m].
-        off_lane: (P, T) whether the ego is on several lanes or off the road.
+        places: Of the proposals.
         others: The others.
         near: Those that count.
         rows: (T,) row of time of each time index; -1 where it is not looked at.
         forgives: Whether a first contact without fault makes all later ones count as such.
-        scores: (P,) receives the factors 0, 0.5 or 1.
-        first: (P,) receives the time indices of the first collisions, inf if none.
+
+    Returns:
+        (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
     """
+    scores, first = np.ones(len(places.states)), np.full(len(places.states), NEVER)
     decided = np.empty(len(near), np.bool_)
-    for proposal in range(states.shape[0]):
-        scores[proposal], first[proposal] = 1.0, NEVER
+    for proposal in range(len(scores)):
         for entry in range(len(near)):
             decided[entry] = False
-        for step in range(states.shape[1]):
-            box, row = corners[proposal, step], rows[step]
+        for step in range(len(rows)):
+            box, row = places.corners[proposal, step], rows[step]
             if row < 0:
                 continue
             circle = circle_around(box)
@@ -200,11 +165,12 @@ def first_faults(
                 index = near[entry]
                 if decided[entry] or not hits(others, row, index, box, circle):
                     continue
-                off = off_lane[proposal, step]
-                if is_at_fault(states[proposal, step], box, off, others, row, index):
+                state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
+                if is_at_fault(state, box, off_lane, others, row, index):
                     worth = 0.0 if others.is_agent[index] else 0.5
                     scores[proposal] = min(scores[proposal], worth)
                     first[proposal] = min(first[proposal], float(step))
                     decided[entry] = True
                 elif forgives:
                     decided[entry] = True
+    return scores, first

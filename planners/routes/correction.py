@@ -161,8 +161,8 @@ def _find_blocks(
                 kind = 0
         least = np.inf
         for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
-            edge = block_edges.items[entry]
-            displacement, error = deviation(baselines, edge, 1, x, y, heading)
+            lane = block_edges.items[entry]
+            displacement, error = deviation(baselines, lane, 1, x, y, heading)
             least = min(least, displacement)
             if error < MAX_HEADING_ERROR and displacement < MAX_DISPLACEMENT:
                 names[kind, counts[kind]], distances[kind, counts[kind]] = block, displacement

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import circle_around, meets_bounds
 from shiftsim.planners.proposals.contacts import (
     NEVER,
@@ -13,6 +13,7 @@ from shiftsim.planners.proposals.contacts import (
     is_at_fault,
     project_box,
 )
+from shiftsim.planners.proposals.places import Places
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.state import VX
@@ -21,19 +22,12 @@ TTC_STEPS = (2, 4, 6, 8)  # how far ahead a pose is projected
 
 
 def collisions(
-    states: FloatArray,
-    corners: FloatArray,
-    off_lane: BoolArray,
-    others: Others,
-    near: IntArray,
-    first_red: FloatArray,
+    places: Places, others: Others, near: IntArray, first_red: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions, red lights included.
 
     Args:
-        states: (P, T, 11) driven states.
-        corners: (P, T, 4, 2) corners of the ego [m].
-        off_lane: (P, T) whether the ego is on several lanes or off the road.
+        places: Of the proposals.
         others: What is around.
         near: Those of them that count.
         first_red: (P,) time indices of `run_lights`.
@@ -41,10 +35,10 @@ def collisions(
     Returns:
         (P,) factors 0, 0.5 or 1, and times of the first collisions, inf if none [s].
     """
-    scores, first = np.empty(len(states)), np.empty(len(states))
-    rows = np.arange(states.shape[1])
+    rows = np.arange(places.states.shape[1])
     rows[0] = -1
-    first_faults(states, corners, off_lane, others, near, rows, False, scores, first)
+    # nuPlan rule 251: a contact without fault is looked at again
+    scores, first = first_faults(places, others, near, rows, False)
     # a red light after another fault does not count
     is_red = (first_red < NEVER) & (first_red <= first)
     return np.where(is_red, 0.0, scores), DT * np.minimum(first, first_red)
@@ -66,37 +60,32 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 
 @kernel
-def times_to_collision(
-    states: FloatArray,
-    corners: FloatArray,
-    off_lane: BoolArray,
-    others: Others,
-    near: IntArray,
-    scores: FloatArray,
-) -> None:
-    """Whether the ego, moved ahead along its heading, stays clear: scores (P,) 0 or 1.
+def times_to_collision(places: Places, others: Others, near: IntArray) -> FloatArray:
+    """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
 
     Arguments as for `collisions`.
     """
-    box, last = np.empty((4, 2)), states.shape[1] - 1
-    for proposal in range(states.shape[0]):
-        scores[proposal] = 1.0
+    scores, box, last = np.ones(len(places.states)), np.empty((4, 2)), places.states.shape[1] - 1
+    for proposal in range(len(scores)):
         for step in range(1, last + 1):
-            state = states[proposal, step]
+            state = places.states[proposal, step]
             if state[VX] < TTC_STOPPED:
                 continue
             for number in range(len(TTC_STEPS)):
                 ahead = TTC_STEPS[number]
                 if step + ahead > last:
                     continue
-                project_box(corners[proposal, step], state, 0.1 * ahead * state[VX], box)
+                travel = 0.1 * ahead * state[VX]
+                project_box(places.corners[proposal, step], state, travel, box)
                 circle = circle_around(box)
                 # nuPlan rule 242: the number of the projection stands in for the time of the ego,
                 # of its place and of the object, but not of the moved box
-                then, is_off = states[proposal, number], off_lane[proposal, number]
+                then = places.states[proposal, number]
+                off_lane = places.off_lane[proposal, number]
                 for index in near:
                     if hits(others, step, index, box, circle):
-                        if is_at_fault(then, box, is_off, others, number, index):
+                        if is_at_fault(then, box, off_lane, others, number, index):
                             scores[proposal] = 0.0
             if scores[proposal] == 0.0:
                 break
+    return scores

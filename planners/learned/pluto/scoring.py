@@ -14,15 +14,9 @@ from shiftsim.planners.learned.pluto.collisions import (
 )
 from shiftsim.planners.learned.pluto.reference import Drivable
 from shiftsim.planners.learned.pluto.world import World
-from shiftsim.planners.proposals.areas import (
-    MULTIPLE,
-    OFF_ROAD,
-    OFF_ROUTE,
-    find_places,
-    near_areas,
-)
 from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
-from shiftsim.planners.proposals.contacts import ego_box, near_others, place_ego
+from shiftsim.planners.proposals.contacts import near_others
+from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, ego_box, find_places
 from shiftsim.planners.proposals.tracker import DT, drive_proposals
 from shiftsim.world.layers import Polygons
 from shiftsim.world.state import VX, VY, VehicleParameters, X, Y
@@ -69,12 +63,12 @@ class Place(NamedTuple):
 
     Attributes:
         drivable: Drivable areas of the step.
-        edges: Areas of lanes and connectors.
+        lanes: Areas of lanes and connectors.
         baseline: (K, 2) line along which progress is measured [m].
     """
 
     drivable: Drivable
-    edges: Polygons
+    lanes: Polygons
     baseline: FloatArray
 
 
@@ -97,28 +91,23 @@ def score(
         vehicle: Dimensions of the ego.
     """
     driven = drive_proposals(poses, ego, vehicle).states
-    count, steps = driven.shape[:2]
-    corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
-    place_ego(driven, ego_box(vehicle), corners, centers)
     drivable, others = place.drivable, world.others
-    flags, limits = np.empty((count, steps, 3), np.bool_), np.empty((count, steps))
-    lanes = near_areas(drivable.areas, drivable.selected, corners)
-    rear = np.ascontiguousarray(driven[..., :2])
-    find_places(drivable.areas, lanes, drivable.limits, corners, rear, flags, limits)
-    off_lane = flags[..., MULTIPLE] | flags[..., OFF_ROAD]
-    near = near_others(driven, corners, others, steps, DT * TTC_STEPS[-1])
-    red = run_lights(corners, place.edges, world.lights)
-    clear, fault_times = collisions(driven, corners, off_lane, others, near, red)
-    ttc = np.empty(count)
-    times_to_collision(driven, corners, off_lane, others, near, ttc)
-    factors = np.stack([clear, on_road(flags[..., OFF_ROAD]), direction(driven, flags)])
+    size, areas = ego_box(vehicle), drivable.areas
+    at = find_places(driven, size, areas, drivable.selected, drivable.limits, by_center=False)
+    near = near_others(at, others, driven.shape[1], DT * TTC_STEPS[-1])
+    red = run_lights(at.corners, place.lanes, world.lights)
+    clear, fault_times = collisions(at, others, near, red)
+    ttc = times_to_collision(at, others, near)
+    factors = np.stack([clear, on_road(at.flags[..., OFF_ROAD]), direction(driven, at.flags)])
     progress = travel(driven, place.baseline)
     is_within = comfort(driven, ComfortBounds()).is_within.all(axis=1)
     comfortable = np.where(is_within, 1.0, 0.0)
-    terms = np.stack([np.empty(count), speed_score(driven, limits), comfortable, ttc])
+    terms = np.stack([np.empty(len(ttc)), speed_score(driven, at.speed_limits), comfortable, ttc])
     terms[0], rule = aggregate(factors, terms, progress)
     total = rule + LEARNED_WEIGHT * learned
-    return Scores(total, rule, factors, terms, progress, fault_times, driven, flags, limits)
+    return Scores(
+        total, rule, factors, terms, progress, fault_times, driven, at.flags, at.speed_limits
+    )
 
 
 def on_road(off_road: BoolArray) -> FloatArray:

@@ -9,7 +9,6 @@ import numpy as np
 from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.route import (
-    centerline,
     current_lane,
     follow_route,
     in_index_order,
@@ -17,7 +16,8 @@ from shiftsim.planners.pdm.route import (
     start_route,
 )
 from shiftsim.planners.proposals.areas import select_areas
-from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.proposals.places import ego_box
+from shiftsim.planners.routes.paths import centerline
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
@@ -64,7 +64,7 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
         "start_candidates": [block_ids[block] for block in route.start.others],
         "corrected": [block_ids[block] for block in route.corrected],
         "route_lanes": [edge_ids[edge] for edge in route.lanes.tolist()],
-        "intersecting_lanes": [edge_ids[route.areas.edge[area]] for area in ordered],
+        "intersecting_lanes": [edge_ids[route.areas.lane[area]] for area in ordered],
         "heading_errors": [errors[under.index(area)] for area in ordered],
         "current_lane": edge_ids[lane],
         "n_centerline": len(line),

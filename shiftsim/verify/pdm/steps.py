@@ -21,7 +21,8 @@ from shiftsim.planners.pdm.route import offset_poses
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
 from shiftsim.planners.pdm.step import Step, plan_step
 from shiftsim.planners.proposals.areas import areas_of
-from shiftsim.planners.proposals.contacts import Others, ego_box, touches_boxes
+from shiftsim.planners.proposals.contacts import Others, touches_boxes
+from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
 from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, read_fields
 from shiftsim.verify.report import Report
