@@ -49,7 +49,7 @@ def find_sides(
     """Decide which objects touch the corridor, as far as distances can.
 
     Args:
-        line: (K, 2) the stretch of path [m].
+        line: (K, 2) or (K, 3) the stretch of path [m].
         half_width: Radius of the buffer around it [m].
         footprint: (4, 2) corners of the ego, which belongs to the corridor [m].
         objects: The polygons.
@@ -75,7 +75,7 @@ def exact_side(
     line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, index: int
 ) -> int:
     """The side of an OPEN object, by the polygon nuPlan uses; arguments as for `find_sides`."""
-    corridor = corridor_polygon(shapely.LineString(line), half_width)
+    corridor = corridor_polygon(shapely.LineString(line[:, :2]), half_width)
     corridor = corridor.union(shapely.Polygon(footprint))
     ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
     return HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR

@@ -11,8 +11,9 @@ from shiftsim.geometry.corridors import OPEN
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.geometry.paths import Path, pose_at
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, exact_side, find_lead, find_sides
-from shiftsim.planners.idm.path import LanePath, build_path, plan_route, route_blocks, sub_path
+from shiftsim.planners.idm.route import build_path, plan_route, route_blocks
 from shiftsim.planners.routes.lanes import lanes_of, red_lanes
+from shiftsim.planners.routes.paths import LanePath, sub_path
 from shiftsim.planners.routes.search import Search
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -182,7 +183,7 @@ def _circle(ring: FloatArray) -> FloatArray:
 
 @kernel
 def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
-    """(K, 2) the stretch of path that the ego would cover at its target velocity [m]."""
+    """(K, 3) the stretch of path that the ego would cover at its target velocity."""
     end = path.progress[-1]
     low = min(max(progress, 0.0), end)
     return sub_path(path, low, min(max(progress + abs(target) * HORIZON, 0.0), end))

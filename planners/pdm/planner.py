@@ -25,7 +25,6 @@ from shiftsim.planners.pdm.parameters import FollowingModel, PdmParameters
 from shiftsim.planners.pdm.rollout import Scene
 from shiftsim.planners.pdm.route import (
     Route,
-    centerline,
     current_lane,
     follow_route,
     offset_poses,
@@ -38,6 +37,7 @@ from shiftsim.planners.proposals.contacts import ego_box
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import known_blocks
 from shiftsim.planners.routes.lanes import red_lanes
+from shiftsim.planners.routes.paths import centerline
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import NUM_STATE, Trajectory

@@ -1,13 +1,12 @@
 """The lanes PDM-Closed follows: corrected route, current lane, centerline."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.planners.proposals.areas import Areas, covering, index_ranks, make_areas
 from shiftsim.planners.proposals.contacts import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
@@ -122,12 +121,6 @@ def follow_route(road: VectorMap, route: list[int], current: int) -> Search:
         road.baselines.length,
         lambda lane: bool(road.block_of[lane] == goal),
     )
-
-
-def centerline(road: VectorMap, lanes: Iterable[int]) -> FloatArray:
-    """Poses (K, 3) along the baselines of lanes x [m], y [m], heading [rad]."""
-    lines = [road.baselines.at(lane) for lane in lanes]
-    return np.concatenate([np.column_stack([xy, vertex_headings(xy)]) for xy in lines])
 
 
 def offset_poses(poses: FloatArray, offset: float) -> FloatArray:

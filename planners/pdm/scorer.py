@@ -197,7 +197,7 @@ def _travel(
     progress: FloatArray,
     off_route: FloatArray,
 ) -> None:
-    """Progress along the centerline (§8.5) and longest way off the route (§8.3), both (P,) [m]."""
+    """Progress along the centerline and longest way off the route, both (P,) [m]."""
     last = centers.shape[1] - 1
     for row in range(len(centers)):
         start = project(centerline, centers[row, 0, 0], centers[row, 0, 1], 0)

@@ -44,6 +44,7 @@ def collisions(
     scores, first = np.empty(len(states)), np.empty(len(states))
     rows = np.arange(states.shape[1])
     rows[0] = -1
+    # nuPlan rule 251: a contact without fault is looked at again
     first_faults(states, corners, off_lane, others, near, rows, False, scores, first)
     # a red light after another fault does not count
     is_red = (first_red < NEVER) & (first_red <= first)

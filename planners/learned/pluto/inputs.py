@@ -1,4 +1,4 @@
-"""The arrays that PLUTO's network reads, of one scene and of a batch (planner-pluto.md §2)."""
+"""The arrays that PLUTO's network reads, of one scene and of a batch."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ Array = np.ndarray
 
 
 class SceneInputs(NamedTuple):
-    """Fields of `nets.pluto.Inputs` without the axis of the batch; float32, int64 and bool."""
+    """Fields of `network.Inputs` without the axis of the batch; float32, int64 and bool."""
 
     position: Array
     heading: Array
@@ -108,7 +108,7 @@ def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> Array:
 
 
 def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
-    """Values of `nets.pluto.Inputs`; scenes with fewer rows are filled up with zeros."""
+    """Values of `network.Inputs`; scenes with fewer rows are filled up with zeros."""
     import torch
 
     out: list[Any] = []

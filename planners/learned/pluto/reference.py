@@ -11,10 +11,10 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import meets_bounds
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import project_on_polyline, vertex_heading
+from shiftsim.geometry.frames import wrap_angles
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
 from shiftsim.planners.routes.lanes import deviation
+from shiftsim.planners.routes.paths import LanePath, lane_path, sub_path
 from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 
@@ -29,7 +29,6 @@ MAX_LANES = 15  # of one line
 STRIDE = 4  # vertices between two points that are looked at
 NUM_POINTS = 120  # of a line in the features
 SAME_LINE = 0.5  # m, |dx| + |dy| of two lines that count as one
-REPEATED = 1e-8  # m, to the next vertex
 
 
 class Drivable(NamedTuple):
@@ -68,6 +67,7 @@ class RouteLanes(NamedTuple):
         is_on: (E,) whether an edge belongs to one of these blocks.
         areas: Areas of the map, those of the route marked.
         limits: (M,) speed limits [m/s].
+        paths: Made so far, by their lanes.
     """
 
     blocks: list[int]
@@ -76,6 +76,7 @@ class RouteLanes(NamedTuple):
     is_on: BoolArray
     areas: Areas
     limits: FloatArray
+    paths: dict[tuple[int, ...], LanePath]
 
 
 def map_areas(road: VectorMap) -> MapAreas:
@@ -96,7 +97,7 @@ def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> Route
     starts = np.concatenate([edges[edges >= road.num_lanes], edges[edges < road.num_lanes]])
     on_route = np.isin(made.areas.edge, edges)
     areas = made.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits)
+    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits, {})
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
@@ -137,7 +138,9 @@ def reference_lines(
         if start in after:
             continue
         for path in _paths_from(road, route.is_on, start, road.progress_on(start, x, y)):
-            line, length = _cut(road.baselines, np.array(path, np.int64), x, y)
+            if path not in route.paths:
+                route.paths[path] = lane_path(road, path)
+            line, length = _cut(route.paths[path], x, y)
             lines.append(line)
             lengths.append(length)
     if any(length > LONG_ENOUGH for length in lengths):
@@ -145,10 +148,12 @@ def reference_lines(
     return _distinct(lines)
 
 
-def _paths_from(road: VectorMap, is_on: BoolArray, start: int, behind: float) -> list[list[int]]:
+def _paths_from(
+    road: VectorMap, is_on: BoolArray, start: int, behind: float
+) -> list[tuple[int, ...]]:
     """Sequences of lanes of the route from one lane on, depth first in the order of the edges."""
-    paths = []
-    stack = [([start], road.baselines.length(start) - behind)]
+    paths: list[tuple[int, ...]] = []
+    stack: list[tuple[tuple[int, ...], float]] = [((start,), road.baselines.length(start) - behind)]
     while stack:
         path, length = stack.pop()
         following = [edge for edge in road.outgoing.at(path[-1]).tolist() if is_on[edge]]
@@ -156,7 +161,7 @@ def _paths_from(road: VectorMap, is_on: BoolArray, start: int, behind: float) ->
             paths.append(path)
             continue
         stack += [
-            ([*path, edge], length + road.baselines.length(edge)) for edge in reversed(following)
+            ((*path, edge), length + road.baselines.length(edge)) for edge in reversed(following)
         ]
     return paths
 
@@ -206,70 +211,16 @@ def _start_lanes(
     return count
 
 
-@kernel
-def _cut(baselines: Polylines, path: IntArray, x: float, y: float) -> tuple[FloatArray, float]:
-    """The next 120 m of lanes from (x, y) on: poses (K, 3), and their length [m]."""
-    total = 0
-    for edge in path:
-        total += baselines.ptr[edge + 1] - baselines.ptr[edge]
-    xy, heading, progress = np.empty((total, 2)), np.empty(total), np.zeros(total)
-    row = 0
-    for edge in path:
-        stop = baselines.ptr[edge + 1]
-        for index in range(baselines.ptr[edge], stop):
-            xy[row, 0], xy[row, 1] = baselines.xy[index, 0], baselines.xy[index, 1]
-            heading[row] = vertex_heading(baselines.xy, index, stop)
-            if row > 0:
-                dx, dy = xy[row, 0] - xy[row - 1, 0], xy[row, 1] - xy[row - 1, 1]
-                progress[row] = progress[row - 1] + np.sqrt(dx * dx + dy * dy)
-            row += 1
-    here = project_on_polyline(xy, progress, 0, total, x, y)
-    count = 0
-    # nuPlan rule 153: of two equal vertices the second stays, and the last of all is always lost
-    for row in range(total - 1):
-        if progress[row + 1] - progress[row] > REPEATED:
-            xy[count, 0], xy[count, 1] = xy[row, 0], xy[row, 1]
-            heading[count], progress[count] = heading[row], progress[row]
-            count += 1
-    last = progress[count - 1]
-    start, end = min(max(here, progress[0]), last), min(here + LINE_LENGTH, last)
-    ahead = 0
-    while ahead < count and progress[ahead] <= start:
-        ahead += 1
-    is_cut = ahead < count
-    first = ahead if is_cut else max(count - 2, 0)
-    stop = first if is_cut else count
-    while stop < count and progress[stop] < end:
-        stop += 1
-    margin = 1 if is_cut else 0  # an interpolated pose at either end
-    out = np.empty((stop - first + 2 * margin, 3))
-    for vertex in range(first, stop):
-        place = vertex - first + margin
-        out[place, 0], out[place, 1], out[place, 2] = xy[vertex, 0], xy[vertex, 1], heading[vertex]
-    if is_cut:
-        _interpolate(xy, heading, progress, count, start, out[0])
-        _interpolate(xy, heading, progress, count, end, out[len(out) - 1])
-    return out, end - start
-
-
-@kernel
-def _interpolate(
-    xy: FloatArray,
-    heading: FloatArray,
-    progress: FloatArray,
-    count: int,
-    at: float,
-    out: FloatArray,
-) -> None:
-    """Write the pose at a progress between the first `count` vertices into `out` (3,)."""
-    upper = 1
-    while upper < count - 1 and progress[upper] < at:
-        upper += 1
-    low = upper - 1
-    share = (at - progress[low]) / (progress[upper] - progress[low])
-    out[0] = xy[low, 0] + share * (xy[upper, 0] - xy[low, 0])
-    out[1] = xy[low, 1] + share * (xy[upper, 1] - xy[low, 1])
-    out[2] = wrap_angle(heading[low] + share * wrap_angle(heading[upper] - heading[low]))
+def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:
+    """The next 120 m of a path from (x, y) on: poses (K, 3), and their length [m]."""
+    here = path.project(x, y)
+    low, high = np.clip([here, here + LINE_LENGTH], path.driven.progress[0], path.end).tolist()
+    line = sub_path(path.driven, low, high)
+    # nuPlan rule 250: the ends are wrapped, vertices keep the angle between them
+    turned = np.abs(line[:, 2]) > np.pi
+    turned[[0, -1]] = True
+    line[turned, 2] = wrap_angles(line[turned, 2])
+    return line, high - low
 
 
 class LineFeatures(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.route import (
-    centerline,
     current_lane,
     follow_route,
     in_index_order,
@@ -18,6 +17,7 @@ from shiftsim.planners.pdm.route import (
 )
 from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.routes.paths import centerline
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario

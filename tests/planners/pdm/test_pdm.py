@@ -42,7 +42,7 @@ def test_an_empty_road_is_driven_at_the_limit_on_the_centerline():
     _, step = one_step(cruise_scenario())
     assert (step.best, step.braked) == (4, False)
     np.testing.assert_allclose(step.poses[:, 1:], 0.0, atol=1e-9)
-    # nuPlan: every proposal brakes in its first 0.1 s, then it speeds up
+    # nuPlan rule 193: every proposal brakes in its first 0.1 s, then it speeds up
     advance = np.diff(step.poses[:, 0])
     assert advance[0] == pytest.approx(0.8)
     assert advance[1] == pytest.approx(0.1 * (8.0 - 0.3))

@@ -1,42 +1,14 @@
-"""The path of the IDM planner: lanes along the route, and poses by progress."""
-
-from typing import NamedTuple
+"""The lanes that the IDM planner drives along."""
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.paths import Path, make_path, pose_at
-from shiftsim.geometry.polylines import arc_lengths, project_on_polyline, vertex_headings
 from shiftsim.planners.routes.lanes import HINT, lane_at, lanes_of
+from shiftsim.planners.routes.paths import LanePath, lane_path
 from shiftsim.planners.routes.search import Search, search_levels
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import VehicleParameters
-
-SAME_POINT = 1e-8  # m, vertices closer than this are one
-
-
-class LanePath(NamedTuple):
-    """The path along some lanes.
-
-    Attributes:
-        line: (V, 2) all vertices of the lanes' baselines, on which the ego is projected [m].
-        line_arc: (V,) arc length at each of them [m].
-        driven: What poses are read from: without repeated vertices.
-    """
-
-    line: FloatArray
-    line_arc: FloatArray
-    driven: Path
-
-    @property
-    def end(self) -> float:
-        """Progress at the last vertex [m]."""
-        return float(self.driven.progress[-1])
-
-    def project(self, x: float, y: float) -> float:
-        """Progress of the point of the path nearest to (x, y) [m]."""
-        return float(project_on_polyline(self.line, self.line_arc, 0, len(self.line), x, y))
 
 
 def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
@@ -102,37 +74,10 @@ def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
     Raises:
         PlannerError: Fewer than two vertices are left.
     """
-    lines = [road.baselines.at(lane) for lane in lanes]
-    line = np.concatenate(lines)
-    arc = arc_lengths(line, np.array([0, len(line)]))
-    poses = np.column_stack([line, np.concatenate([vertex_headings(xy) for xy in lines])])
-    # nuPlan rule 153: of two equal vertices the second stays, and the last of all is always lost
-    kept = np.flatnonzero(np.abs(np.diff(arc)) > SAME_POINT)
-    if len(kept) < 2:
+    path = lane_path(road, lanes)
+    if len(path.driven.progress) < 2:
         raise PlannerError(
             f"idm: the baselines of {[road.edges.ids[e] for e in lanes]} have too few vertices",
             hint="a path needs at least three different vertices",
         )
-    return LanePath(line, arc, make_path(poses[kept], arc[kept]))
-
-
-@kernel
-def sub_path(path: Path, low: float, high: float) -> FloatArray:
-    """(K', 2) points of the path between two progresses, the interpolated ends included [m]."""
-    # loops instead of slice assignments, which take numba seconds to compile
-    count = len(path.progress)
-    first = int(np.searchsorted(path.progress, low, side="right"))
-    last = int(np.searchsorted(path.progress, high, side="left"))  # one past the last vertex
-    if first == count or last == 0:
-        out = np.empty((2, 2))
-        for row in range(2):
-            vertex = row if last == 0 else count - 2 + row
-            out[row, 0], out[row, 1] = path.xy[vertex, 0], path.xy[vertex, 1]
-        return out
-    inner = max(last - first, 0)
-    out = np.empty((inner + 2, 2))
-    out[0, 0], out[0, 1], _ = pose_at(path, low)
-    for row in range(inner):
-        out[row + 1, 0], out[row + 1, 1] = path.xy[first + row, 0], path.xy[first + row, 1]
-    out[inner + 1, 0], out[inner + 1, 1], _ = pose_at(path, high)
-    return out
+    return path
