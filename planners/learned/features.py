@@ -177,7 +177,7 @@ def straight_on(history: History) -> Trajectory:
     return plan_of_poses(poses, history)
 
 
-def stack(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
+def stack_scenes(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
     """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
     import torch
 

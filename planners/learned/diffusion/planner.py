@@ -17,7 +17,13 @@ from shiftsim.planners.learned.diffusion.features import (
     Single,
     lane_lines,
 )
-from shiftsim.planners.learned.features import NO_ROUTE, PerMap, poses_of, short_history, stack
+from shiftsim.planners.learned.features import (
+    NO_ROUTE,
+    PerMap,
+    poses_of,
+    short_history,
+    stack_scenes,
+)
 from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.sim.noise import keyed_generator
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -53,7 +59,7 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
         draw = keyed_generator(*self._key, f"planner-diffusion-{observation.iteration}")
         noise = draw.standard_normal(NOISE_SHAPE, np.float32)
         out = self._build(observation, noise)
-        self._reason = why_makeshift(out, len(observation.history.ego))
+        self._reason = _why_fallback(out, len(observation.history.ego))
         return out
 
     def infer(self, features: Sequence[Features]) -> Sequence[Single]:
@@ -67,7 +73,7 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
     def batch(self, features: Sequence[Features]) -> tuple[Mapping[str, Any], Any]:
         """Tensors that the network reads, by name, and the start noise (B, 11, 80, 4)."""
         rows = [[getattr(one, name) for name in (*INPUTS, "noise")] for one in features]
-        *inputs, noise = stack(rows, self.device)
+        *inputs, noise = stack_scenes(rows, self.device)
         return dict(zip(INPUTS, inputs, strict=True)), noise
 
     def decode(self, output: Single, observation: Observation) -> Trajectory:
@@ -82,13 +88,8 @@ def decode_ego(output: Single, observation: Observation) -> Trajectory:
     return plan_of_poses(from_frame(poses_of(output[0]), history.ego[-1]), history)
 
 
-def why_makeshift(features: Features, num_samples: int) -> str:
-    """Why the official planner would fail here; empty where it would not.
-
-    Args:
-        features: What was found.
-        num_samples: Samples of the history.
-    """
+def _why_fallback(features: Features, num_samples: int) -> str:
+    """Why the official planner would fail here; empty where it would not."""
     if features.route is None:
         return NO_ROUTE
     if len(features.edges) == 0:

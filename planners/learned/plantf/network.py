@@ -10,13 +10,13 @@ from torch import Tensor, nn
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network.blocks import (
     DIM,
+    STATE_CHANNELS,
     AgentEncoder,
     EncoderBlock,
     MapEncoder,
     SceneTensors,
     along_line,
 )
-from shiftsim.planners.learned.network.blocks import STATE_CHANNELS as STATE_CHANNELS
 from shiftsim.planners.learned.network.rows import Linear, without_padding
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint

@@ -21,7 +21,7 @@ from shiftsim.planners.learned.features import (
     poses_of,
     route_blocks,
     short_history,
-    stack,
+    stack_scenes,
     straight_on,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
@@ -150,4 +150,4 @@ def make_batch(features: Sequence[Features], device: str) -> Any:
         )
         for agents, road, state, _ in features
     ]
-    return Inputs(*[*stack(scenes, device), counts])
+    return Inputs(*[*stack_scenes(scenes, device), counts])

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.planners.learned.features import AgentFeatures
+from shiftsim.planners.learned.features import AgentFeatures, stack_scenes
 from shiftsim.planners.learned.map_features import RoadFeatures
 from shiftsim.planners.learned.pluto.reference import LineFeatures
 from shiftsim.planners.learned.pluto.world import StaticObjects
@@ -109,13 +109,8 @@ def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> Array:
 
 def stack(scenes: Sequence[SceneInputs], device: str) -> list[Any]:
     """Values of `network.Inputs`; scenes with fewer rows are filled up with zeros."""
-    import torch
-
-    out: list[Any] = []
-    for _, *arrays in zip(SceneInputs._fields, *scenes, strict=True):
-        batch = np.zeros((len(arrays), *np.max([a.shape for a in arrays], axis=0)), arrays[0].dtype)
-        for row, array in zip(batch, arrays, strict=True):
-            row[tuple(slice(size) for size in array.shape)] = array
-        out.append(torch.from_numpy(batch).to(device))
     parts = ("category", "kind", "object_category", "line_valid")
-    return [*out, [[len(getattr(scene, name)) for scene in scenes] for name in parts]]
+    return [
+        *stack_scenes(scenes, device),
+        [[len(getattr(scene, name)) for scene in scenes] for name in parts],
+    ]

@@ -14,7 +14,14 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.features import SAMPLES, AgentFeatures, PerMap, agent_features
+from shiftsim.planners.learned.features import (
+    NO_ROUTE,
+    AgentFeatures,
+    PerMap,
+    agent_features,
+    route_blocks,
+    short_history,
+)
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
@@ -120,8 +127,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     def reset(self, scene: SceneInfo) -> None:
         """Look up the route; it is corrected at the first step."""
-        index = scene.map.blocks.index
-        self._blocks = [index[name] for name in dict.fromkeys(scene.route) if name in index]
+        self._blocks = route_blocks(scene)
         self._scene, self._lights = scene, LightLookup(scene.map)
         self.route = self.sight = self.choice = None
         self.degraded = ""
@@ -155,13 +161,11 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
     def _why_fallback(self, history: History) -> str:
         """Why the official planner would fail here; empty where it would not."""
         if not self._blocks:
-            return "the scenario has no route on the map"
+            return NO_ROUTE
         assert self.sight is not None
         if not self.sight.lines:
             return NO_LINE
-        if len(history.ego) < SAMPLES:
-            return f"the history has {len(history.ego)} samples, not {SAMPLES}"
-        return ""
+        return short_history(len(history.ego))
 
     def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
         """One forward pass."""

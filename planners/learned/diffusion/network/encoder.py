@@ -7,7 +7,6 @@ little.
 import torch
 from torch import Tensor, nn
 
-from shiftsim.planners.learned.diffusion.network.parts import EPS, Mixer
 from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp
 
 AGENT_COLUMNS, STATIC_COLUMNS, LANE_COLUMNS, LIGHT_COLUMNS = 8, 10, 8, 4
@@ -20,6 +19,33 @@ NO_KEY = float("-inf")
 TOGETHER = 36  # rows that pass through the mixers at a time: what they make stays in the cache
 
 
+class Mixer(nn.Module):
+    """One mixer block: an MLP over the tokens, then one over the channels."""
+
+    def __init__(self, tokens: int, channels: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(channels)
+        self.channels_mlp = Mlp(channels, channels, channels)
+        self.norm2 = nn.LayerNorm(channels)
+        self.tokens_mlp = Mlp(tokens, tokens, tokens)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, T, C) to the same, in place."""
+        self.tokens_mlp.add_over_rows_to(x, self.norm1(x))
+        self.channels_mlp.add_to(x, self.norm2(x))
+        return x
+
+    def mean(self, x: Tensor) -> Tensor:
+        """(B, C) mean over the tokens of what `forward` returns; x does not survive.
+
+        The last layer is linear, so it is applied to the mean instead of to every token.
+        """
+        self.tokens_mlp.add_over_rows_to(x, self.norm1(x))
+        hidden = self.channels_mlp.hidden(self.norm2(x)).mean(dim=1)
+        out: Tensor = x.mean(dim=1) + self.channels_mlp.fc2(hidden)
+        return out
+
+
 class MixerEncoder(nn.Module):
     """What agents and lanes have in common: samples to tokens, mixer blocks, their mean."""
 
@@ -28,7 +54,7 @@ class MixerEncoder(nn.Module):
         self.channel_pre_project = Mlp(columns, CHANNELS, CHANNELS)
         self.token_pre_project = Mlp(samples, TOKENS, TOKENS)
         self.blocks = nn.ModuleList(Mixer(TOKENS, CHANNELS) for _ in range(depth))
-        self.norm = nn.LayerNorm(CHANNELS, EPS)
+        self.norm = nn.LayerNorm(CHANNELS)
         self.emb_project = Mlp(CHANNELS, hidden, hidden)
 
     def mean(self, x: Tensor) -> Tensor:
@@ -100,9 +126,9 @@ class FusionBlock(nn.Module):
 
     def __init__(self, hidden: int, heads: int) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(hidden, EPS)
+        self.norm1 = nn.LayerNorm(hidden)
         self.attn = Attention(hidden, heads)
-        self.norm2 = nn.LayerNorm(hidden, EPS)
+        self.norm2 = nn.LayerNorm(hidden)
         self.mlp = Mlp(hidden, 4 * hidden, hidden)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
@@ -119,7 +145,7 @@ class Fusion(nn.Module):
     def __init__(self, hidden: int, heads: int, depth: int) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(FusionBlock(hidden, heads) for _ in range(depth))
-        self.norm = nn.LayerNorm(hidden, EPS)
+        self.norm = nn.LayerNorm(hidden)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """(B, N, hidden) to the same; `mask` is added to the logits."""
