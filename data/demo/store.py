@@ -57,7 +57,7 @@ def demo_store(path: Path) -> Path:
 
 
 def _sample(store: ScenarioStore) -> list[str]:
-    """Tokens of some scenarios in which the ego gets on, by turns from every town."""
+    """Tokens of some scenarios in which the ego gets on, from every town in turn."""
     by_city: dict[str, list[str]] = {city: [] for city in store.cities}
     for scene in store:
         rows = scene.iteration_rows

@@ -121,7 +121,7 @@ def open_site(src: Path) -> Site:
         src: The folder that holds `data_meta.json`, or one above a `data` or `release/data` folder.
 
     Raises:
-        ConversionError: The file is missing, not JSON, lacks a key or has another major version.
+        ConversionError: The file is missing, not JSON, without a key or of another major version.
     """
     found = [
         d for d in (src, src / "data", src / "release/data") if (d / "data_meta.json").exists()
@@ -198,7 +198,7 @@ def read_recording(
     Args:
         site: Its site.
         name: Its name.
-        category_map: Known category by category of the data set, for names this reader lacks.
+        category_map: Known category by category of the data set, for names that this reader does not know.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.

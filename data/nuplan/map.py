@@ -34,7 +34,7 @@ def read_map(path: Path, name: str) -> VectorMap:
         The map in metres. Flaws that nuPlan tolerates are counted in its `flaws`.
 
     Raises:
-        DataError: The file is missing or broken, or lacks a layer or column.
+        DataError: The file, a layer or a column is missing or broken.
     """
     with open_database(Path(path)) as database:
         try:

@@ -130,7 +130,7 @@ def open_recording(folder: Path) -> StoredRecording:
     """Open the files of a recording.
 
     Raises:
-        DataError: A file is missing, lacks a column or is damaged.
+        DataError: A file or a column is missing, or is damaged.
     """
     frames = Table(folder / FRAMES, schema.FRAMES)
     tracks = Table(folder / TRACKS, schema.TRACKS)
