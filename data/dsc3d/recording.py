@@ -198,7 +198,7 @@ def read_recording(
     Args:
         site: Its site.
         name: Its name.
-        category_map: Known category by category of the data set, for names that this reader does not know.
+        category_map: Known category by category of the data set, for other names.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.
