@@ -83,27 +83,25 @@ def make_config(values: Mapping[str, Any]) -> ConversionConfig:
 
 def _check_type(name: str, value: Any) -> None:
     """Types are checked strictly: TOML and Python callers get the same message."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    if name == "ego_categories":
-        good, wanted = isinstance(value, tuple) and all(map(_is_text, value)), "a list of names"
-    elif name == "category_map":
-        good = isinstance(value, dict) and all(map(_is_text, [*value, *value.values()]))
-        wanted = "a table of names"
-    elif name == "country":
-        good, wanted = _is_text(value), "a name"
-    elif name == "route_extension_blocks":
-        good, wanted = whole and value >= 0, "an integer from 0 on"
-    elif name == "max_per_window":
-        good, wanted = value is None or (whole and value > 0), "an integer from 1 on"
-    else:
-        number = whole or isinstance(value, float)
-        good, wanted = number and 0 <= value < np.inf, "a number from 0 on"
-    if not good:
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    special: dict[str, tuple[bool, str]] = {
+        "ego_categories": (isinstance(value, tuple) and _are_texts(*value), "a list of names"),
+        "category_map": (
+            isinstance(value, dict) and _are_texts(*value, *value.values()),
+            "a table of names",
+        ),
+        "country": (_are_texts(value), "a name"),
+        "route_extension_blocks": (is_whole and value >= 0, "an integer from 0 on"),
+        "max_per_window": (value is None or (is_whole and value > 0), "an integer from 1 on"),
+    }
+    is_number = (is_whole or isinstance(value, float)) and 0 <= value < np.inf
+    is_good, wanted = special.get(name, (is_number, "a number from 0 on"))
+    if not is_good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
+def _are_texts(*values: object) -> bool:
+    return all(isinstance(value, str) for value in values)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,12 @@ _GROUND = 512.0  # m, altitude of everything
 _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleration")
 
 
-def write_sites(folder: Path) -> None:
-    """Write every demo site into a folder of its own below `folder`."""
+def write_demo(folder: Path) -> None:
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
+
+    Args:
+        folder: Where the folders of the towns go; made if needed.
+    """
     for site in demo_sites():
         _write_site(folder / site.name, site)
 

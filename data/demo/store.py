@@ -12,7 +12,7 @@ import numpy as np
 
 from shiftsim.data.deepplan.convert import ConversionReport, convert_dsc3d
 from shiftsim.data.demo.city import bench_scene
-from shiftsim.data.demo.files import write_sites
+from shiftsim.data.demo.files import write_demo
 from shiftsim.data.store.reading import ScenarioStore
 
 __all__ = ["DEMO_SPLIT", "bench_scene", "convert_demo", "demo_store", "write_demo"]
@@ -20,15 +20,6 @@ __all__ = ["DEMO_SPLIT", "bench_scene", "convert_demo", "demo_store", "write_dem
 DEMO_SPLIT = "demo-mini"
 _SPLIT_SIZE = 16
 _SPLIT_PATH = 40.0  # m, shortest way of the ego in a scenario of the split
-
-
-def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
-
-    Args:
-        folder: Where the folders of the towns go; made if needed.
-    """
-    write_sites(folder)
 
 
 def convert_demo(recordings: Path, store: Path) -> list[ConversionReport]:
@@ -66,7 +57,7 @@ def demo_store(path: Path) -> Path:
 
 
 def _sample(store: ScenarioStore) -> list[str]:
-    """Tokens of some scenarios in which the ego gets on, by turns from every town."""
+    """Tokens of some scenarios in which the ego gets on, from every town in turn."""
     by_city: dict[str, list[str]] = {city: [] for city in store.cities}
     for scene in store:
         rows = scene.iteration_rows

@@ -3,6 +3,8 @@
 Rows are sorted by track, then time, as in `dsc3d.Annotations`.
 """
 
+from collections import Counter
+
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
@@ -41,7 +43,7 @@ def believed_velocities(
     xy: FloatArray,
     time: FloatArray,
     track: IntArray,
-    warnings: dict[str, int],
+    warnings: Counter[str],
 ) -> FloatArray:
     """Stored velocities of the tracks where they fit the positions (nuPlan rule 459), else derived.
 
@@ -54,7 +56,7 @@ def believed_velocities(
     """
     derived = _central_differences(xy, time, track)
     if stored is None:
-        count(warnings, "tracks without stored velocity (derived)", int(track[-1]) + 1)
+        warnings["tracks without stored velocity (derived)"] += int(track[-1]) + 1
         return derived
     error = np.hypot(*(derived - stored).T)
     first = np.searchsorted(track, np.arange(track[-1] + 1))
@@ -62,7 +64,7 @@ def believed_velocities(
     refused = track_medians(error, track) >= _MAX_VELOCITY_ERROR
     refused &= last > first  # a single row has nothing to compare with
     refused[track[np.abs(stored).max(axis=1) > _MAX_SPEED]] = True
-    count(warnings, "tracks whose stored velocity does not fit (derived)", int(refused.sum()))
+    warnings["tracks whose stored velocity does not fit (derived)"] += int(refused.sum())
     return np.where(refused[track][:, None], derived, stored)
 
 
@@ -88,7 +90,7 @@ def held_headings(
     velocities: FloatArray,
     time: FloatArray,
     track: IntArray,
-    warnings: dict[str, int],
+    warnings: Counter[str],
 ) -> FloatArray:
     """Headings; where a standing object's spins, the one before (nuPlan rule 460)."""
     standing = np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDSTILL
@@ -102,12 +104,6 @@ def held_headings(
     first_spin = np.full(stretch[-1] + 1, len(yaw), np.int64)
     np.minimum.at(first_spin, stretch[spins], index[spins])
     held = standing & (index >= first_spin[stretch])
-    count(warnings, "rows with a heading that spins at standstill (held)", int(held.sum()))
+    warnings["rows with a heading that spins at standstill (held)"] += int(held.sum())
     source = np.where(held, np.maximum(first_spin[stretch] - 1, 0), index)
     return yaw[source]
-
-
-def count(warnings: dict[str, int], what: str, number: int) -> None:
-    """Add to a count, unless there is nothing to add."""
-    if number:
-        warnings[what] = warnings.get(what, 0) + number

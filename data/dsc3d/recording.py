@@ -6,6 +6,7 @@ Position and heading are taken as truth, heading through the rotation matrix.
 """
 
 import json
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,6 @@ from shiftsim.data.dsc3d.files import (
 )
 from shiftsim.data.dsc3d.motion import (
     believed_velocities,
-    count,
     held_headings,
     rotation_angles,
     track_medians,
@@ -33,24 +33,14 @@ from shiftsim.data.dsc3d.motion import (
 from shiftsim.errors import ConversionError
 from shiftsim.world.state import AgentKind
 
-CATEGORIES = {
-    **dict.fromkeys(
-        ("car", "vehicle", "van", "pickup", "truck", "bus", "trailer", "tram", "train"),
-        AgentKind.VEHICLE,
-    ),
-    **dict.fromkeys(
-        ("construction_vehicle", "agricultural_vehicle", "emergency_vehicle"), AgentKind.VEHICLE
-    ),
-    **dict.fromkeys(
-        ("motorcycle", "bicycle", "cyclist", "scooter", "e_scooter", "escooter", "moped"),
-        AgentKind.BICYCLE,
-    ),
-    **dict.fromkeys(("pedestrian", "person", "stroller", "wheelchair"), AgentKind.PEDESTRIAN),
-    **dict.fromkeys(
-        ("animal", "bicycle_rack", "movable_object", "static_object", "generic_object"),
-        AgentKind.GENERIC_OBJECT,
-    ),
+_CATEGORIES = {
+    AgentKind.VEHICLE: "car vehicle van pickup truck bus trailer tram train construction_vehicle"
+    " agricultural_vehicle emergency_vehicle",
+    AgentKind.BICYCLE: "motorcycle bicycle cyclist scooter e_scooter escooter moped",
+    AgentKind.PEDESTRIAN: "pedestrian person stroller wheelchair",
+    AgentKind.GENERIC_OBJECT: "animal bicycle_rack movable_object static_object generic_object",
 }  # nuPlan rule 462: it has no class for motorcycles
+CATEGORIES = {name: kind for kind, names in _CATEGORIES.items() for name in names.split()}
 
 _NEEDED = ("frame_id", "track_id", "category", *POSITION, *ROTATION, *DIMENSION, *VELOCITY)
 
@@ -131,7 +121,7 @@ def open_site(src: Path) -> Site:
         src: The folder that holds `data_meta.json`, or one above a `data` or `release/data` folder.
 
     Raises:
-        ConversionError: The file is missing, not JSON, lacks a key or has another major version.
+        ConversionError: The file is missing, not JSON, without a key or of another major version.
     """
     found = [
         d for d in (src, src / "data", src / "release/data") if (d / "data_meta.json").exists()
@@ -208,13 +198,13 @@ def read_recording(
     Args:
         site: Its site.
         name: Its name.
-        category_map: Known category by category of the data set, for names this reader lacks.
+        category_map: Known category by category of the data set, for other names.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.
     """
     folder = site.folder / "annotations" / name
-    warnings: dict[str, int] = {}
+    warnings: Counter[str] = Counter()
     frame_ids, start_us = _read_frames(folder / "frames.parquet", site, warnings)
     path = folder / "annotations.parquet"
     table = read_table(path, _NEEDED, _MAX_ROWS)
@@ -262,7 +252,7 @@ def read_recording(
         categories=names,
         kinds=kinds,
         sizes=sizes,
-        warnings=warnings,
+        warnings=dict(+warnings),
     )
 
 
@@ -280,24 +270,28 @@ def _key(data: Any, dotted: str, path: Path) -> Any:
 
 
 def _check_site(site: Site, path: Path) -> None:
-    if not (1 <= site.zone <= 60):
-        raise ConversionError(f"{path}: reference_utm.zone {site.zone!r} is not a UTM zone (1-60)")
-    if not np.isfinite(site.offset).all():
-        raise ConversionError(f"{path}: reference_utm.offset is not finite")
-    if (np.abs(site.offset) > _MAX_OFFSET).any():
-        raise ConversionError(
-            f"{path}: reference_utm.offset {site.offset.tolist()} is not a place in UTM"
-        )
-    if not (np.isfinite(site.frame_rate) and site.frame_rate > 0 and site.frame_distance > 0):
-        raise ConversionError(f"{path}: frame_rate and frame_distance must be positive")
-    if not site.recordings:
-        raise ConversionError(f"{path}: no recordings are listed under locations")
+    rate = site.frame_rate
+    for is_good, what in (
+        (1 <= site.zone <= 60, f"reference_utm.zone {site.zone!r} is not a UTM zone (1-60)"),
+        (np.isfinite(site.offset).all(), "reference_utm.offset is not finite"),
+        (
+            (np.abs(site.offset) <= _MAX_OFFSET).all(),
+            f"reference_utm.offset {site.offset.tolist()} is not a place in UTM",
+        ),
+        (
+            np.isfinite(rate) and rate > 0 and site.frame_distance > 0,
+            "frame_rate and frame_distance must be positive",
+        ),
+        (site.recordings, "no recordings are listed under locations"),
+    ):
+        if not is_good:
+            raise ConversionError(f"{path}: {what}")
     for name in site.recordings:
         if Path(name).name != name or name in ("", ".", ".."):
             raise ConversionError(f"{path}: recording name {name!r} is not a plain folder name")
 
 
-def _read_frames(path: Path, site: Site, warnings: dict[str, int]) -> tuple[IntArray, int]:
+def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArray, int]:
     table = read_table(path, ("frame_id", "time"), _MAX_FRAMES)
     ids = numbers(table, "frame_id", path).astype(np.int64)
     if len(ids) < 2:
@@ -320,9 +314,8 @@ def _read_frames(path: Path, site: Site, warnings: dict[str, int]) -> tuple[IntA
             "check frame_id, and frame_rate in data_meta.json; or split the recording",
         )
     wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * site.period
-    count(warnings, "frames whose time disagrees with their id", int(wrong.sum()))
-    missing = int((np.diff(ids) // site.frame_distance - 1).sum())
-    count(warnings, "frames missing", missing)
+    warnings["frames whose time disagrees with their id"] += int(wrong.sum())
+    warnings["frames missing"] += int((np.diff(ids) // site.frame_distance - 1).sum())
     return ids, int(stamps[0])
 
 
@@ -353,7 +346,7 @@ def _refuse_duplicates(
 
 
 def _track_sizes(
-    sizes: FloatArray, track: IntArray, num_tracks: int, path: Path, warnings: dict[str, int]
+    sizes: FloatArray, track: IntArray, num_tracks: int, path: Path, warnings: Counter[str]
 ) -> FloatArray:
     if not (sizes > 0).all():
         row = int(np.flatnonzero(~(sizes > 0).all(axis=1))[0])
@@ -366,7 +359,7 @@ def _track_sizes(
     changed = np.unique(track[varying])
     for axis in range(sizes.shape[1] if len(changed) else 0):
         out[changed, axis] = track_medians(sizes[:, axis], track)[changed]
-    count(warnings, "tracks of varying size (median taken)", len(changed))
+    warnings["tracks of varying size (median taken)"] += len(changed)
     return out
 
 
@@ -376,7 +369,7 @@ def _track_categories(
     track: IntArray,
     num_tracks: int,
     path: Path,
-    warnings: dict[str, int],
+    warnings: Counter[str],
 ) -> tuple[str, ...]:
     if "category" not in table.column_names:
         raise ConversionError(f"{path}: column 'category' is missing")
@@ -398,7 +391,7 @@ def _track_categories(
     votes = np.zeros((num_tracks, len(names)), np.int64)
     np.add.at(votes, (track, codes), 1)
     changing = int(((votes > 0).sum(axis=1) > 1).sum())
-    count(warnings, "tracks of changing category (most frequent taken)", changing)
+    warnings["tracks of changing category (most frequent taken)"] += changing
     return tuple(names[code] for code in votes.argmax(axis=1).tolist())
 
 

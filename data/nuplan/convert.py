@@ -69,20 +69,18 @@ def convert_nuplan(
     """
     chosen = _choice(tokens, types, filter_file)
     files = _log_files(Path(logs), chosen)
-    known_maps = find_maps(Path(maps))
-    report = ConversionReport()
-    roads: dict[str, VectorMap] = {}
-    found: set[str] = set()
     with StoreWriter(store) as writer:
+        conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
+        report = conversion.report
         for done, path in enumerate(files):
             if progress is not None:
                 progress(done, len(files), path.stem)
             try:
                 with open_log(path) as log:
-                    found |= _convert_log(log, chosen, mapping, known_maps, roads, writer, report)
+                    conversion.convert_log(log)
             except DataError as error:
                 report.failed[path.stem] = _reason(error)
-    for token in sorted((chosen.tokens or frozenset()) - found):
+    for token in sorted((chosen.tokens or frozenset()) - conversion.found):
         names = ", ".join(path.name for path in files[:5]) + (", …" if len(files) > 5 else "")
         report.failed[token] = f"not offered by any of {len(files)} logs searched ({names})"
     for flaw, count in report.flaws.items():
@@ -116,63 +114,6 @@ def _reason(error: DataError) -> str:
     return f"{error} ({error.hint})" if error.hint else str(error)
 
 
-def _convert_log(
-    log: Log,
-    chosen: ScenarioFilter,
-    mapping: Mapping | None,
-    known_maps: dict[str, Path],
-    roads: dict[str, VectorMap],
-    writer: StoreWriter,
-    report: ConversionReport,
-) -> set[str]:
-    """Convert the chosen scenarios of one log; returns the tokens found."""
-    entries = offered(
-        log,
-        tokens=chosen.tokens,
-        types=chosen.types,
-        remove_invalid_goals=chosen.remove_invalid_goals,
-    )
-    if chosen.maps is not None and log.map_name not in chosen.maps:
-        entries = []
-    windows: list[Window] = []
-    for entry in entries:
-        try:
-            window = cut_window(log, entry.token, mapping)
-        except ConversionError as error:
-            report.failed[entry.token] = _reason(error)
-            continue
-        if _is_stored(writer, window):
-            report.unchanged.append(window.token)
-        else:
-            windows.append(window)
-    if windows:
-        road = _road(log.map_name, known_maps, roads, writer, report)
-        for group in _parts(windows):
-            _write_part(log, group, road, writer, report)
-    return {entry.token for entry in entries}
-
-
-def _is_stored(writer: StoreWriter, window: Window) -> bool:
-    if window.token not in writer.tokens:
-        return False
-    stored = writer.window(window.token)
-    return stored.mapping == window.mapping and stored.scenario_type == window.scenario_type
-
-
-def _road(
-    name: str,
-    known_maps: dict[str, Path],
-    roads: dict[str, VectorMap],
-    writer: StoreWriter,
-    report: ConversionReport,
-) -> VectorMap:
-    if name not in roads:
-        roads[name] = load_map(known_maps, name)
-        writer.add_map(roads[name])
-        report.flaws.update({f"map {name}: {w}": n for w, n in roads[name].flaws.items()})
-    return roads[name]
-
-
 def _parts(windows: Sequence[Window]) -> list[list[Window]]:
     """Windows that overlap in time share a part of the log, up to a length."""
     parts: list[list[Window]] = []
@@ -186,35 +127,88 @@ def _parts(windows: Sequence[Window]) -> list[list[Window]]:
     return parts
 
 
-def _write_part(
-    log: Log, windows: list[Window], road: VectorMap, writer: StoreWriter, report: ConversionReport
-) -> None:
-    first, last = windows[0].first_row, max(window.last_row for window in windows)
-    name = f"{log.name}@{log.time_us[first]}-{log.time_us[last - 1]}"
-    flaws: Counter[str] = Counter()
-    try:
-        recording, ego = read_span(log, name, first, last, flaws)
-    except ConversionError as error:
-        if len(windows) == 1:
-            report.failed[windows[0].token] = _reason(error)
-        else:  # only the scenarios that hold the broken rows fail
-            for window in windows:
-                _write_part(log, [window], road, writer, report)
-        return
-    writer.add_recording(recording)
-    writer.add_ego(ego)
-    report.flaws.update({f"log {log.name}: {what}": count for what, count in (+flaws).items()})
-    for window in windows:
-        unknown = sum(block not in road.blocks.index for block in window.route)
-        report.flaws.update({f"log {log.name}: unknown route ids": unknown} if unknown else {})
-        writer.add_window(
-            replace(
-                window,
-                log_name=name,
-                ego=EGO,
-                first_row=window.first_row - first,
-                last_row=window.last_row - first,
-                iteration_rows=window.iteration_rows - first,
+class _Conversion:
+    """Scenarios on their way into a store, and what became of them so far."""
+
+    def __init__(
+        self,
+        chosen: ScenarioFilter,
+        mapping: Mapping | None,
+        known_maps: dict[str, Path],
+        writer: StoreWriter,
+    ) -> None:
+        self.chosen, self.mapping, self.known_maps = chosen, mapping, known_maps
+        self.writer = writer
+        self.report = ConversionReport()
+        self.maps: dict[str, VectorMap] = {}
+        self.found: set[str] = set()  # tokens
+
+    def convert_log(self, log: Log) -> None:
+        """Convert the chosen scenarios of one log."""
+        chosen, report = self.chosen, self.report
+        if chosen.maps is not None and log.map_name not in chosen.maps:
+            return
+        windows: list[Window] = []
+        for entry in offered(
+            log,
+            tokens=chosen.tokens,
+            types=chosen.types,
+            remove_invalid_goals=chosen.remove_invalid_goals,
+        ):
+            self.found.add(entry.token)
+            try:
+                window = cut_window(log, entry.token, self.mapping)
+            except ConversionError as error:
+                report.failed[entry.token] = _reason(error)
+                continue
+            if self._is_stored(window):
+                report.unchanged.append(window.token)
+            else:
+                windows.append(window)
+        for group in _parts(windows):
+            self._write_part(log, group)
+
+    def _is_stored(self, window: Window) -> bool:
+        if window.token not in self.writer.tokens:
+            return False
+        stored = self.writer.window(window.token)
+        return stored.mapping == window.mapping and stored.scenario_type == window.scenario_type
+
+    def _map(self, name: str) -> VectorMap:
+        if name not in self.maps:
+            self.maps[name] = load_map(self.known_maps, name)
+            self.writer.add_map(self.maps[name])
+            flaws = self.maps[name].flaws
+            self.report.flaws.update({f"map {name}: {what}": n for what, n in flaws.items()})
+        return self.maps[name]
+
+    def _write_part(self, log: Log, windows: list[Window]) -> None:
+        report, blocks = self.report, self._map(log.map_name).blocks.index
+        first, last = windows[0].first_row, max(window.last_row for window in windows)
+        name = f"{log.name}@{log.time_us[first]}-{log.time_us[last - 1]}"
+        flaws: Counter[str] = Counter()
+        try:
+            recording, ego = read_span(log, name, first, last, flaws)
+        except ConversionError as error:
+            if len(windows) == 1:
+                report.failed[windows[0].token] = _reason(error)
+            else:  # only the scenarios that hold the broken rows fail
+                for window in windows:
+                    self._write_part(log, [window])
+            return
+        self.writer.add_recording(recording)
+        self.writer.add_ego(ego)
+        for window in windows:
+            flaws["unknown route ids"] += sum(block not in blocks for block in window.route)
+            self.writer.add_window(
+                replace(
+                    window,
+                    log_name=name,
+                    ego=EGO,
+                    first_row=window.first_row - first,
+                    last_row=window.last_row - first,
+                    iteration_rows=window.iteration_rows - first,
+                )
             )
-        )
-        report.converted.append(window.token)
+            report.converted.append(window.token)
+        report.flaws.update({f"log {log.name}: {what}": n for what, n in (+flaws).items()})

@@ -81,13 +81,13 @@ def export_nuplan(
     """
     chosen = store.tokens if tokens is None else tuple(tokens)
     windows = {token: store.window(token) for token in chosen}
-    names = _log_names(store, windows)
+    cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
+    names = _log_names(windows, cities)
     report = ExportReport(
         logs=out / "nuplan-v1.1" / "splits" / _plain(store.path.resolve().name),
         maps=out / "maps",
         token_file=out / "tokens.txt",
     )
-    cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
     report.cities = sorted({cities[token] for token in chosen})
     _write_maps(store, report)
     for done, token in enumerate(chosen):
@@ -103,9 +103,8 @@ def export_nuplan(
     return report
 
 
-def _log_names(store: ScenarioStore, windows: dict[str, Window]) -> dict[str, str]:
+def _log_names(windows: dict[str, Window], cities: dict[str, str]) -> dict[str, str]:
     """`<map>_<recording>_<ego track>_<first frame>`, with the token where that is not unique."""
-    cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
     names = {}
     for token, window in windows.items():
         recording = window.log_name.removeprefix(f"{cities[token]}_")

@@ -75,7 +75,7 @@ def open_log(path: Path) -> Iterator[Log]:
     """Open a log and read its clock.
 
     Raises:
-        DataError: The file is broken or lacks a table, column or the merged point cloud.
+        DataError: The file is broken, or a table, column or the merged point cloud is missing.
     """
     with open_database(Path(path)) as database:
         for table, columns in _TABLES.items():

@@ -1,15 +1,17 @@
 """nuPlan's map.gpkg -> VectorMap."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
 from shiftsim.data.nuplan.sqlite import open_database
+from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 
@@ -32,7 +34,7 @@ def read_map(path: Path, name: str) -> VectorMap:
         The map in metres. Flaws that nuPlan tolerates are counted in its `flaws`.
 
     Raises:
-        DataError: The file is missing or broken, or lacks a layer or column.
+        DataError: The file, a layer or a column is missing or broken.
     """
     with open_database(Path(path)) as database:
         try:
@@ -46,7 +48,7 @@ def read_map(path: Path, name: str) -> VectorMap:
 
 
 def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
-    flaws: dict[str, int] = {}
+    flaws: Counter[str] = Counter()
     boundaries = _lines(gpkg.table("boundaries"))
     baselines = _baselines(gpkg)
     intersections = gpkg.table("intersections", extra=["intersection_type_fid"])
@@ -68,9 +70,9 @@ def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
     ]
     blocks = _blocks(gpkg, flaws)
     lanes = [spec.polygon for spec in edges if not spec.is_connector]
-    _count(flaws, "overlapping lanes", _num_overlaps(lanes))
+    flaws["overlapping lanes"] += _num_overlaps(lanes)
     roadblocks = [spec.polygon for spec in blocks if not spec.is_connector]
-    _count(flaws, "overlapping roadblocks", _num_overlaps(roadblocks))
+    flaws["overlapping roadblocks"] += _num_overlaps(roadblocks)
     tables = {t: gpkg.table(t) for t in _DRIVABLE_LAYERS if t != "intersections"}
     tables["intersections"] = intersections
     road = build_map(
@@ -85,12 +87,7 @@ def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
         car_parks=_areas(tables["carpark_areas"]),
         drivable_areas=[area for layer in _DRIVABLE_LAYERS for area in _areas(tables[layer])],
     )
-    return replace(road, flaws={**flaws, **road.flaws})
-
-
-def _count(flaws: dict[str, int], flaw: str, number: int) -> None:
-    if number:
-        flaws[flaw] = flaws.get(flaw, 0) + number
+    return replace(road, flaws={**+flaws, **road.flaws})
 
 
 def _lines(table: LayerTable) -> dict[str, FloatArray]:
@@ -122,7 +119,7 @@ def _lanes(
     baselines: dict[str, FloatArray],
     boundaries: dict[str, FloatArray],
     connectors: LayerTable,
-    flaws: dict[str, int],
+    flaws: Counter[str],
 ) -> list[EdgeSpec]:
     table = gpkg.table(
         "lanes_polygons",
@@ -139,12 +136,12 @@ def _lanes(
     outgoing = _group(connectors.text_ids("exit_lane_fid"), connectors.ids)
     incoming = _group(connectors.text_ids("entry_lane_fid"), connectors.ids)
     groups, indices = table.text_ids("lane_group_fid"), table.integers("lane_index", -1)
-    left, right = table.text_ids("left_boundary_fid"), table.text_ids("right_boundary_fid")
+    borders = _Borders(boundaries, table)
     lane_at = {
         (group, index): fid for group, index, fid in zip(groups, indices, table.ids, strict=True)
     }
     different = sum(i != j for i, j in zip(table.ids, table.text_ids("lane_fid"), strict=True))
-    _count(flaws, "lane_fid differs from fid", different)
+    flaws["lane_fid differs from fid"] += different
     kinds = table.integers("lane_type_fid", 0)
     return [
         EdgeSpec(
@@ -155,10 +152,7 @@ def _lanes(
             block_id=groups[row] or "",
             incoming=incoming.get(fid, []),
             outgoing=outgoing.get(fid, []),
-            left=_optional(boundaries, left[row], flaws),
-            right=_optional(boundaries, right[row], flaws),
-            left_id=left[row] or "",
-            right_id=right[row] or "",
+            **borders.at(row, flaws),
             speed_limit=_speed(table, row),
             lane_index=indices[row],
             left_lane=lane_at.get((groups[row], indices[row] - 1)),
@@ -175,7 +169,7 @@ def _connectors(
     boundaries: dict[str, FloatArray],
     table: LayerTable,
     stops: LayerTable,
-    flaws: dict[str, int],
+    flaws: Counter[str],
 ) -> list[EdgeSpec]:
     areas = gpkg.table(
         "gen_lane_connectors_scaled_width_polygons",
@@ -186,7 +180,7 @@ def _connectors(
     bare = set(table.ids) - set(owners)
     if bare:
         raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=REPAIR)
-    left, right = areas.text_ids("left_boundary_fid"), areas.text_ids("right_boundary_fid")
+    borders = _Borders(boundaries, areas)
     start, end = table.text_ids("exit_lane_fid"), table.text_ids("entry_lane_fid")
     groups = table.text_ids("lane_group_connector_fid")
     crossings = table.text_ids("intersection_fid")
@@ -196,7 +190,7 @@ def _connectors(
     # nuPlan rule 424: in the order of the polygons
     for area, fid in enumerate(owners):
         if fid is None or fid not in row_of:
-            _count(flaws, "polygon of an unknown lane connector", 1)
+            flaws["polygon of an unknown lane connector"] += 1
             continue
         row = row_of[fid]
         baseline = _find(baselines, fid, "lane connector", "baseline")
@@ -210,10 +204,7 @@ def _connectors(
                 block_id=groups[row] or "",
                 incoming=_known(start[row]),
                 outgoing=_known(end[row]),
-                left=_optional(boundaries, left[area], flaws),
-                right=_optional(boundaries, right[area], flaws),
-                left_id=left[area] or "",
-                right_id=right[area] or "",
+                **borders.at(area, flaws),
                 speed_limit=_speed(table, row),
                 has_traffic_lights=listed != "",  # nuPlan rule 423
                 stop_lines=_stop_lines(listed, baseline, stop_shapes),
@@ -224,7 +215,7 @@ def _connectors(
     return out
 
 
-def _blocks(gpkg: GeoPackage, flaws: dict[str, int]) -> list[BlockSpec]:
+def _blocks(gpkg: GeoPackage, flaws: Counter[str]) -> list[BlockSpec]:
     roadblocks = gpkg.table("lane_groups_polygons")
     links = gpkg.table(
         "lane_group_connectors", ["from_lane_group_fid", "to_lane_group_fid", "intersection_fid"]
@@ -290,12 +281,21 @@ def _find(lines: dict[str, FloatArray], fid: str, owner: str, what: str) -> Floa
     return lines[fid]
 
 
-def _optional(
-    lines: dict[str, FloatArray], fid: str | None, flaws: dict[str, int]
-) -> FloatArray | None:
-    if fid is not None and fid not in lines:
-        _count(flaws, "edge names an unknown boundary", 1)
-    return None if fid is None else lines.get(fid)
+class _Borders:
+    """The borders that the rows of a layer name."""
+
+    def __init__(self, lines: dict[str, FloatArray], table: LayerTable) -> None:
+        self.lines = lines
+        self.ids = {side: table.text_ids(f"{side}_boundary_fid") for side in ("left", "right")}
+
+    def at(self, row: int, flaws: Counter[str]) -> dict[str, Any]:
+        """Both borders of a row and their ids, as `EdgeSpec` takes them."""
+        out: dict[str, Any] = {}
+        for side, ids in self.ids.items():
+            fid = ids[row] or ""
+            flaws["edge names an unknown boundary"] += fid != "" and fid not in self.lines
+            out |= {side: self.lines.get(fid), f"{side}_id": fid}
+        return out
 
 
 def _speed(table: LayerTable, row: int) -> float | None:
@@ -310,10 +310,10 @@ def _speed(table: LayerTable, row: int) -> float | None:
     return float(value)
 
 
-def _one_polygon(table: LayerTable, row: int, flaws: dict[str, int]) -> shapely.Polygon:
+def _one_polygon(table: LayerTable, row: int, flaws: Counter[str]) -> shapely.Polygon:
     parts = _polygons(table, row)
     if len(parts) > 1:
-        _count(flaws, "lane or roadblock in several pieces: the largest is kept", 1)
+        flaws["lane or roadblock in several pieces: the largest is kept"] += 1
     return max(parts, key=lambda part: float(shapely.area(part)))
 
 
@@ -337,17 +337,4 @@ def _areas(table: LayerTable, kinds: Sequence[int] | None = None) -> list[AreaSp
 
 
 def _num_overlaps(polygons: Sequence[shapely.Polygon]) -> int:
-    shapes = np.array(polygons, object)
-    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    pairs = first < second
-    common = [
-        _common_area(a, b) for a, b in zip(shapes[first[pairs]], shapes[second[pairs]], strict=True)
-    ]
-    return sum(area > _MIN_OVERLAP for area in common)
-
-
-def _common_area(a: shapely.Polygon, b: shapely.Polygon) -> float:
-    try:
-        return float(shapely.area(shapely.intersection(a, b)))
-    except shapely.errors.GEOSException:  # a polygon that crosses itself
-        return float(shapely.area(shapely.intersection(shapely.buffer(a, 0), shapely.buffer(b, 0))))
+    return sum(area > _MIN_OVERLAP for area in shared_areas(polygons).values())

@@ -94,7 +94,7 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
         mapping: Duration [s], offset [s] and subsample ratio; nuPlan's for the type where None.
 
     Raises:
-        ConversionError: The log lacks the token, or has too few rows there.
+        ConversionError: The log does not have the token, or too few rows there.
     """
     if token not in log.row_of:
         raise ConversionError(f"{log.path}: there is no lidar_pc {token!r}", hint="check the token")

@@ -22,17 +22,11 @@ _BESIDE = ("filter", "splits")  # folders that hold statements about the scenari
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
+    """One thing that is wrong."""
 
-    Attributes:
-        where: File, map or scenario.
-        what: What is wrong there.
-        is_error: Whether results cannot be trusted; else it is only unusual.
-    """
-
-    where: str
-    what: str
-    is_error: bool = True
+    where: str  # file, map or scenario
+    what: str  # what is wrong there
+    is_error: bool = True  # whether results cannot be trusted; else it is only unusual
 
 
 def check_store(path: str | Path) -> list[Problem]:

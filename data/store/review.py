@@ -24,23 +24,16 @@ _DECISIONS = (ACCEPT, REJECT, UNDECIDED)
 
 @dataclass(frozen=True, slots=True)
 class Review:
-    """What a person says of one scenario.
+    """What a person says of one scenario."""
 
-    Attributes:
-        token: The scenario.
-        decision: `accept`, `reject`, or empty where there is only a comment or a route.
-        comment: Why.
-        route: Corrected route roadblock ids; None where the recorded route stands.
-        reviewer: Who says so.
-        version: Version of shiftsim it was written with.
-    """
-
-    token: str
+    token: str  # the scenario
+    # `accept`, `reject`, or empty where there is only a comment or a route
     decision: str = UNDECIDED
-    comment: str = ""
+    comment: str = ""  # why
+    # corrected route roadblock ids; None where the recorded route stands
     route: tuple[str, ...] | None = None
-    reviewer: str = ""
-    version: str = ""
+    reviewer: str = ""  # who says so
+    version: str = ""  # version of shiftsim it was written with
 
     @property
     def is_empty(self) -> bool:

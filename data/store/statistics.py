@@ -39,37 +39,21 @@ PUBLISHED_SETS = {"nuPlan Val14": 1118, "interPlan": 80, "DeepPlan": 1182}
 
 @dataclass(frozen=True, slots=True)
 class ScenarioStats:
-    """Numbers of one scenario, over its iterations.
+    """Numbers of one scenario, over its iterations."""
 
-    Attributes:
-        vehicles: Vehicles besides the ego that are ever present.
-        pedestrians: The same of pedestrians.
-        bicycles: The same of bicycles.
-        vehicles_t0: Vehicles at iteration 0.
-        pedestrians_t0: The same of pedestrians.
-        bicycles_t0: The same of bicycles.
-        static_objects: Static objects that are ever present.
-        mean_speed_mps: Of the ego.
-        max_speed_mps: Of the ego.
-        path_m: Length of the ego's path.
-        route_m: Length of the route: of one lane per block.
-        interactions: Mean number of agents that come close to the ego's path.
-        intersection: 1 when the ego passes an intersection, else 0.
-    """
-
-    vehicles: float
-    pedestrians: float
-    bicycles: float
-    vehicles_t0: float
-    pedestrians_t0: float
-    bicycles_t0: float
-    static_objects: float
-    mean_speed_mps: float
-    max_speed_mps: float
-    path_m: float
-    route_m: float
-    interactions: float
-    intersection: float
+    vehicles: float  # vehicles besides the ego that are ever present
+    pedestrians: float  # the same of pedestrians
+    bicycles: float  # the same of bicycles
+    vehicles_t0: float  # vehicles at iteration 0
+    pedestrians_t0: float  # the same of pedestrians
+    bicycles_t0: float  # the same of bicycles
+    static_objects: float  # static objects that are ever present
+    mean_speed_mps: float  # of the ego
+    max_speed_mps: float  # of the ego
+    path_m: float  # length of the ego's path
+    route_m: float  # length of the route: of one lane per block
+    interactions: float  # mean number of agents that come close to the ego's path
+    intersection: float  # 1 when the ego passes an intersection, else 0
 
 
 COLUMNS = tuple(field.name for field in fields(ScenarioStats))
@@ -82,17 +66,11 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class StoreStats:
-    """Statistics of some scenarios of a store.
+    """Statistics of some scenarios of a store."""
 
-    Attributes:
-        rows: Numbers by scenario.
-        cities: City by scenario.
-        types: Scenario type by scenario.
-    """
-
-    rows: Mapping[str, ScenarioStats]
-    cities: Mapping[str, str]
-    types: Mapping[str, str]
+    rows: Mapping[str, ScenarioStats]  # numbers by scenario
+    cities: Mapping[str, str]  # city by scenario
+    types: Mapping[str, str]  # scenario type by scenario
 
     def groups(self, by: str = "city") -> dict[str, dict[str, float]]:
         """Number of scenarios and mean of every column, of each group and of all.

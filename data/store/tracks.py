@@ -66,25 +66,15 @@ def _track_block(tracks: Tracks, start: int) -> pa.Table:
 
 @dataclass(frozen=True)
 class StoredRecording:
-    """Open files of one recording.
+    """Open files of one recording."""
 
-    Attributes:
-        log_name: Its name.
-        city: Map it was recorded on.
-        frames: Times and lights.
-        tracks: Boxes.
-        connectors: Ids of the connectors that have lights.
-        tokens: Tokens of the tracks.
-        kinds: (N,) AgentKind codes of the tracks.
-    """
-
-    log_name: str
-    city: str
-    frames: Table
-    tracks: Table
-    connectors: tuple[str, ...]
-    tokens: tuple[str, ...]
-    kinds: IntArray
+    log_name: str  # its name
+    city: str  # map it was recorded on
+    frames: Table  # times and lights
+    tracks: Table  # boxes
+    connectors: tuple[str, ...]  # ids of the connectors that have lights
+    tokens: tuple[str, ...]  # tokens of the tracks
+    kinds: IntArray  # (N,) AgentKind codes of the tracks
 
     @property
     def num_rows(self) -> int:
@@ -140,7 +130,7 @@ def open_recording(folder: Path) -> StoredRecording:
     """Open the files of a recording.
 
     Raises:
-        DataError: A file is missing, lacks a column or is damaged.
+        DataError: A file or a column is missing, or is damaged.
     """
     frames = Table(folder / FRAMES, schema.FRAMES)
     tracks = Table(folder / TRACKS, schema.TRACKS)

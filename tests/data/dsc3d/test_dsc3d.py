@@ -1,3 +1,5 @@
+from collections import Counter
+
 import dsc3d_writer as writer
 import numpy as np
 import pyarrow.parquet as pq
@@ -68,7 +70,7 @@ def test_missing_velocities_are_derived_and_counted(tmp_path):
 def test_velocities_that_contradict_the_positions_are_not_believed():
     time = np.arange(10) * 0.1
     xy = np.column_stack([3.0 * time, 0.0 * time])
-    warnings = {}
+    warnings = Counter()
     stored = np.tile([5.0, 0.0], (10, 1))
     out = believed_velocities(stored, xy, time, np.zeros(10, np.int64), warnings)
     np.testing.assert_allclose(out[:, 0], 3.0, rtol=0, atol=1e-9)
@@ -83,7 +85,7 @@ def test_a_standing_object_that_spins_keeps_its_heading():
         np.column_stack([speed, 0 * speed]),
         np.arange(6) * 0.08,
         np.zeros(6, np.int64),
-        {},
+        Counter(),
     )
     np.testing.assert_array_equal(out, [0.1, 0.1, 0.1, 0.1, 0.1, 0.3])
 

@@ -40,7 +40,7 @@ def demo(tmp_path_factory):
         site = next(site for site in demo_files.demo_sites() if site.name == "junction")
         sites = (replace(site, scenes=site.scenes[:1]),)
         patch.setattr(demo_files, "demo_sites", lambda: sites)
-        demo_files.write_sites(folder / "recordings")
+        demo_files.write_demo(folder / "recordings")
     convert_dsc3d(folder / "recordings" / "junction", folder / "store", site="junction")
     store = open_store(folder / "store")
     return [cut(store.read(token)) for token in store.tokens[:3]]
