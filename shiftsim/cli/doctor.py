@@ -49,8 +49,6 @@ def verify(
 
 def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
-    from shiftsim.cli.diagnosis import examine
-
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance)
     if as_json:

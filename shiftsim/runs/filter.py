@@ -201,7 +201,9 @@ def filter_store(
     (path / _UNFINISHED).parent.mkdir(exist_ok=True)
     journal = Journal(path / _UNFINISHED, keep=True)
     try:
-        unfinished = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        unfinished = [
+            row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])
+        ]
         rows = (*_finished(path, conditions), *unfinished)
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]

@@ -189,7 +189,10 @@ class RunWriter:
             texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
             return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
         columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
-        return {**self._journal.values(self.ended[task].number), **dict(zip(PLACE, columns, strict=True))}
+        return {
+            **self._journal.values(self.ended[task].number),
+            **dict(zip(PLACE, columns, strict=True)),
+        }
 
     def _write_rollouts(self) -> dict[Task, Place]:
         """Put the rollouts of a run that ends into files, those of a scenario together.

@@ -1,4 +1,4 @@
-"""The run folder: tables and rollouts on disk, and reading all of it back (ux.md §5).
+"""The run folder: tables and rollouts on disk, and reading all of it back.
 
 `scores.parquet` and `metrics.parquet` hold nothing but results, sorted by task and written with
 fixed settings, so that the same run gives the same bytes for any number of workers and any order.
