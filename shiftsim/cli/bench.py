@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from shiftsim.benchmarks.bench import Plan
-    from shiftsim.report import Group
     from shiftsim.report.figures import Figure
+    from shiftsim.report.groups import Group
 
 _UNFINISHED = 3
 _MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustness"}
@@ -113,8 +113,10 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import TABLES, Options, make_tables, write_report
+    from shiftsim.report.groups import read_groups
+    from shiftsim.report.scores import summary
+    from shiftsim.report.writers import FORMATS, render
 
     runs, own, extra = open_runs([plan.folder])
     groups = read_groups(runs, (*known_sets(), *own))

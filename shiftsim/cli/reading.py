@@ -68,8 +68,10 @@ def report(
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.errors import one_of
-    from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
+    from shiftsim.report.groups import read_groups
+    from shiftsim.report.scores import summary
+    from shiftsim.report.writers import FORMATS, render
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:
@@ -134,7 +136,7 @@ def _write_pages(
 
 
 def _say_worst(runs: "Sequence[Run]", count: int) -> None:
-    from shiftsim.report import worst_rollouts
+    from shiftsim.report.scores import worst_rollouts
 
     for run in runs:
         rows = worst_rollouts(run, count)

@@ -166,7 +166,7 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
 
 
 def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
-    from shiftsim.report import failures, score_table, summary, worst_rollouts
+    from shiftsim.report.scores import failures, score_table, summary, worst_rollouts
 
     if as_json:
         say_json(summary(finished))

@@ -92,8 +92,7 @@ class RunConfig:
     all_scenarios: bool = _setting(False, "Also the scenarios that the filter dropped.", "--all")
     traffic: str = _setting(
         "nonreactive",
-        "nonreactive (nr), reactive (r), reactive-fixed, constant-velocity, or "
-        "package.module:Model. [nonreactive]",
+        "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
     controller: str = _setting("lqr", "lqr, perfect or log-playback. [lqr]")
     thresholds: str = _setting("nuplan", "nuplan or deepplan. [nuplan]")

@@ -11,10 +11,10 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from shiftsim.errors import DataError
+from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
-from shiftsim.runs.planners import planner_name
 from shiftsim.runs.prepare import Prepared, prepare
 from shiftsim.runs.results import FAILED, OK, TIMEOUT, Run, TaskResult, open_run
 from shiftsim.runs.rollouts import Task

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.store.files import Table, digest, write_blocks
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
 from shiftsim.runs.journal import Journal

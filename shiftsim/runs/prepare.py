@@ -16,6 +16,7 @@ from shiftsim._version import __version__
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
 from shiftsim.runs.config import RunConfig, Value, parse_shard
 from shiftsim.runs.manifest import (
     State,
@@ -24,7 +25,6 @@ from shiftsim.runs.manifest import (
     check_target,
     code_digest,
 )
-from shiftsim.runs.planners import PlannerEntry, can_travel, planner_entry, takes_argument
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
@@ -62,7 +62,7 @@ class Prepared:
 
     config: RunConfig
     store: str
-    planners: Mapping[str, PlannerEntry]
+    planners: Mapping[str, RunPlanner]
     noises: Mapping[str, NoiseModel]
     batches: tuple[Batch, ...]
     missing: tuple[Task, ...]
@@ -153,7 +153,7 @@ def prepare(
     )
 
 
-def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
+def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
     checkpoints = _checkpoints(config, sources)
     entries = []
     for name, source in zip(config.planners, sources, strict=True):
@@ -162,7 +162,7 @@ def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
             arguments["checkpoint"] = checkpoints[name]
         if takes_argument(source, "device"):
             arguments.setdefault("device", config.device)
-        entries.append(planner_entry(source, arguments))
+        entries.append(run_planner(source, arguments))
     return entries
 
 
@@ -247,9 +247,9 @@ def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) 
     return before
 
 
-def _workers(config: RunConfig, entries: Sequence[PlannerEntry], num_batches: int) -> int:
+def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int) -> int:
     """Number of worker processes; 1 for planners that cannot be sent to another process."""
-    stuck = [entry.name for entry in entries if not can_travel(entry)]
+    stuck = [entry.name for entry in entries if not entry.can_travel]
     if stuck and (config.timeout or config.executor != "processes"):
         raise ConfigError(
             f"planner {stuck[0]!r} cannot be sent to a worker process, as a timeout or a cluster "
@@ -277,7 +277,7 @@ def _check_traffic(name: str) -> None:
 
 
 def _tasks(
-    entries: Iterable[PlannerEntry],
+    entries: Iterable[RunPlanner],
     models: Iterable[NoiseModel],
     seeds: Iterable[int],
     tokens: Iterable[str],
@@ -292,7 +292,7 @@ def _tasks(
     return (Task(*run, token) for token in tokens for run in runs)
 
 
-def _batches(entries: Iterable[PlannerEntry], tasks: list[Task], size: int) -> list[Batch]:
+def _batches(entries: Iterable[RunPlanner], tasks: list[Task], size: int) -> list[Batch]:
     """The tasks, those of a planner that answers in batches grouped.
 
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
@@ -332,7 +332,7 @@ def _leading_first(batches: list[Batch]) -> list[Batch]:
 
 def _determining(
     config: RunConfig,
-    entries: Sequence[PlannerEntry],
+    entries: Sequence[RunPlanner],
     models: Sequence[NoiseModel],
     thresholds: dict[str, Any],
 ) -> dict[str, Any]:

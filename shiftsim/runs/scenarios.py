@@ -14,13 +14,9 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from shiftsim.data.store.reading import (
-    ScenarioStore,
-    StoreWriter,
-    open_store,
-    window_row,
-)
+from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import ConfigError, DataError, nearest, one_of
 from shiftsim.files import read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE

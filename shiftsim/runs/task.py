@@ -18,8 +18,8 @@ import numpy as np
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ShiftsimError
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
+from shiftsim.planners.registry import RunPlanner, close_planner
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.planners import PlannerEntry, close_planner
 from shiftsim.runs.results import FAILED, OK, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
@@ -106,7 +106,7 @@ class TaskRunner:
 
     config: RunConfig
     store: str
-    planners: Mapping[str, PlannerEntry]
+    planners: Mapping[str, RunPlanner]
     noises: Mapping[str, NoiseModel]
     _made: dict[str, Planner] = field(default_factory=dict, init=False)
 

@@ -25,7 +25,7 @@ from nuplan.planning.simulation.trajectory.interpolated_trajectory import Interp
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
-from shiftsim.sim.loop import HISTORY_SAMPLES
+from shiftsim.sim.observation import HISTORY_SAMPLES
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, Tracks, TrafficLights, Trajectory
 from shiftsim.world.state import VehicleParameters as Dimensions
@@ -95,7 +95,7 @@ class SeenTracks(DetectionsTracks):
         if tracks.kinds[track] > LAST_AGENT_KIND:
             return StaticObject(kind, box, metadata)
         velocity = StateVector2D(*tracks.velocities[0, track].tolist())
-        # nuPlan: objects of a log come with an unknown angular velocity and no predictions
+        # nuPlan rule 579: objects of a log come with an unknown angular velocity and no predictions
         return Agent(kind, box, velocity, metadata, angular_velocity=np.nan, predictions=[])
 
 
