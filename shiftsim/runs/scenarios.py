@@ -16,7 +16,6 @@ from typing import Any
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.review import REVIEW
-from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import ConfigError, DataError, nearest, one_of
 from shiftsim.files import read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
@@ -109,6 +108,8 @@ def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> d
 def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
     columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
     used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
+    from shiftsim.data.store.writing import StoreWriter, window_row
+
     with StoreWriter(target) as writer:
         for city in sorted({city for _, _, city in used}):
             writer.add_map(store.map(city))
