@@ -158,8 +158,8 @@ def click_commands() -> dict[tuple[str, ...], Any]:
 
     def below(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
         yield words, command
-        for name, inner in getattr(command, "commands", {}).items():
-            yield from below(inner, (*words, name))
+        for name in command.list_commands(None) if hasattr(command, "list_commands") else ():
+            yield from below(command.get_command(None, name), (*words, name))
 
     return dict(below(typer.main.get_command(app), ()))
 
