@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 class ShiftsimError(Exception):
-    """Base of all errors that a user can cause or mend.
+    """Base of all errors that a user can cause or repair.
 
     Attributes:
         hint: One line that says what to do, shown below the message on the command line.

@@ -8,6 +8,7 @@ tasks, 130 interrupted; `verify` has its own.
 import os
 import sys
 from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -55,18 +56,21 @@ class _Commands(typer.core.TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """One of them, imported; None where there is none."""
-        if cmd_name not in _COMMANDS:
-            return None
-        module, _, attribute = _COMMANDS[cmd_name].partition(":")
-        found = getattr(import_module(f"shiftsim.cli.{module}"), attribute)
-        if isinstance(found, typer.Typer):
-            command: Any = typer.main.get_group(found)
-        else:
-            alone = new_app()
-            alone.command()(found)
-            command = typer.main.get_command(alone)
-        command.name = cmd_name
-        return command
+        return _command(cmd_name) if cmd_name in _COMMANDS else None
+
+
+@cache
+def _command(name: str) -> Any:
+    module, _, attribute = _COMMANDS[name].partition(":")
+    found = getattr(import_module(f"shiftsim.cli.{module}"), attribute)
+    if isinstance(found, typer.Typer):
+        command: Any = typer.main.get_group(found)
+    else:
+        alone = new_app()
+        alone.command()(found)
+        command = typer.main.get_command(alone)
+    command.name = name
+    return command
 
 
 app = new_app(

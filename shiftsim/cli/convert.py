@@ -218,7 +218,7 @@ def _show_dsc3d(report: "ConversionReport") -> None:
         for rule, count in summary.rejected.items():
             say(f"   not accepted by rule {rule}: {count}")
         for name, count in summary.warnings.items():
-            say(f"   mended: {name} ({count})")
+            say(f"   repaired: {name} ({count})")
     for name, reason in report.skipped.items():
         say(f" skipped: {name}: {reason}")
     if report.kept:

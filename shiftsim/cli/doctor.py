@@ -11,10 +11,8 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.arrays import cache_folder
 from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, say_json
 from shiftsim.files import PACKAGE
-from shiftsim.runs.workers import default_workers
 
 REFERENCE = PACKAGE / "verify" / "reference"
 _DATA = 2
@@ -49,8 +47,6 @@ def verify(
 
 def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
-    from shiftsim.cli.diagnosis import examine
-
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance)
     if as_json:
@@ -110,7 +106,9 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
+    from shiftsim.arrays import cache_folder
     from shiftsim.runs.manifest import versions
+    from shiftsim.runs.workers import default_workers
     from shiftsim.verify import verify
     from shiftsim.verify.warmup import warm_up
 

@@ -233,16 +233,16 @@ def _change(
         note = "rollouts are not stored"
     else:
         departure = find_departure(first.rollout_rows(task), second.rollout_rows(theirs_of))
-        note = "" if departure else _why_only_judged(first, second)
+        note = "" if departure else _why_only_scored(first, second)
     return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
 
 
-def _why_only_judged(first: Run, second: Run) -> str:
+def _why_only_scored(first: Run, second: Run) -> str:
     """Why scores differ where the ego drove the same."""
     ours, theirs = (run.manifest["determining"]["traffic"] for run in (first, second))
     if ours != theirs:
         return f"the ego drove the same, but in other traffic ({ours}, {theirs})"
-    return "the rollouts are the same: they were judged differently"
+    return "the rollouts are the same: they were scored differently"
 
 
 def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:

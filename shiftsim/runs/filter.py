@@ -136,6 +136,7 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
     Returns:
         The row of the verdict.
     """
+    # nuPlan rule 550: the recording itself, under thresholds of the filter's own
     log = simulate(scenario, None, controller="log-playback")
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds)
     centers = center_poses(log.expert_ego[:, :3])
@@ -147,6 +148,7 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
         broken.append(COLLISION)
     if rows[_DRIVABLE].score != 1.0:
         broken.append(AREA)
+    # nuPlan rule 551: too little progress is a short path, or a path beside the route
     if path < config.min_path_m:
         broken.append(STANDING)
     elif progress < config.min_progress_share * path:
@@ -189,7 +191,7 @@ def filter_store(
         store: Folder of the store.
         config: What a scenario must satisfy; the values of the benchmark where None.
         workers: Worker processes; 0 chooses from the cores.
-        on_progress: Called with scenarios judged and scenarios in all.
+        on_progress: Called with scenarios done and scenarios in all.
 
     Raises:
         DataError: There is no store, or it is damaged.
@@ -201,7 +203,9 @@ def filter_store(
     (path / _UNFINISHED).parent.mkdir(exist_ok=True)
     journal = Journal(path / _UNFINISHED, keep=True)
     try:
-        unfinished = [row for key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        unfinished = [
+            row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])
+        ]
         rows = (*_finished(path, conditions), *unfinished)
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]

@@ -62,11 +62,13 @@ class Ended(NamedTuple):
     """A task that has ended.
 
     Attributes:
+        number: Its entry in the journal.
         status: What became of it.
         place: Where its rollout is, where a Parquet file has it already.
         has_rollout: Whether the journal has its rollout.
     """
 
+    number: int
     status: str
     place: Place | None
     has_rollout: bool
@@ -109,11 +111,11 @@ class RunWriter:
         self._linked: dict[Path, Path] = {}
 
     def _entries(self) -> Iterator[tuple[Task, Ended]]:
-        for key, values, has_rollout in self._journal.items():
+        for number, key, values, has_rollout in self._journal.items():
             place = values["place"] and Place(
                 self.rollouts / values["place"][0], *values["place"][1:]
             )
-            yield Task(*json.loads(key)), Ended(values["status"], place, has_rollout)
+            yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
 
     def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
         """Put one result on disk.
@@ -126,8 +128,8 @@ class RunWriter:
             OSError: The disk is full; what is there already stays.
         """
         place = stored and stored._replace(file=self._link(stored.file))
-        self._journal.put(*_entry((result, place)), result.rollout)
-        self.ended[result.task] = Ended(result.status, place, bool(result.rollout))
+        number = self._journal.put(*_entry((result, place)), result.rollout)
+        self.ended[result.task] = Ended(number, result.status, place, bool(result.rollout))
 
     def _link(self, file: Path) -> Path:
         """Have a file of another run in this one, too; returns where it is here."""
@@ -187,7 +189,10 @@ class RunWriter:
             texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
             return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
         columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
-        return {**self._journal.values(_key(task)), **dict(zip(PLACE, columns, strict=True))}
+        return {
+            **self._journal.values(self.ended[task].number),
+            **dict(zip(PLACE, columns, strict=True)),
+        }
 
     def _write_rollouts(self) -> dict[Task, Place]:
         """Put the rollouts of a run that ends into files, those of a scenario together.
@@ -207,13 +212,13 @@ class RunWriter:
         writer, reader = PartWriter(self.rollouts), RolloutReader()
         try:
             for task in sorted(self.ended, key=lambda task: (task.token, task)):
-                _, place, has_rollout = self.ended[task]
+                number, _, place, has_rollout = self.ended[task]
                 if place and place.file in whole:
                     places[task] = place
                 elif place:
                     places[task] = writer.add(task, without_key(reader.read(place)))
                 elif has_rollout:
-                    places[task] = writer.add(task, decode_rows(self._journal.data(_key(task))))
+                    places[task] = writer.add(task, decode_rows(self._journal.data(number)))
             writer.close()
         finally:
             writer.discard()
@@ -224,16 +229,12 @@ class RunWriter:
             partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
 
 
-def _key(task: Task) -> str:
-    return json.dumps(task)
-
-
 def _entry(found: tuple[TaskResult, Place | None]) -> tuple[str, dict[str, Any]]:
     """A result as the journal has it, without its rollout."""
     result, place = found
     values = {name: getattr(result, name) for name in (*TEXTS, "seconds", "scores", "metrics")}
     values["place"] = place and (place.file.name, place.row, place.rows)
-    return _key(result.task), values
+    return json.dumps(result.task), values
 
 
 def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:

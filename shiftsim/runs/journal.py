@@ -20,15 +20,17 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import locked
 
 _SETTINGS = (
+    "page_size = 16384",
     "locking_mode = exclusive",  # no third file, whose memory is shared between processes
     "journal_mode = wal",
     "synchronous = normal",  # a power failure takes the last entries, and nothing else
     "wal_autocheckpoint = 0",
 )
+_INSERT = "insert into entries (key, content, data) values (?, ?, ?)"
 
 
 class Journal:
-    """Entries by key: JSON values, and bytes beside them."""
+    """Numbered entries: a key, JSON values, and bytes beside them."""
 
     def __init__(self, path: Path, *, keep: bool) -> None:
         """Begin a journal, or go on with one; nothing is in the file before the first entry.
@@ -62,21 +64,25 @@ class Journal:
             for setting in _SETTINGS:
                 database.execute(f"pragma {setting}")
             database.execute(
-                "create table if not exists entries (key text primary key, content text, data blob)"
+                "create table if not exists entries "
+                "(number integer primary key, key text, content text, data blob)"
             )
         return database
 
-    def put(self, key: str, values: Mapping[str, Any], data: bytes = b"") -> None:
-        """Put an entry on disk, in place of the one with this key.
+    def put(self, key: str, values: Mapping[str, Any], data: bytes = b"") -> int:
+        """Put an entry on disk; with the same key again, the last one counts.
+
+        Returns:
+            Its number.
 
         Raises:
             OSError: The disk is full; what is there already stays.
         """
-        content = json.dumps(values, default=_plain)
+        row = (key, json.dumps(values, default=_plain), data)
         with self._explained():
-            self._database.execute(
-                "insert or replace into entries values (?, ?, ?)", (key, content, data)
-            )
+            number = self._database.execute(_INSERT, row).lastrowid
+        assert number is not None
+        return number
 
     def put_all(self, entries: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
         """Put entries on disk: all of them or, where the process is ended, none."""
@@ -86,30 +92,29 @@ class Journal:
                 self.put(key, values)
             self._database.execute("commit")
 
-    def items(self) -> Iterator[tuple[str, dict[str, Any], bool]]:
-        """Key, values and whether there are bytes, of all entries."""
+    def items(self) -> Iterator[tuple[int, str, dict[str, Any], bool]]:
+        """Number, key, values and whether there are bytes, of all entries in their order."""
         if self._lock.seek(0, os.SEEK_END) == 0:
             return
+        query = "select number, key, content, length(data) from entries order by number"
         with self._explained():
-            for key, content, size in self._database.execute(
-                "select key, content, length(data) from entries"
-            ):
-                yield key, json.loads(content), size > 0
+            for number, key, content, size in self._database.execute(query):
+                yield number, key, json.loads(content), size > 0
 
-    def values(self, key: str) -> dict[str, Any]:
+    def values(self, number: int) -> dict[str, Any]:
         """The values of an entry."""
-        found: dict[str, Any] = json.loads(self._select("content", key))
+        found: dict[str, Any] = json.loads(self._select("content", number))
         return found
 
-    def data(self, key: str) -> bytes:
+    def data(self, number: int) -> bytes:
         """The bytes of an entry."""
-        found: bytes = self._select("data", key)
+        found: bytes = self._select("data", number)
         return found
 
-    def _select(self, column: str, key: str) -> Any:
+    def _select(self, column: str, number: int) -> Any:
+        query = f"select {column} from entries where number = ?"
         with self._explained():
-            query = f"select {column} from entries where key = ?"
-            return self._database.execute(query, (key,)).fetchone()[0]
+            return self._database.execute(query, (number,)).fetchone()[0]
 
     def close(self) -> None:
         """Let another process work with it."""

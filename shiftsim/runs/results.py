@@ -1,4 +1,4 @@
-"""The run folder: tables and rollouts on disk, and reading all of it back (ux.md §5).
+"""The run folder: tables and rollouts on disk, and reading all of it back.
 
 `scores.parquet` and `metrics.parquet` hold nothing but results, sorted by task and written with
 fixed settings, so that the same run gives the same bytes for any number of workers and any order.
@@ -34,65 +34,55 @@ FORMAT_VERSION = 4
 JOURNAL = "unfinished.sqlite"  # of a run under way
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
 
-_KEY = [
-    ("planner", pa.string()),
-    ("noise", pa.string()),
-    ("seed", pa.int64()),
-    ("token", pa.string()),
-]
-_PROFILE = [("thresholds", pa.string()), ("metric_version", pa.string())]
-TASKS_SCHEMA = pa.schema(
-    [
-        *_KEY,
-        ("scenario_type", pa.string()),
-        ("status", pa.string()),
-        ("error", pa.string()),
-        ("hint", pa.string()),
-        ("traceback", pa.string()),
-        ("read_seconds", pa.float64()),
-        ("simulate_seconds", pa.float64()),
-        ("planner_seconds", pa.float64()),
-        ("planning_ms_mean", pa.float64()),
-        ("planning_ms_p95", pa.float64()),
-        ("metrics_seconds", pa.float64()),
-        ("rollout", pa.string()),  # file below rollouts/
-        ("rollout_row", pa.int64()),
-        ("rollout_rows", pa.int64()),
-    ]
+_TEXT, _NUMBER, _WHOLE = pa.string(), pa.float64(), pa.int64()
+_KEY = {"planner": _TEXT, "noise": _TEXT, "seed": _WHOLE, "token": _TEXT}
+_PROFILE = {"thresholds": _TEXT, "metric_version": _TEXT}
+_DURATIONS = (
+    "read_seconds",
+    "simulate_seconds",
+    "planner_seconds",
+    "planning_ms_mean",
+    "planning_ms_p95",
+    "metrics_seconds",
 )
-PLACE = ("rollout", "rollout_row", "rollout_rows")
-TEXTS = ("status", "scenario_type", "error", "hint", "traceback")
-_DURATIONS = [n for n in TASKS_SCHEMA.names if n.endswith("_seconds") or "_ms_" in n]
-SCORES_SCHEMA = pa.schema(
-    [
-        *_KEY,
-        ("scenario_type", pa.string()),
-        ("city", pa.string()),
-        ("log_name", pa.string()),
-        ("traffic", pa.string()),
-        ("cls", pa.float64()),
-        *((name, pa.float64()) for name in SHORT_NAMES if name != "score"),
-        ("degraded_steps", pa.int64()),
-        *_PROFILE,
-    ]
-)
-METRICS_SCHEMA = pa.schema(
-    [
-        *_KEY,
-        ("metric", pa.string()),
-        ("value", pa.float64()),
-        ("unit", pa.string()),
-        ("threshold", pa.float64()),
-        ("score", pa.float64()),
-        ("first_violation_iteration", pa.int64()),
-        ("first_violation_time_us", pa.int64()),
-        ("first_violation_s", pa.float64()),
-        ("first_violation_value", pa.float64()),
-        ("partner_token", pa.string()),
-        *_PROFILE,
-    ]
-)
-TABLES = {"tasks": TASKS_SCHEMA, "scores": SCORES_SCHEMA, "metrics": METRICS_SCHEMA}
+TEXTS = ("scenario_type", "status", "error", "hint", "traceback")
+PLACE = ("rollout", "rollout_row", "rollout_rows")  # file below rollouts/, first row there, rows
+TABLES = {
+    "tasks": pa.schema(
+        {
+            **_KEY,
+            **dict.fromkeys(TEXTS, _TEXT),
+            **dict.fromkeys(_DURATIONS, _NUMBER),
+            **dict(zip(PLACE, (_TEXT, _WHOLE, _WHOLE), strict=True)),
+        }
+    ),
+    "scores": pa.schema(
+        {
+            **_KEY,
+            **dict.fromkeys(("scenario_type", "city", "log_name", "traffic"), _TEXT),
+            "cls": _NUMBER,
+            **dict.fromkeys((name for name in SHORT_NAMES if name != "score"), _NUMBER),
+            "degraded_steps": _WHOLE,
+            **_PROFILE,
+        }
+    ),
+    "metrics": pa.schema(
+        {
+            **_KEY,
+            "metric": _TEXT,
+            "value": _NUMBER,
+            "unit": _TEXT,
+            "threshold": _NUMBER,
+            "score": _NUMBER,
+            "first_violation_iteration": _WHOLE,
+            "first_violation_time_us": _WHOLE,
+            "first_violation_s": _NUMBER,
+            "first_violation_value": _NUMBER,
+            "partner_token": _TEXT,
+            **_PROFILE,
+        }
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)

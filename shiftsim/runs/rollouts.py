@@ -122,19 +122,19 @@ def rollout_rows(log: SimulationLog, *, with_tracks: bool) -> pa.RecordBatch:
 
 
 def encode_rows(rows: pa.RecordBatch) -> bytes:
-    """The rows of a rollout as compressed bytes."""
+    """The rows of a rollout as bytes; tracks are compressed, what is small without them is not."""
     sink = pa.BufferOutputStream()
-    with pa.CompressedOutputStream(sink, "lz4") as compressed:
-        with pa.ipc.new_stream(compressed, rows.schema) as stream:
-            stream.write_batch(rows)
+    compression = "lz4" if "track_valid" in rows.schema.names else None
+    options = pa.ipc.IpcWriteOptions(compression=compression)
+    with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
+        stream.write_batch(rows)
     encoded: bytes = sink.getvalue().to_pybytes()
     return encoded
 
 
 def decode_rows(data: bytes) -> pa.RecordBatch:
     """What `encode_rows` was given."""
-    with pa.CompressedInputStream(pa.BufferReader(data), "lz4") as source:
-        return pa.ipc.open_stream(source).read_next_batch()
+    return pa.ipc.open_stream(data).read_next_batch()
 
 
 def _states(log: SimulationLog) -> list[pa.Array]:
@@ -285,7 +285,8 @@ class PartWriter:
         self._number = next_number(folder)
         self._writer: pq.ParquetWriter | None = None
         self._pending: list[tuple[Task, pa.RecordBatch]] = []
-        self._in_file, self._in_group = _Size(), _Size()
+        self._count = self._rows = self._bytes = 0  # in the file under way
+        self._pending_bytes = 0
 
     def add(self, task: Task, rows: pa.RecordBatch) -> Place:
         """Write a rollout, or keep it until its row group is full.
@@ -297,13 +298,16 @@ class PartWriter:
         Returns:
             Where it will be.
         """
-        place = Place(self._path, self._in_file.rows, len(rows))
+        place = Place(self._path, self._rows, len(rows))
         self._pending.append((task, rows))
-        for size in (self._in_file, self._in_group):
-            size.add(rows)
-        if self._in_file.exceeds(*_MAX_FILE):
+        size = rows.get_total_buffer_size()
+        self._count += 1
+        self._rows += len(rows)
+        self._bytes += size
+        self._pending_bytes += size
+        if self._count >= _MAX_FILE[0] or self._bytes >= _MAX_FILE[1]:
             self.close()
-        elif self._in_group.exceeds(*_MAX_GROUP):
+        elif len(self._pending) >= _MAX_GROUP[0] or self._pending_bytes >= _MAX_GROUP[1]:
             self._write_group()
         return place
 
@@ -323,7 +327,7 @@ class PartWriter:
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))
         self._pending.clear()
-        self._in_group = _Size()
+        self._pending_bytes = 0
 
     def close(self) -> None:
         """Finish the file that is under way; the next rollout begins another one."""
@@ -334,7 +338,7 @@ class PartWriter:
             self._partial.replace(self._path)
             self._writer = None
             self._number += 1
-        self._in_file = _Size()
+        self._count = self._rows = self._bytes = 0
 
     def discard(self) -> None:
         """Remove what is not finished."""
@@ -344,21 +348,6 @@ class PartWriter:
                 self._writer.close()
             self._writer = None
             self._partial.unlink(missing_ok=True)
-
-
-class _Size:
-    """How much is in a file or row group."""
-
-    def __init__(self) -> None:
-        self.rollouts = self.rows = self.bytes = 0
-
-    def add(self, rows: pa.RecordBatch) -> None:
-        self.rollouts += 1
-        self.rows += len(rows)
-        self.bytes += rows.get_total_buffer_size()
-
-    def exceeds(self, rollouts: int, num_bytes: int) -> bool:
-        return self.rollouts >= rollouts or self.bytes >= num_bytes
 
 
 def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:

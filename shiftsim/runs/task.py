@@ -23,7 +23,7 @@ from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.loop import Rollout, simulate, simulate_together
+from shiftsim.sim.loop import Rollout, Setting, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import BatchPlanner, Planner
 from shiftsim.world.scenario import Scenario
@@ -130,7 +130,7 @@ class TaskRunner:
         with watch("read_seconds"):
             scenario = self._scenarios.read(task.token)
         with watch("simulate_seconds"):
-            log = simulate(scenario, self._planner(task), **self._setting(task))
+            log = simulate(scenario, self._planner(task), self._setting(task))
         return self._scored(task, scenario, log, watch)
 
     def _together(self, batch: Batch) -> list[TaskResult]:
@@ -155,7 +155,7 @@ class TaskRunner:
     def _begin(self, task: Task, watch: Stopwatch) -> Rollout:
         with watch("read_seconds"):
             scenario = self._scenarios.read(task.token)
-        return Rollout(scenario, self._planner(task), **self._setting(task))
+        return Rollout(scenario, self._planner(task), self._setting(task))
 
     def _scored(
         self, task: Task, scenario: Scenario, log: SimulationLog | Exception, watch: Stopwatch
@@ -174,14 +174,14 @@ class TaskRunner:
             task, OK, scenario.scenario_type, scores=scores, metrics=metrics, rollout=rollout
         )
 
-    def _setting(self, task: Task) -> dict[str, Any]:
-        return {
-            "noise": self.noises[task.noise],
-            "seed": task.seed,
-            "traffic": self.config.traffic,
-            "controller": self.config.controller,
-            "strict": self.config.strict,
-        }
+    def _setting(self, task: Task) -> Setting:
+        return Setting(
+            noise=self.noises[task.noise],
+            seed=task.seed,
+            traffic=self.config.traffic,
+            controller=self.config.controller,
+            strict=self.config.strict,
+        )
 
     def _planner(self, task: Task) -> Planner | None:
         """The planner of a task: made once, or a fork of it that has nothing of other tasks."""

@@ -8,6 +8,7 @@ task it was working on. The standard pools do not give that: theirs break as a w
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import sys
 from collections import deque
@@ -16,13 +17,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from math import inf
-from multiprocessing.connection import Connection, Pipe, wait
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, Literal, TypeVar
 
-import shiftsim
 from shiftsim.errors import ConfigError
+from shiftsim.files import PACKAGE
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -96,10 +97,6 @@ def map_unordered(
     if workers <= 1 and not limit:
         yield from _serial(make, tasks)
         return
-    if sys.platform == "win32":
-        raise ConfigError(
-            "worker processes need a POSIX system", hint="use --workers 1 and no --timeout"
-        )
     payload = pickle.dumps((sys.path, pickle.dumps(make)))
     pool = Pool(payload, max(1, workers), limit, pieces, group)
     try:
@@ -168,17 +165,10 @@ class _Worker:
     """One interpreter and the socket to it."""
 
     def __init__(self, payload: bytes) -> None:
-        self.connection, theirs = Pipe()
-        command = "import sys, shiftsim.runs.workers as w; w.serve(*map(int, sys.argv[1:]))"
-        search = [str(Path(shiftsim.__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", command, str(theirs.fileno()), str(os.getpid())],
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            process_group=0,  # an interrupt from the terminal reaches the parent only
-            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, search))},
-        )
+        ours, theirs = socket.socketpair()
+        self.process = _start(theirs)
         theirs.close()
+        self.connection: Connection[Any, Any] = Connection(ours.detach())
         self.task: Any = None
         self.state: Literal["starting", "idle", "busy"] = "starting"
         self.is_new = True
@@ -331,9 +321,36 @@ class Pool:
             worker.end()
 
 
-def serve(handle: int, parent: int) -> None:
+def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
+    """Start an interpreter that serves a socket; interrupts from the terminal do not reach it."""
+    command = "import sys, shiftsim.runs.workers as w; w.serve(*map(int, sys.argv[1:]))"
+    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
+    paths = os.pathsep.join(filter(None, search))
+    words = [sys.executable, "-c", command, str(os.getpid()), str(theirs.fileno())]
+    environment = {**os.environ, **_ONE_THREAD, "PYTHONPATH": paths}
+    if sys.platform == "win32":
+        group = subprocess.CREATE_NEW_PROCESS_GROUP
+        process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, creationflags=group, env=environment
+        )
+        assert process.stdin is not None
+        with process.stdin as pipe:
+            pipe.write(theirs.share(process.pid))
+        return process
+    return subprocess.Popen(
+        words,
+        pass_fds=[theirs.fileno()],
+        stdin=subprocess.DEVNULL,
+        process_group=0,
+        env=environment,
+    )
+
+
+def serve(parent: int, handle: int) -> None:
     """Main function of a worker process: do tasks from a socket until it closes."""
     _end_with(parent)
+    if sys.platform == "win32":  # handles are not inherited: it comes through the standard input
+        handle = socket.fromshare(sys.stdin.buffer.read()).detach()
     connection: Connection[Any, Any] = Connection(handle)
     try:
         path, pickled = pickle.loads(connection.recv_bytes())

@@ -51,7 +51,7 @@ def test_rollouts_part_at_the_step_where_the_planner_acts_differently(runs):
 @pytest.mark.parametrize(
     ("traffic", "note"),
     [
-        ("nonreactive", "the rollouts are the same: they were judged differently"),
+        ("nonreactive", "the rollouts are the same: they were scored differently"),
         ("reactive", "the ego drove the same, but in other traffic (nonreactive, reactive)"),
     ],
 )

@@ -1,0 +1,61 @@
+"""Options of the command line are the settings of a run."""
+
+from dataclasses import fields
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from shiftsim.cli import app
+from shiftsim.cli.options import with_settings
+from shiftsim.runs.config import RunConfig, make_config
+
+
+def options_of(command):
+    group = typer.main.get_command(app)
+    return {parameter.name: parameter for parameter in group.get_command(None, command).params}
+
+
+def test_every_setting_is_an_option_with_its_help():
+    options = options_of("run")
+    for item in fields(RunConfig):
+        option = item.metadata["option"]
+        assert options[item.name].help == option.help
+        if option.flags:
+            assert options[item.name].opts == list(option.flags)
+
+
+def test_the_options_are_those_of_before():
+    flags = [max(option.opts, key=len) for option in options_of("run").values()]
+    words = """--planner --noise --seeds --store --split --limit --all --traffic --controller
+        --thresholds --planner-arg --metric --checkpoint --device --batch-size --strict --out
+        --workers --timeout --resume --retry-failed --shard --executor --scheduler --save-rollouts
+        --bundle --allow-partial --config --dry-run --quiet --json --debug"""
+    assert flags == words.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], {}),
+        (["--seeds", "3,4"], {"seeds": [3, 4]}),
+        (["-n", "none", "-n", "ou-high"], {"noise": ["none", "ou-high"]}),
+        (["--workers", "auto"], {"workers": 0}),
+        (["--workers", "3", "--all"], {"workers": 3, "all_scenarios": True}),
+        (["--timeout", "2.5", "--limit", "0"], {"timeout": 2.5, "limit": 0}),
+        (["--out", ""], {"out": ""}),
+    ],
+)
+def test_a_command_gets_the_settings_that_were_given(words, expected):
+    found = []
+
+    @with_settings("seeds", "noise", "workers", "all_scenarios", "timeout", "limit", "out")
+    def command(settings, *, quiet: bool = False):
+        found.append(settings)
+
+    alone = typer.Typer()
+    alone.command()(command)
+    done = CliRunner().invoke(alone, words)
+    assert done.exit_code == 0, done.output
+    assert found == [expected]
+    make_config({"planners": ["idm"], **found[0]})
