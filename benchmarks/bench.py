@@ -6,7 +6,6 @@ to it, and `report/`.
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,8 @@ from shiftsim.files import whole_file
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.config import DEFAULT_STORE, make_config
-from shiftsim.runs.execute import RUNS, Prepared, Progress, execute, prepare
+from shiftsim.runs.execute import Progress, execute
+from shiftsim.runs.prepare import RUNS, Prepared, prepare
 from shiftsim.runs.results import Run, open_run
 
 MANIFEST = "bench.json"
@@ -171,10 +171,7 @@ class _Total:
 
     def show(self, progress: Progress) -> None:
         """Add the progress of a run to that of the runs before it."""
-        before, seconds = self.before, Counter(self.before.seconds)
-        seconds.update(progress.seconds)
-        done, failed = before.done + progress.done, before.failed + progress.failed
-        self.now = Progress(done, before.total, failed, dict(seconds))
+        self.now = self.before + replace(progress, total=0)
         self._on_progress(self.now)
 
 

@@ -22,7 +22,7 @@ LAYERS = (
 LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
 # what may be used of a neighbour in the same layer
 NEIGHBOURS = {
-    "planners": ("sim.dynamics", "sim.noise", "sim.plan_check", "sim.planner"),
+    "planners": ("sim.dynamics", "sim.noise", "sim.observation", "sim.plan_check", "sim.planner"),
     "metrics": ("sim.log",),
     "view": ("report.palette",),
     "train": ("env",),
@@ -111,10 +111,10 @@ def test_no_module_needs_itself():
 def test_the_core_works_without_torch():
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "import shiftsim.runs.execute, shiftsim.runs.rescore, shiftsim.report.explain\n"
+        "import shiftsim.runs.execute, shiftsim.runs.derive, shiftsim.report.explain\n"
         "import shiftsim.planners.registry, shiftsim.data.store.reading, shiftsim.verify\n"
-        "import shiftsim.cli.diagnosis\n"
-        "print(shiftsim.cli.diagnosis._torch())\n"
+        "import shiftsim.cli.doctor\n"
+        "print(shiftsim.cli.doctor._torch())\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "not installed" in done.stdout

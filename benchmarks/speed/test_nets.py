@@ -23,7 +23,7 @@ from shiftsim.data.demo.store import bench_scene, demo_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import Rollout
-from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")
@@ -71,7 +71,7 @@ def scenes(store, tmp_path_factory):
         with tarfile.open(REPOSITORY / "tests/golden/nuplan.tar.xz") as archive:
             archive.extractall(folder.parent, filter="data")
     demo = open_store(store)
-    found = {**load_scenes(folder), "bench_scene_100": bench_scene(100, 0)}
+    found = {**Scenes(folder), "bench_scene_100": bench_scene(100, 0)}
     return {**found, "demo": demo.read(demo.tokens[0])}
 
 
@@ -198,22 +198,19 @@ def test_diffusion_planner_against_the_plain_sampler(scenes, loaded, size):
     import torch
     from plain_diffusion import plain_network, plain_sample
 
-    from shiftsim.planners.learned.diffusion.planner import INPUTS
-
     planner = loaded("diffusion-planner")
-    plain = plain_network(planner._network)
+    plain = plain_network(planner.network)
     for scene in ("bench_scene_100", "s04_left_turn", "s13_empty_road"):
         forks, observations = started(planner, [scenes[scene]], 1)
         features = [forks[0].features(observations[0])]
-        inputs = {name: planner._batch(features, name) for name in INPUTS}
-        noise = planner._batch(features, "noise")
+        inputs, noise = planner.batch(features)
         ratios = []
         with torch.inference_mode():
             for _ in range(size(40, 3)):  # times vary more than what they differ by
                 began = process_time()
                 plain_sample(plain, inputs, noise)
                 middle = process_time()
-                planner._network(inputs, noise)
+                planner.network(inputs, noise)
                 ratios.append((process_time() - middle) / (middle - began))
         ratio = statistics.median(ratios[2:])
         print(

@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.execute import open_named_store
+from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION, TaskResult
-from shiftsim.runs.rollouts import Task, encode_rollout
+from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
+from shiftsim.runs.scenarios import open_named_store
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
@@ -139,8 +140,11 @@ def test_overhead_per_scenario(store, size, tmp_path):
     scenario = store.read(store.tokens[0])
     task = Task(PLANNER, NOISE, 0, scenario.token)
     log = simulate(scenario, load_planner(PLANNER), noise=NOISE)
-    scores, metrics = score_rollout(scenario, log, thresholds="nuplan", traffic="nonreactive")
-    encode = partial(encode_rollout, log, with_tracks=False)
+    scores, metrics = score_rollout(scenario, log, make_config({"planners": [PLANNER]}))
+
+    def encode() -> bytes:
+        return encode_rows(rollout_rows(log, with_tracks=False))
+
     result = TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode())
     writer = RunWriter(tmp_path / "run", {})
     few, more = size(200, 10), size(2000, 20)
