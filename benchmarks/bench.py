@@ -14,6 +14,7 @@ from typing import Any
 from shiftsim.benchmarks import Track, load_track
 from shiftsim.benchmarks.coverage import coverage
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.files import whole_file
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.config import DEFAULT_STORE, make_config
@@ -117,10 +118,8 @@ def _own_list(prepared: Prepared) -> KnownSet:
     """The whole list that a run is on, which may be limited to its first scenarios."""
     whole = prepared
     if prepared.config.limit:
-        unlimited = replace(
-            prepared.config, limit=0, out=str(prepared.folder / "whole"), resume=False
-        )
-        whole = prepare(unlimited)
+        out = str(prepared.folder / "whole")
+        whole = prepare(replace(prepared.config, limit=0, out=out, resume=False))
     tokens = {task.token for task in (*whole.tasks, *whole.missing)}
     rules = prepared.config.thresholds
     return KnownSet(whole.split, whole.split, rules, len(tokens), token_digest(tokens))
@@ -149,24 +148,31 @@ def run_bench(
         "argv": list(argv),
     }
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
-    (plan.folder / MANIFEST).write_text(f"{text}\n", encoding="utf-8")
+    with whole_file(plan.folder / MANIFEST) as partial:
+        partial.write_text(f"{text}\n", encoding="utf-8")
+    total = _Total(plan.num_tasks, on_progress)
     out = []
-    base = Progress(0, plan.num_tasks, 0)
     for prepared in plan.runs.values():
-        last = [Progress(0, 0, 0)]
-
-        def show(progress: Progress, base: Progress = base, last: list[Progress] = last) -> None:
-            last[0] = progress
-            on_progress(base + replace(progress, total=0))
-
         if prepared.before == "complete":
             out.append(open_run(prepared.folder))
-            base = replace(base, done=base.done + len(prepared.tasks))
-            on_progress(base)
+            total.show(Progress(len(prepared.tasks), 0, 0))
         else:
-            out.append(execute(prepared, on_progress=show, argv=argv))
-            base = base + replace(last[0], total=0)
+            out.append(execute(prepared, on_progress=total.show, argv=argv))
+        total.before = total.now
     return out
+
+
+class _Total:
+    """The progress of runs that follow one another, as that of one."""
+
+    def __init__(self, num_tasks: int, on_progress: Callable[[Progress], None]) -> None:
+        self.before = self.now = Progress(0, num_tasks, 0)
+        self._on_progress = on_progress
+
+    def show(self, progress: Progress) -> None:
+        """Add the progress of a run to that of the runs before it."""
+        self.now = self.before + replace(progress, total=0)
+        self._on_progress(self.now)
 
 
 def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:

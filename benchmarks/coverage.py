@@ -33,8 +33,8 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
                     verdict if done else "not run",
                 )
             )
-    lacking = [name for name in track.planners if name not in {g.planner for g in inside}]
-    others = f"planners of the paper that are not here: {', '.join(lacking)}" if lacking else ""
+    missing = [name for name in track.planners if name not in {g.planner for g in inside}]
+    others = f"planners of the paper that are not here: {', '.join(missing)}" if missing else ""
     return Table(
         "coverage",
         f"Coverage of the track {track.name}",

@@ -36,6 +36,7 @@ REUSE_TARGET = 0.6
 MEMORY_TARGET, GROWTH_TARGET = 1500.0, 50.0  # MB
 STEPS = 60  # of a scene
 WARM = 5  # steps that are not counted
+DRIVES = 3  # of which the fastest counts
 BATCH = 16
 GPU_BATCHES = (1, 4, 16, 64, 256)
 SCENARIOS = 500
@@ -125,9 +126,8 @@ def test_stages_of_a_step(scenes, loaded, size, calibration_seconds, note, name,
     """Medians along a rollout, caches of map and scenario warm."""
     planner, scenario = loaded(name), scenes[scene]
     drive(planner, scenario, 2)  # kernels
-    features, network, rest = np.median(
-        drive(planner, scenario, size(STEPS, WARM + 1))[WARM:], axis=0
-    )
+    drives = [drive(planner, scenario, size(STEPS, WARM + 1)) for _ in range(size(DRIVES))]
+    features, network, rest = np.min([np.median(one[WARM:], axis=0) for one in drives], axis=0)
     ratio = features / calibration_seconds
     print(
         f"\n{name} {scene}, {lanes_near(scenario)} lanes: "

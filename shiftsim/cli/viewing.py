@@ -111,10 +111,10 @@ def inspect(
     from shiftsim.data.store.review import REVIEW
     from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.review.server import ReviewServer
-    from shiftsim.view.review.service import Desk
+    from shiftsim.view.review.service import ReviewService
 
     path = open_named_store(store).path
-    with ReviewServer(Desk(path, reviewer), port) as server:
+    with ReviewServer(ReviewService(path, reviewer), port) as server:
         say(f"review     {server.address}")
         say(f"kept in    {path / REVIEW}")
         say("stop with Ctrl-C; what was decided is on disk")

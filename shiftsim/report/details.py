@@ -107,7 +107,7 @@ def planning_times(groups: Sequence[Group]) -> Table:
     times = ("ms per step", "95 % ms", "worst 95 % ms", "s per rollout")
     return Table(
         "planning-time",
-        "Planning time, and steps driven on a degraded (makeshift) plan",
+        "Planning time, and steps driven on a degraded (fallback) plan",
         (*labels, "rollouts", *times, "degraded steps", "in rollouts"),
         tuple(_times_row(group) for group in each.values()),
         len(labels),

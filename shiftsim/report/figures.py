@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from shiftsim.arrays import BoolArray
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
-from shiftsim.report.palette import Look, looks, new_figure, save_picture
+from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
 from shiftsim.report.paper import METRICS, traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate
@@ -62,7 +62,7 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
         MissingExtraError: matplotlib is not installed.
     """
     out = []
-    styles = looks(dict.fromkeys(group.planner for group in groups))
+    styles = planner_styles(dict.fromkeys(group.planner for group in groups))
     for data in _named_apart(distinct_sets(groups)):
         mine = [group for group in groups if group.data.key[1:] == data.key[1:]]
         shown = [g for g in mine if _estimate(g, allow_partial) is not None]
@@ -103,7 +103,7 @@ def _estimate(
 
 
 def _robustness(
-    data: DataSet, groups: Sequence[Group], styles: dict[str, Look], allow_partial: bool
+    data: DataSet, groups: Sequence[Group], styles: dict[str, Style], allow_partial: bool
 ) -> list[Figure]:
     kinds = [kind for kind in _KINDS if any(g.noise.startswith(f"{kind}-") for g in groups)]
     modes = traffics(groups)
@@ -150,11 +150,11 @@ def _curve(
     axes.errorbar(places, means, yerr=errors, label=label, capsize=2, **style)
 
 
-def _line(look: Look) -> dict[str, Any]:
+def _line(style: Style) -> dict[str, Any]:
     return {
-        "color": look.colour,
-        "marker": look.marker,
-        "markersize": 6.0 * _SIZES.get(look.marker, 1.0),
+        "color": style.colour,
+        "marker": style.marker,
+        "markersize": 6.0 * _SIZES.get(style.marker, 1.0),
         "linewidth": 1.4,
         "markeredgecolor": "white",
         "markeredgewidth": 0.5,
@@ -164,7 +164,7 @@ def _line(look: Look) -> dict[str, Any]:
 def _dots(
     groups: Sequence[Group],
     places: Sequence[_Place],
-    styles: dict[str, Look],
+    styles: dict[str, Style],
     allow_partial: bool,
 ) -> Any:
     """Planners side by side at every place, one panel per traffic mode."""

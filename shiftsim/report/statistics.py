@@ -5,7 +5,7 @@ recordings are. Everything here therefore draws or flips whole recordings ("clus
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def cluster_codes(clusters: Sequence[str]) -> IntArray:
 
 
 def bootstrap_interval(
-    values: FloatArray, clusters: IntArray, *, draws: int = DRAWS, seed: int = SEED
+    values: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> Interval | None:
     """Percentile interval of the mean; clusters are drawn with replacement.
 
@@ -49,42 +49,30 @@ def bootstrap_interval(
         values: (S,) one value per scenario.
         clusters: (S,) recording of each, as `cluster_codes` gives them.
         draws: How many samples are drawn.
-        seed: Of the draws.
 
     Returns:
         None with fewer than two clusters: then nothing is known of the spread between them.
     """
-    sums, sizes = _per_cluster(values, clusters)
-    if len(sums) < 2:
+    sums, sizes = np.bincount(clusters, values), np.bincount(clusters).astype(np.float64)
+    count = len(sums)
+    if count < 2:
         return None
-    means = np.concatenate(
-        [(drawn @ sums) / (drawn @ sizes) for drawn in _draws(len(sums), draws, seed)]
-    )
+    rng = np.random.default_rng(SEED)
+    means = []
+    for size in _blocks(draws):
+        drawn = rng.multinomial(count, np.full(count, 1.0 / count), size=size).astype(np.float64)
+        means.append((drawn @ sums) / (drawn @ sizes))
     tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.quantile(means, [tail, 1.0 - tail])
+    low, high = np.quantile(np.concatenate(means), [tail, 1.0 - tail])
     return Interval(float(low), float(high))
 
 
-def _per_cluster(values: FloatArray, clusters: IntArray) -> tuple[FloatArray, FloatArray]:
-    count = int(clusters.max(initial=-1)) + 1
-    sums, sizes = np.zeros(count), np.zeros(count)
-    np.add.at(sums, clusters, values)
-    np.add.at(sizes, clusters, 1.0)
-    return sums, sizes
+def _blocks(draws: int) -> list[int]:
+    """Sizes of the parts in which so many samples are drawn."""
+    return [min(_BLOCK, draws - start) for start in range(0, draws, _BLOCK)]
 
 
-def _draws(count: int, draws: int, seed: int) -> list[FloatArray]:
-    """Blocks (B, G): how often each cluster is in each draw."""
-    rng = np.random.default_rng(seed)
-    share = np.full(count, 1.0 / count)
-    return [
-        rng.multinomial(count, share, size=min(_BLOCK, draws - start)).astype(np.float64)
-        for start in range(0, draws, _BLOCK)
-    ]
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
+class Comparison(NamedTuple):
     """Two planners on the same scenarios.
 
     Attributes:
@@ -131,31 +119,27 @@ def compare(
 
 
 def sign_flip_test(
-    delta: FloatArray, clusters: IntArray, *, draws: int = DRAWS, seed: int = SEED
+    delta: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> tuple[float, float]:
     """Two-sided p-value of a mean difference, and the smallest one that could come out.
 
     If the planners were alike, the sign of each recording's summed difference would be a toss of
     a coin. Few recordings: all patterns of signs are tried; else `draws` random ones.
     """
-    sums = _per_cluster(delta, clusters)[0]
+    sums = np.bincount(clusters, delta)
     observed = abs(float(sums.sum()))
     # sums that differ by rounding alone are as extreme as the observed one
     bound = observed - 1e-12 * max(1.0, float(np.abs(sums).sum()))
     if len(sums) <= _EXACT_CLUSTERS:
-        flipped = np.abs(_all_signs(len(sums)) @ sums)
+        patterns = np.arange(2 ** len(sums))[:, None] >> np.arange(len(sums))
+        flipped = np.abs(((patterns & 1) * 2.0 - 1.0) @ sums)
         return float(np.mean(flipped >= bound)), float(2.0 ** (1 - len(sums)))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     count = 0
-    for start in range(0, draws, _BLOCK):
-        signs = rng.integers(0, 2, size=(min(_BLOCK, draws - start), len(sums))) * 2.0 - 1.0
+    for size in _blocks(draws):
+        signs = rng.integers(0, 2, size=(size, len(sums))) * 2.0 - 1.0
         count += int(np.sum(np.abs(signs @ sums) >= bound))
     return (count + 1.0) / (draws + 1.0), 1.0 / (draws + 1.0)
-
-
-def _all_signs(count: int) -> FloatArray:
-    patterns = np.arange(2**count)[:, None] >> np.arange(count)
-    return (patterns & 1).astype(np.float64) * 2.0 - 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

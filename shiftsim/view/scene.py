@@ -13,7 +13,7 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
-from shiftsim.report.palette import looks
+from shiftsim.report.palette import planner_styles
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
@@ -120,7 +120,7 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
 def describe_scene(replay: Replay) -> dict[str, Any]:
     """Everything that is text or a single number, as JSON values."""
     scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
-    styles = looks(item.planner for item in shown)
+    styles = planner_styles(item.planner for item in shown)
     return {
         "token": scenario.token,
         "type": scenario.scenario_type,

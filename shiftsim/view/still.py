@@ -9,7 +9,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.report.palette import looks, new_figure, save_picture
+from shiftsim.report.palette import new_figure, planner_styles, save_picture
 from shiftsim.view.scene import Replay, Shown, map_lines
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, AgentKind, Tracks, center_poses
@@ -118,22 +118,22 @@ def _heading(axes: Any, scenario: Scenario, time: float) -> None:
 
 def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
     """Everything that moves at one sample; returns what was drawn."""
-    styles = looks(item.planner for item in shown)
+    styles = planner_styles(item.planner for item in shown)
     drawn = _draw_agents(axes, shown[0].log.tracks, row)
     expert = shown[0].log.expert_ego
     dotted = {"color": _LOG, "linewidth": 1, "linestyle": ":", "zorder": 4}
     drawn += axes.plot(expert[:, 0], expert[:, 1], label="recorded driver", **dotted)
     for item in shown:
-        look, ego = styles[item.planner], item.log.ego
+        style, ego = styles[item.planner], item.log.ego
         clean = item.noise == "none"
         label = item.planner if clean else f"{item.planner} {item.noise}"
         drawn += axes.plot(
             ego[:, 0],
             ego[:, 1],
-            color=look.colour,
+            color=style.colour,
             linewidth=1.8,
             linestyle="-" if clean else (0, (5, 3)),
-            marker=look.marker,
+            marker=style.marker,
             markersize=6,
             markeredgecolor="white",
             markeredgewidth=0.5,
@@ -145,7 +145,7 @@ def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
             axes,
             center_poses(ego[row : row + 1, :3]),
             np.array([[PACIFICA.length, PACIFICA.width]]),
-            look.colour,
+            style.colour,
             zorder=7,
         )
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}

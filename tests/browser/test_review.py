@@ -7,7 +7,7 @@ from stores import write_toy_store
 import shiftsim
 from shiftsim.data.store.review import REVIEW
 from shiftsim.view.review.server import ReviewServer
-from shiftsim.view.review.service import Desk
+from shiftsim.view.review.service import ReviewService
 
 SIZES = [(1440, 900), (800, 600)]
 FIRST, SECOND = "0000cafe", "0001cafe"
@@ -20,7 +20,7 @@ def store(tmp_path):
 
 @pytest.fixture
 def server(store):
-    with ReviewServer(Desk(store, "me")) as running:
+    with ReviewServer(ReviewService(store, "me")) as running:
         thread = Thread(target=running.serve_forever, daemon=True)
         thread.start()
         yield running

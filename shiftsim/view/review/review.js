@@ -1,5 +1,5 @@
 "use strict";
-// The review desk: walks through scenarios, keeps every decision at once, edits routes by clicking.
+// The review page: walks through scenarios, keeps every decision at once, edits routes by clicking.
 
 const byId = (id) => document.getElementById(id);
 const secret = new URLSearchParams(location.search).get("token") || "";

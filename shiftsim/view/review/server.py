@@ -16,7 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from shiftsim.errors import ShiftsimError
 from shiftsim.view.page import framed
-from shiftsim.view.review.service import Desk
+from shiftsim.view.review.service import ReviewService
 
 HOST = "127.0.0.1"
 TOKEN_HEADER = "X-Shiftsim-Token"
@@ -28,18 +28,18 @@ _POLICY = (
 
 
 class ReviewServer(ThreadingHTTPServer):
-    """Serves one desk.
+    """Serves the reviews of one store.
 
     Attributes:
-        desk: Does the work; one request at a time.
+        service: Does the work; one request at a time.
         token: What a request must carry.
     """
 
     daemon_threads = True
 
-    def __init__(self, desk: Desk, port: int = 0) -> None:
+    def __init__(self, service: ReviewService, port: int = 0) -> None:
         """Bind to a port of the loopback interface; 0 chooses a free one."""
-        self.desk = desk
+        self.service = service
         self.token = secrets.token_urlsafe(24)
         self.turn = Lock()
         super().__init__((HOST, port), _Handler)
@@ -72,12 +72,14 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._may(given if url.path == "/" else self.headers.get(TOKEN_HEADER, "")):
             return
         if url.path == "/":
-            self._answer(HTTPStatus.OK, review_page(self.server.desk.store.path.name), "text/html")
+            self._answer(
+                HTTPStatus.OK, review_page(self.server.service.store.path.name), "text/html"
+            )
         elif url.path == "/api/scenarios":
-            self._work(lambda desk: desk.listing())
+            self._work(lambda service: service.listing())
         elif url.path == "/api/scenario":
             token = query.get("id", [""])[0]
-            self._work(lambda desk: desk.scenario(token))
+            self._work(lambda service: service.scenario(token))
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
 
@@ -91,9 +93,9 @@ class _Handler(BaseHTTPRequestHandler):
         token, values = str(body.get("token", "")), body.get("values")
         path = urlsplit(self.path).path
         if path == "/api/review" and isinstance(values, dict):
-            self._work(lambda desk: desk.keep(token, values))
+            self._work(lambda service: service.keep(token, values))
         elif path == "/api/route" and _is_route(values):
-            self._work(lambda desk: desk.check_route(token, values))
+            self._work(lambda service: service.check_route(token, values))
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such request")
 
@@ -127,7 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _work(self, request: Any) -> None:
         try:
             with self.server.turn:
-                answer = request(self.server.desk)
+                answer = request(self.server.service)
         except ShiftsimError as error:
             self._refuse(HTTPStatus.BAD_REQUEST, f"{error} {error.hint}".strip())
         except OSError as error:

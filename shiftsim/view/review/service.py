@@ -40,7 +40,7 @@ MAX_COMMENT = 4000  # characters
 _STEP = 0.05  # m
 
 
-class Desk:
+class ReviewService:
     """The reviews of one store, and what is needed to make them."""
 
     def __init__(self, store: Path, reviewer: str = "") -> None:
