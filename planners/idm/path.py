@@ -83,8 +83,7 @@ def plan_route(
             f"idm: map {road.name!r} has no lanes in the first two roadblocks of the route",
             hint=HINT,
         )
-    size = (vehicle.length, vehicle.width)
-    start = int(lane_at(road.edges.polygons, np.array(lanes), center, *size))
+    start = lane_at(road, np.array(lanes), center, vehicle.length, vehicle.width)
     skipped = 1 if int(road.block_of[start]) == blocks[1] else 0
     allowed = set(lanes_of(road, blocks))
     # nuPlan rule 152: the goal must lie exactly as deep as the route is long

@@ -82,7 +82,7 @@ def current_lane(
     """
     areas, errors = lanes_at(road, route, selected, ego)
     if not areas:
-        return int(lane_at(road.edges.polygons, route.lanes, center, size.length, size.width))
+        return lane_at(road, route.lanes, center, size.length, size.width)
     least = min(errors)
     tied = [area for area, error in zip(areas, errors, strict=True) if error == least]
     if len(tied) > 1:

@@ -122,9 +122,9 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
 
 def near_areas(areas: Areas, selected: IntArray, points: FloatArray) -> IntArray:
     """Those of the selected areas whose bounds overlap the bounds of points (..., 2)."""
-    flat, bounds = points.reshape(-1, 2), areas.polygons.bounds[selected]
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    near = (bounds[:, :2] <= high).all(axis=1) & (bounds[:, 2:] >= low).all(axis=1)
+    (x, y), bounds = points.reshape(-1, 2).T, areas.polygons.bounds[selected]
+    near = (bounds[:, 0] <= x.max()) & (bounds[:, 2] >= x.min())
+    near &= (bounds[:, 1] <= y.max()) & (bounds[:, 3] >= y.min())
     return selected[near]
 
 

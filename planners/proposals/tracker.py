@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, kernel, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.dynamics.lqr import (
@@ -99,17 +99,19 @@ def fit_profiles(poses: FloatArray, dt: float, params: LqrParameters, profiles: 
     fit_curvature(poses, profiles.speeds, dt, rate_penalty, profiles.curvatures)
 
 
-@kernel
-def steer_to(
-    state: FloatArray, pose: FloatArray, step: int, speed: float, profiles: Profiles
-) -> Reference:
-    """What the tracker steers to from a state (11,), beside the pose (3,) of a step."""
+@lean_kernel
+def look_ahead(
+    state: FloatArray, pose: FloatArray, step: int, profiles: Profiles
+) -> tuple[float, float]:
+    """Lateral error [m] and heading error [rad] of a state (11,) beside the pose (3,) of a step.
+
+    The curvatures from there on are written into `profiles.ahead`.
+    """
     last = len(profiles.curvatures) - 1
     for index in range(len(profiles.ahead)):
         profiles.ahead[index] = profiles.curvatures[min(step + index, last)]
     lateral = (state[Y] - pose[1]) * np.cos(pose[2]) - (state[X] - pose[0]) * np.sin(pose[2])
-    turn = wrap_angle(state[HEADING] - pose[2])
-    return Reference(TRACKED, lateral, turn, speed, profiles.ahead)
+    return lateral, wrap_angle(state[HEADING] - pose[2])
 
 
 class Driven(NamedTuple):
@@ -156,6 +158,7 @@ def _drive(
             states[0, column] = ego[column]
         for step in range(len(states) - 1):
             speed = profiles.speeds[min(step + params.horizon, last)]
-            reference = steer_to(states[step], poses[row, step], step, speed, profiles)
+            lateral, turn = look_ahead(states[step], poses[row, step], step, profiles)
+            reference = Reference(TRACKED, lateral, turn, speed, ahead)
             accel, rate = command(states[step], reference, params)
             step_bicycle(states[step], accel, rate, params.wheel_base, dt, states[step + 1])

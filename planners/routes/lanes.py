@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.geometry.polylines import nearest_vertex, vertex_heading
 from shiftsim.geometry.rings import ring_distance
-from shiftsim.world.layers import Polygons, Polylines, contains
+from shiftsim.world.layers import Polylines, contains
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus
 
@@ -38,35 +38,32 @@ def deviation(
     return distance, abs(wrap_angle(vertex_heading(baselines.xy, found, stop) - heading))
 
 
-@kernel
 def lane_at(
-    polygons: Polygons, lanes: IntArray, center: FloatArray, length: float, width: float
+    road: VectorMap, lanes: IntArray, center: FloatArray, length: float, width: float
 ) -> int:
     """The first lane that holds the centre of a box, else the one nearest to the box.
 
     Args:
-        polygons: Areas of lanes and connectors.
-        lanes: Those that count, at least one.
+        road: The map.
+        lanes: Lanes and connectors that count, at least one.
         center: (3,) centre of the box x [m], y [m], heading [rad].
         length: Of the box [m].
         width: Of the box [m].
     """
+    x, y, heading = center
+    bounds = road.edges.polygons.bounds[lanes]
+    away_x = np.maximum(np.maximum(bounds[:, 0] - x, x - bounds[:, 2]), 0.0)
+    away_y = np.maximum(np.maximum(bounds[:, 1] - y, y - bounds[:, 3]), 0.0)
+    away = np.hypot(away_x, away_y)
+    for lane in lanes[away == 0.0].tolist():
+        if contains(road.edges.polygons, lane, x, y):
+            return int(lane)
     footprint = np.empty((4, 2))
-    box_corners(center[0], center[1], center[2], length, width, footprint)
-    best, found = np.inf, lanes[0]
-    for lane in lanes:
-        if contains(polygons, lane, center[0], center[1]):
-            return lane
-    radius = 0.5 * np.hypot(length, width)
-    for lane in lanes:
-        dx = max(polygons.bounds[lane, 0] - center[0], 0.0, center[0] - polygons.bounds[lane, 2])
-        dy = max(polygons.bounds[lane, 1] - center[1], 0.0, center[1] - polygons.bounds[lane, 3])
-        if np.hypot(dx, dy) > best + 1.001 * radius:
-            continue
-        shell = polygons.poly_ptr[lane]
-        # a copy, since map arrays are read-only and would need kernels of their own
-        ring = polygons.xy[polygons.ring_ptr[shell] : polygons.ring_ptr[shell + 1]].copy()
-        distance = ring_distance(footprint, ring)
-        if distance < best:
-            best, found = distance, lane
-    return found
+    box_corners(x, y, heading, length, width, footprint)
+    best = (np.inf, 0)  # the first one on ties
+    for place in np.argsort(away).tolist():
+        if away[place] > best[0] + 0.51 * np.hypot(length, width):
+            break
+        ring = road.edges.rings(lanes[place])[0].copy()  # read-only ones would need a kernel more
+        best = min(best, (float(ring_distance(footprint, ring)), place))
+    return int(lanes[best[1]])

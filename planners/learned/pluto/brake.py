@@ -3,9 +3,16 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray, kernel
-from shiftsim.planners.proposals.tracker import DT, Profiles, fit_profiles, steer_to
+from shiftsim.planners.proposals.tracker import DT, Profiles, fit_profiles, look_ahead
 from shiftsim.sim.dynamics.bicycle import step_bicycle
-from shiftsim.sim.dynamics.lqr import NUPLAN, LqrParameters, command, is_stopping
+from shiftsim.sim.dynamics.lqr import (
+    NUPLAN,
+    TRACKED,
+    LqrParameters,
+    Reference,
+    command,
+    is_stopping,
+)
 from shiftsim.world.state import NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters
 
 MAX_SPEED = 8.0  # m/s, a faster ego does not brake
@@ -51,7 +58,8 @@ def _roll_out(
     fit_profiles(poses, dt, params, profiles)
     for step in range(count):
         state = states[step]
-        reference = steer_to(state, poses[step], step, 0.0, profiles)
+        lateral, turn = look_ahead(state, poses[step], step, profiles)
+        reference = Reference(TRACKED, lateral, turn, 0.0, profiles.ahead)
         accel, rate = command(state, reference, params)
         if soft or is_stopping(state[VX], 0.0, params):
             accel = max(accel, SOFT_ACCEL)
