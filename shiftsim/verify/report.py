@@ -5,9 +5,22 @@ folder is compared, or named: as not covered (counts against `--require-all`) or
 label, or a value that by the folder's README need not be compared).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+
+from shiftsim.errors import ShiftsimError
+
+ERRORS = (  # what may be raised by content that has not the form of the reference
+    *(ShiftsimError, OSError, BadZipFile, LookupError, ValueError, TypeError, AttributeError),
+    *(ArithmeticError, shapely.errors.ShapelyError),
+)
 
 
 @dataclass
@@ -37,40 +50,51 @@ class Report:
     informative: list[str] = field(default_factory=list)
 
     def compare(
-        self, quantity: str, where: str, actual: object, expected: object, *, atol: float = 0.0
+        self,
+        quantity: str,
+        where: str,
+        actual: object,
+        expected: object,
+        *,
+        atol: ArrayLike = 0.0,
+        angle: bool = False,
     ) -> bool:
         """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
 
         Args:
             quantity: What is compared; cases of one quantity are tallied together.
             where: Which case: file, scene, run.
-            actual: Ours: a scalar, string, list or array.
-            expected: The reference value of the same form.
-            atol: Absolute tolerance; 0 demands equality. Strings, booleans and integers are always
-                compared exactly.
+            actual: Ours: a scalar, string, array or list, also of lists of several lengths.
+            expected: The reference value of the same form; None among numbers is NaN.
+            atol: Absolute tolerance, of all values or of each (it is broadcast to them); 0 demands
+                equality. Strings, booleans and integers are always compared exactly.
+            angle: Whether the values are angles [rad], which are equal up to whole turns.
 
         Returns:
             Whether they agree.
         """
         tally = self.quantities.setdefault(quantity, Quantity())
         tally.cases += 1
-        tally.tolerance = max(tally.tolerance, atol)
-        ours, theirs = np.asarray(actual), np.asarray(expected)
+        tally.tolerance = max(tally.tolerance, float(np.max(atol)))
+        ours, theirs = _array(actual), _array(expected)
         if ours.shape != theirs.shape:
             return self._differ(tally, quantity, where, f"shape {ours.shape}, not {theirs.shape}")
-        if ours.dtype.kind not in "fiub" or theirs.dtype.kind not in "fiub":
-            bad = np.atleast_1d(ours != theirs)
-        elif ours.dtype.kind in "iub" and theirs.dtype.kind in "iub":
-            bad = np.atleast_1d(ours != theirs)
-        else:
+        if ours.dtype.kind == "f" and theirs.dtype.kind == "O":
+            theirs = _numbers(theirs)
+        kinds = ours.dtype.kind + theirs.dtype.kind
+        if set(kinds) <= set("fiub") and "f" in kinds:
             left, right = ours.astype(np.float64), theirs.astype(np.float64)
             same = (left == right) | (np.isnan(left) & np.isnan(right))
             with np.errstate(invalid="ignore"):
-                error = np.where(same, 0.0, np.abs(left - right))
+                gap = left - right
+                gap = (gap + np.pi) % (2.0 * np.pi) - np.pi if angle else gap
+                error = np.where(same, 0.0, np.abs(gap))
             error = np.where(np.isnan(error), np.inf, error)
             if error.size:
                 tally.max_error = max(tally.max_error, float(error.max()))
-            bad = np.atleast_1d(error > atol)
+            bad = np.atleast_1d(error > np.asarray(atol))
+        else:
+            bad = np.atleast_1d(ours != theirs)
         if not bad.any():
             return True
         first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -90,6 +114,14 @@ class Report:
         tally = self.quantities.setdefault(quantity, Quantity())
         tally.cases += 1
         self._differ(tally, quantity, where, why)
+
+    @contextmanager
+    def attempt(self, quantity: str, where: str) -> Iterator[None]:
+        """Count one case as differing where the block raises any of `ERRORS`."""
+        try:
+            yield
+        except ERRORS as error:
+            self.fail(quantity, where, f"cannot be compared: {type(error).__name__}: {error}")
 
     def skip(self, what: str, count: int = 1) -> None:
         """Name something that should be compared and is not."""
@@ -132,3 +164,20 @@ class Report:
         if self.num_cases == 0:
             return 2
         return 3 if require_all and self.not_covered else 0
+
+
+def _array(value: Any) -> np.ndarray[Any, Any]:
+    try:
+        return np.asarray(value)
+    except ValueError:  # lists of several lengths
+        out = np.empty(len(value), np.object_)
+        for index, item in enumerate(value):
+            out[index] = item
+        return out
+
+
+def _numbers(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    try:
+        return array.astype(np.float64)
+    except (TypeError, ValueError):
+        return array

@@ -134,5 +134,5 @@ def test_an_unknown_series_is_named_as_not_covered(tmp_path: Path) -> None:
     world["expected"]["series"]["novelty"] = [1]
     (tmp_path / CRASH.name).write_text(json.dumps(world))
     report = verify(tmp_path)
-    assert "series 'novelty'" in report.not_covered
+    assert list(report.not_covered) == ["metric_world expected series: field 'novelty'"]
     assert report.exit_code(require_all=True) == 3

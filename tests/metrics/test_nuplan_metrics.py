@@ -1,6 +1,5 @@
 """Recorded nuPlan rollouts score as the official stack scored them; a changed value shows."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.data.nuplan.map import read_map
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.report import Report
-from shiftsim.world.map import VectorMap
+from shiftsim.verify.scenes import Scenes
 
 pytestmark = pytest.mark.golden
 TABLES = (
@@ -30,21 +28,20 @@ TABLES = (
 
 
 @pytest.fixture(scope="module")
-def maps(nuplan_reference: Path) -> dict[str, VectorMap]:
-    found = nuplan_reference.glob("maps/*/*/map.gpkg")
-    return {path.parent.parent.name: read_map(path, path.parent.parent.name) for path in found}
+def scenes(nuplan_reference: Path) -> Scenes:
+    return Scenes(nuplan_reference)
 
 
-def verify(folder: Path, maps: dict[str, VectorMap]) -> Report:
+def verify(folder: Path, scenes: Scenes) -> Report:
     report = Report()
-    verify_nuplan_metrics(folder, report, maps)
+    verify_nuplan_metrics(folder / "expected", report, scenes)
     return report
 
 
 def test_recorded_rollouts_score_as_nuplan_scored_them(
-    nuplan_reference: Path, maps: dict[str, VectorMap]
+    nuplan_reference: Path, scenes: Scenes
 ) -> None:
-    report = verify(nuplan_reference, maps)
+    report = verify(nuplan_reference, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.num_cases > 300
@@ -54,16 +51,14 @@ def test_recorded_rollouts_score_as_nuplan_scored_them(
 
 def test_all_recorded_rollouts_of_the_reference_agree(shared: Path) -> None:
     folder = shared / "reference" / "nuplan"
-    found = folder.glob("maps/*/*/map.gpkg")
-    maps = {path.parent.parent.name: read_map(path, path.parent.parent.name) for path in found}
-    report = verify(folder, maps)
+    report = verify(folder, Scenes(folder))
     assert report.mismatches == []
     assert report.not_covered == {}
 
 
-def test_a_mode_limits_the_runs(nuplan_reference: Path, maps: dict[str, VectorMap]) -> None:
+def test_a_mode_limits_the_runs(nuplan_reference: Path, scenes: Scenes) -> None:
     report = Report()
-    verify_nuplan_metrics(nuplan_reference, report, maps, "XX")
+    verify_nuplan_metrics(nuplan_reference / "expected", report, scenes, "XX")
     assert report.num_cases == 0
 
 
@@ -71,7 +66,6 @@ def test_a_mode_limits_the_runs(nuplan_reference: Path, maps: dict[str, VectorMa
 def copy(nuplan_reference: Path, tmp_path: Path) -> Path:
     """The tables of one run with a collision, free to be changed."""
     (tmp_path / "expected").mkdir()
-    shutil.copy(nuplan_reference / "scenes.json", tmp_path)
     collisions = pq.read_table(nuplan_reference / "expected" / "collisions.parquet")
     scene, planner = collisions["scene"][0].as_py(), collisions["planner"][0].as_py()
     for name in TABLES:
@@ -145,14 +139,14 @@ CHANGES: list[tuple[str, str, Callable[[Any], Any]]] = [
     ("table", "column", "new"), CHANGES, ids=[f"{table}-{column}" for table, column, _ in CHANGES]
 )
 def test_a_changed_value_turns_the_report_red(
-    copy: Path, maps: dict[str, VectorMap], table: str, column: str, new: Callable[[Any], Any]
+    copy: Path, scenes: Scenes, table: str, column: str, new: Callable[[Any], Any]
 ) -> None:
     change(copy, table, column, new)
-    assert verify(copy, maps).exit_code() == 1
+    assert verify(copy, scenes).exit_code() == 1
 
 
-def test_an_unknown_column_is_named_as_not_covered(copy: Path, maps: dict[str, VectorMap]) -> None:
+def test_an_unknown_column_is_named_as_not_covered(copy: Path, scenes: Scenes) -> None:
     path = copy / "expected" / "route.parquet"
     content = pq.read_table(path)
     pq.write_table(content.append_column("novelty", pa.array([1] * content.num_rows)), path)
-    assert "route.parquet: column 'novelty'" in verify(copy, maps).not_covered
+    assert "route: column 'novelty'" in verify(copy, scenes).not_covered

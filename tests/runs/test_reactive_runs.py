@@ -1,7 +1,7 @@
 """Reactive traffic through a whole run."""
 
 import shiftsim
-from shiftsim.runs.rescore import rescore
+from shiftsim.runs.derive import rescore
 
 
 def test_workers_do_not_change_reactive_results(toy, tmp_path):

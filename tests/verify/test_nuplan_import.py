@@ -13,9 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify.nuplan.format import verify_nuplan_format
+from shiftsim.verify.nuplan.logs import verify_nuplan_import
 from shiftsim.verify.nuplan.maps import verify_maps
-from shiftsim.verify.nuplan.reading import load_maps, verify_nuplan_import
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 GOLDEN = places.GOLDEN / "nuplan_format"
 pytestmark = pytest.mark.golden
@@ -107,11 +108,11 @@ def test_the_whole_reference_is_equal(nuplan_reference: Path) -> None:
 @pytest.mark.thorough
 @pytest.mark.slow
 def test_every_changed_cell_is_noticed(folder: Path) -> None:
-    maps = load_maps(folder)
+    maps = Scenes(folder).maps
 
     def check_maps() -> tuple[list[str], dict[str, int]]:
         report = Report()
-        verify_maps(folder, maps, report)
+        verify_maps(folder / "expected", maps, report)
         return report.mismatches, report.not_covered
 
     def check_logs() -> tuple[list[str], dict[str, int]]:

@@ -7,26 +7,27 @@ import pytest
 
 from shiftsim.errors import DataError
 from shiftsim.verify import verify
-from shiftsim.verify.nuplan.reading import load_scenes
-from shiftsim.verify.nuplan.simulation import verify_simulation
+from shiftsim.verify.nuplan.runs import verify_simulation
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 pytestmark = pytest.mark.golden
 
 
 @pytest.fixture(scope="module")
 def scenes(nuplan_reference):
-    return load_scenes(nuplan_reference)
+    return Scenes(nuplan_reference)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "runs"), [("NR", 46), ("PT", 2)])
 def test_closed_loops_end_where_the_official_ones_do(nuplan_reference, scenes, mode, runs):
     report = Report()
-    verify_simulation(nuplan_reference, report, scenes, mode)
+    verify_simulation(nuplan_reference / "expected", report, scenes, mode)
     assert report.mismatches == []
     assert report.quantities["ego x"].cases == runs
-    assert report.quantities["simulated score"].cases == 18 * runs
+    scored = [q for name, q in report.quantities.items() if name.startswith("simulated score")]
+    assert sum(quantity.cases for quantity in scored) == 18 * runs
     assert not report.not_covered
 
 
@@ -34,7 +35,7 @@ def test_closed_loops_end_where_the_official_ones_do(nuplan_reference, scenes, m
 def one_run(nuplan_reference, tmp_path):
     """A folder that holds one recorded run only, to be falsified."""
     (tmp_path / "expected").mkdir()
-    for name in ("ego", "scores"):
+    for name in ("ego", "objects", "scores"):
         table = pq.read_table(nuplan_reference / "expected" / f"{name}.parquet")
         keep = [
             row["scene"] == "s13_empty_road"
@@ -73,7 +74,7 @@ def test_one_changed_state_is_seen(one_run, scenes, column):
     index = table.column_names.index(column)
     pq.write_table(table.set_column(index, column, pa.array(values)), path)
     report = Report()
-    verify_simulation(one_run, report, scenes)
+    verify_simulation(one_run / "expected", report, scenes)
     assert len(report.mismatches) == 1
     assert f"ego {column}: s13_empty_road NR log_future" in report.mismatches[0]
     assert " at 77" in report.mismatches[0]
@@ -87,7 +88,7 @@ def test_one_changed_score_is_seen(one_run, scenes):
     index = table.column_names.index("score")
     pq.write_table(table.set_column(index, "score", pa.array(values)), path)
     report = Report()
-    verify_simulation(one_run, report, scenes)
+    verify_simulation(one_run / "expected", report, scenes)
     assert len(report.mismatches) == 1
     assert "score" in report.mismatches[0]
 
@@ -97,7 +98,7 @@ def test_a_missing_sample_is_seen(one_run, scenes):
     table = pq.read_table(path)
     pq.write_table(table.slice(0, len(table) - 1), path)
     report = Report()
-    verify_simulation(one_run, report, scenes)
+    verify_simulation(one_run / "expected", report, scenes)
     assert any("shape" in line for line in report.mismatches)
 
 

@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.nuplan.reading import load_scenes
 from shiftsim.verify.pdm.kernels import verify_kernels
 from shiftsim.verify.pdm.loops import verify_calls
 from shiftsim.verify.pdm.routes import verify_routes
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
 GOLDEN = places.GOLDEN / "pdm"
 RUN = "s02_curve_objects"
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.golden
 
 @pytest.fixture(scope="module")
 def scenes(nuplan_reference):
-    return load_scenes(nuplan_reference)
+    return Scenes(nuplan_reference)
 
 
 @pytest.fixture

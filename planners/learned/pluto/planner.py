@@ -14,8 +14,6 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.checkpoint import load_weights
-from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import SAMPLES, AgentFeatures, PerMap, agent_features
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
@@ -112,24 +110,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     name = "pluto"
 
-    def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            checkpoint: A file, a name, or `deterministic:base` or `deterministic:drive`.
-            device: Where the network runs, as in `resolve_device`.
-
-        Raises:
-            CheckpointError: There is no such file, or it is of another network.
-            MissingExtraError: PyTorch is not installed.
-        """
-        weights = load_weights(checkpoint, self.name, device=device)
-        from shiftsim.planners.learned.pluto.network import build_network
-
-        self._device = resolve_device(device)
-        self._network = build_network(weights.args)
-        self._network.load_state_dict(weights.state)
-        self._network.to(self._device).eval()
+    def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
+        """Load the network; arguments and errors as in the base."""
+        super().__init__(checkpoint, device=device)
         self._scene: SceneInfo | None = None
         self.route: RouteLanes | None = None
         self.sight: Sight | None = None
@@ -187,7 +170,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         from shiftsim.planners.learned.pluto.network import Inputs
 
         with torch.inference_mode():
-            outputs = self._network(Inputs(*stack(features, self._device)))
+            outputs = self.network(Inputs(*stack(features, self.device)))
         arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
         return [
             Output(

@@ -1,19 +1,21 @@
 """The nets folder: the learned planners with deterministic weights against the official code."""
 
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from shiftsim.verify.nets.common import ERRORS, Scenes
-from shiftsim.verify.nuplan.reading import read_json
+from shiftsim.verify.files import Source, read_arrays, read_fields, read_json, verify_files
 from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
 
-PARTS = {  # sub-folder → `module:function` below shiftsim.verify
-    "carl": "nets.carl:verify_carl",
-    "diffusion_planner": "nets.diffusion:verify_diffusion",
-    "plantf": "nets.plantf:verify_plantf",
-    "pluto": "nets.pluto:verify_pluto",
-    "route_correction": "nets.routes:verify_routes",
+PARTS = {  # sub-folder → module with `FILES`: by glob pattern what is called with file and scenes
+    "carl": "carl",
+    "diffusion_planner": "diffusion",
+    "plantf": "plantf",
+    "pluto": "pluto",
+    "route_correction": "routes",
 }
 
 
@@ -25,19 +27,47 @@ def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> 
         report: Filled with the comparisons.
         scenes: Folder with the logs and maps, by default `nuplan` beside `nets`.
     """
-    part = _part_of(folder)
-    home = folder.resolve() if part is None else folder.resolve().parent
-    known = Scenes(scenes or home.parent / "nuplan")
+    part, home = _part_of(folder), folder.resolve()
+    known = Scenes(scenes or (home if part is None else home.parent).parent / "nuplan")
     if part is not None:
-        _verify_part(part, folder, report, known)
+        verify_part(part, folder, report, known)
         return
-    for path in sorted(folder.iterdir()):
-        if path.name in PARTS and path.is_dir():
-            _verify_part(path.name, path, report, known)
-        elif path.suffix == ".md":
-            report.note(f"{path.name}: description of the folder")
-        else:
-            report.skip(f"file {path.name}")
+    parts = {name: partial(verify_part, name, report=report, scenes=known) for name in PARTS}
+    verify_files(folder, report, parts)
+
+
+def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
+    """Compare every file of a sub-folder.
+
+    Args:
+        part: Name of the sub-folder, as in `PARTS`.
+        folder: Where its files are.
+        report: Filled with the comparisons.
+        scenes: The scenes that closed loops and routes refer to.
+    """
+    if part not in PARTS:
+        report.skip(f"{part}: nothing compares this folder")
+    elif find_spec("torch") is None and part != "route_correction":
+        report.skip(f"{part}: torch is not installed")
+    else:
+        files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
+        bound = {
+            pattern: partial(_verify_file, compare, report, scenes)
+            for pattern, compare in files.items()
+        }
+        verify_files(folder, report, bound)
+
+
+def _verify_file(
+    compare: Callable[[Source, Scenes], None], report: Report, scenes: Scenes, path: Path
+) -> None:
+    file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
+    scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
+    if scene is not None and scene not in scenes:
+        report.skip(f"{path.name}: scene {scene}, which is not at hand")
+    else:
+        compare(file, scenes)
+        file.finish()
 
 
 def _part_of(folder: Path) -> str | None:
@@ -45,22 +75,8 @@ def _part_of(folder: Path) -> str | None:
     if any(folder.glob("route_correction_*.json")):
         return "route_correction"
     manifest = folder / "state_dict.json"
-    if manifest.is_file():
-        content = read_json(manifest)
-        named = content.get("planner") if isinstance(content, dict) else None
-        return named if named in PARTS else folder.resolve().name
-    return None
-
-
-def _verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
-    module, _, function = PARTS.get(part, ":").partition(":")
-    if not module or find_spec(f"shiftsim.verify.{module}") is None:
-        report.skip(f"{part}: nothing compares this folder")
-        return
-    if find_spec("torch") is None and part != "route_correction":
-        report.skip(f"{part}: torch is not installed")
-        return
-    try:
-        getattr(import_module(f"shiftsim.verify.{module}"), function)(folder, report, scenes)
-    except ERRORS as error:  # the official code got through, so this is a difference
-        report.fail(part, str(folder), f"cannot be compared: {type(error).__name__} {error}")
+    if not manifest.is_file():
+        return None
+    content = read_json(manifest)
+    named = content.get("planner") if isinstance(content, dict) else None
+    return named if named in PARTS else folder.resolve().name

@@ -1,49 +1,54 @@
-"""Diffusion Planner: settings, schedule, network, features and closed loops (planner-diffusion.md).
+"""Diffusion Planner: settings, schedule, network, features and closed loops.
 
 Everything is made from the scene's own log and map; stored features are only compared with.
 """
 
-import json
 import re
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.errors import DataError
 from shiftsim.planners.learned.deterministic import keyed_normals
-from shiftsim.planners.learned.diffusion.features import FeatureBuilder, Features, lane_lines
-from shiftsim.planners.learned.diffusion.planner import (
-    INPUTS,
-    NOISE_SHAPE,
-    decode_ego,
-    why_makeshift,
+from shiftsim.planners.learned.diffusion.features import (
+    LANES,
+    ROUTE_LANES,
+    Features,
+    agent_features,
+    lane_features,
+    lanes_on_route,
 )
-from shiftsim.verify.array_file import ArrayFile
-from shiftsim.verify.nets.common import (
-    ERRORS,
+from shiftsim.planners.learned.diffusion.kernels import (
+    SAMPLES,
+    LaneLines,
+    line_bounds,
+    nearest_lanes,
+    resample_lanes,
+)
+from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.verify.files import Source
+from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
+from shiftsim.verify.nets.networks import (
     FEATURE,
-    HEADING,
-    POSITION,
-    Loop,
-    Scenes,
-    compare_driven,
     make_network,
-    open_loop,
-    verify_state_dict,
+    match_meta,
+    num_elements,
+    verify_manifest,
 )
-from shiftsim.verify.nets.diffusion_selection import verify_agents, verify_lanes
-from shiftsim.verify.nuplan.reading import read_json
-from shiftsim.verify.report import Report
-from shiftsim.world.state import NUM_STATE, Command, Trajectory
+from shiftsim.verify.scenes import Scenes
+from shiftsim.world.layers import Polylines, make_polygons, make_polylines
+from shiftsim.world.state import AgentKind, Tracks
 
-NAME = "diffusion_planner"
+NAME = DiffusionPlanner.name
 NETWORK = 2e-5  # one call of encoder or decoder
 SAMPLED = {"base": 1e-3, "drive": 2e-4}  # m, after all calls
 SCALE = 20.0  # m, of what the network calls 1
 SCHEDULE = 2e-6  # single precision, about 1
-_PLAN = ("x", "y", "heading", "vx", "vy", "ax", "ay")  # columns of stored plans
+NORMALISED = 1e-6
 
 _DRIVE = (
     "shape (324,768), row 4*t+c (t=0..80, c=0..3): amp[c]*(t/80)*u[c], amp=[0.3,0.05,0,0.05], "
@@ -65,90 +70,63 @@ _OTHER_ARGS = {  # of training, or fixed by the features
     "diffusion_model_type": "x_start",
     "device": "cpu",
 }
+_TRACK_COLUMNS = ["track", "vx", "vy", "heading", "width", "length", "x", "y"]
+_STATIC = ("CZONE_SIGN", "BARRIER", "TRAFFIC_CONE", "GENERIC_OBJECT")
 
 
-def verify_diffusion(folder: Path, report: Report, scenes: Scenes) -> None:
-    """Compare every file of the folder.
+def start_noise(key: str) -> np.ndarray:
+    """(11, 80, 4) float32, of a case or of an iteration."""
+    return keyed_normals(f"noise:{key}", (1, *NOISE_SHAPE)).astype(np.float32)[0]
 
-    Args:
-        folder: The folder `diffusion_planner`.
-        report: Receives the comparisons.
-        scenes: The scenes of the closed loops.
-    """
-    networks = _Networks(folder)
-    by_name: dict[str, Callable[[Path], None]] = {
-        "args.json": lambda path: _verify_args(path, report),
-        "sampler.json": lambda path: _verify_sampler(path, report),
-        "state_dict.json": lambda path: verify_state_dict(path, report, NAME, _manifest()),
+
+class KeyedPlanner(DiffusionPlanner):
+    """The planner with the start noise of the reference files."""
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Prepare for a scenario."""
+        super().reset(scene)
+        self._token = scene.token
+
+    def features(self, observation: Observation) -> Features:
+        """What the network reads."""
+        noise = start_noise(f"{self._token}:{observation.iteration}")
+        return replace(super().features(observation), noise=noise)
+
+
+def _verify_manifest(file: Source, scenes: Scenes) -> None:
+    from shiftsim.planners.learned.diffusion.network import PREFIXES, build_network
+
+    network = build_network()
+    last = "decoder.decoder.dit.final_layer.proj.4"
+    others = {
+        "parameters": num_elements(network.state_dict().values()),
+        "parameters_encoder": num_elements(network.encoder.parameters()),
+        "checkpoint": lambda given: {
+            **given,
+            "prefix": PREFIXES[0] + given["prefix"][len(PREFIXES[0]) :],
+            "used_key": re.sub(r"^\w+", "ema_state_dict", given["used_key"]),
+        },
+        "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
+        "noise": _NOISE,
     }
-    by_start: dict[str, Callable[[Path], None]] = {
-        "forward_": lambda path: _verify_forward(path, report, networks),
-        "closed_loop_": lambda path: _verify_loop(path, report, scenes, networks),
-        "overflow_agents_": lambda path: verify_agents(path, report),
-        "overflow_lanes_": lambda path: verify_lanes(path, report),
-    }
-    for path in sorted(folder.iterdir()):
-        start = next((s for s in by_start if path.name.startswith(s)), "")
-        verify = by_name.get(path.name) or (by_start.get(start) if path.suffix == ".npz" else None)
-        if verify is None:
-            report.skip(f"{NAME}: file {path.name}")
-            continue
-        try:
-            verify(path)
-        except ERRORS as error:
-            why = f"cannot be compared: {type(error).__name__} {error}"
-            report.fail(f"{NAME} file", path.name, why)
-    for name in (*by_name, *(f"{start}*.npz" for start in by_start)):
-        if not any(folder.glob(name)):
-            report.note(f"{NAME}: the folder has no {name}")
+    verify_manifest(file, NAME, others)
 
 
-class _Networks:
-    """Networks by variant of their weights, made when first asked for."""
-
-    def __init__(self, folder: Path) -> None:
-        path = folder / "args.json"
-        self._args = read_json(path) if path.is_file() else None
-        self._made: dict[str, Any] = {}
-
-    def __call__(self, variant: str) -> Any:
-        if variant not in self._made:
-            self._made[variant] = make_network(NAME, variant, self._args)
-        return self._made[variant]
-
-
-def _verify_args(path: Path, report: Report) -> None:
+def _verify_args(file: Source, scenes: Scenes) -> None:
     """The bundled settings must be those of the file; both normalisers too."""
     from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS
 
-    given = read_json(path)
-    ours = {**DEFAULT_ARGS, **_OTHER_ARGS}
-    row = {name: np.array(ours["state_normalizer"][name]) for name in ("mean", "std")}
-    agents = 1 + int(given["predicted_neighbor_num"])
-    ours["state_normalizer"] = {
-        name: np.broadcast_to(value, (agents, 1, len(value))) for name, value in row.items()
-    }
-    _compare_tree(report, path.name, ours, given)
+    agents, normaliser = 1 + int(file["predicted_neighbor_num"]), DEFAULT_ARGS["state_normalizer"]
+    rows = {name: [[row]] * agents for name, row in normaliser.items()}
+    ours = {**DEFAULT_ARGS, **_OTHER_ARGS, "state_normalizer": rows}
+    file.match(file.name, ours, quantity=f"{NAME} args")
 
 
-def _compare_tree(report: Report, where: str, ours: Any, given: Any) -> None:
-    if not isinstance(given, Mapping) or not isinstance(ours, Mapping):
-        report.compare(f"{NAME} args", where, ours, given)
-        return
-    for name in sorted({*given, *ours}):
-        if name not in ours:
-            report.skip(f"{NAME} {where}: field {name!r}")
-        elif name not in given:
-            report.fail(f"{NAME} args", where, f"no field {name!r}")
-        else:
-            _compare_tree(report, f"{where} {name}", ours[name], given[name])
-
-
-def _verify_sampler(path: Path, report: Report) -> None:
+def _verify_sampler(file: Source, scenes: Scenes) -> None:
     from shiftsim.planners.learned.diffusion.network import sampler
 
-    made, given = sampler.SCHEDULE, read_json(path)
-    ours: dict[str, Any] = {
+    made, count = sampler.SCHEDULE, sampler.STEPS
+    ours = {
         "timesteps": made.times.numpy(),
         "lambda": made.half_snr.numpy(),
         "log_alpha": made.log_alpha.numpy(),
@@ -156,83 +134,50 @@ def _verify_sampler(path: Path, report: Report) -> None:
         "sigma": made.sigma.numpy(),
         "final_denoise_t": sampler.LAST_TIME,
     }
-    steps = [
-        {
-            "step": i + 1,
-            "order": 1 if i == 0 else 2,
-            "t": float(made.times[i + 1]),
-            "h": float(made.h[i]),
-            "c_x": float(made.c_x[i]),
-            "c_x0": float(made.c_x0[i]),
-            "r0": np.nan if i == 0 else float(made.r0[i - 1]),
-        }
-        for i in range(sampler.STEPS)
-    ]
-    report.compare(f"{NAME} sampler steps", path.name, len(steps), len(given["steps"]))
-    pairs = [("", ours, {n: v for n, v in given.items() if n != "steps"})]
-    pairs += [(f"step {i + 1}", *pair) for i, pair in enumerate(zip(steps, given["steps"]))]  # noqa: B905  # lengths are compared above
-    for where, mine, theirs in pairs:
-        report.compare(f"{NAME} sampler fields", where, sorted(mine), sorted(theirs))
-        for name in sorted(set(mine) & set(theirs)):
-            value = np.nan if theirs[name] is None else theirs[name]
-            report.compare(f"{NAME} sampler {name}", where, mine[name], value, atol=SCHEDULE)
-
-
-def _manifest() -> dict[str, Callable[[Any], object] | None]:
-    """Fields of state_dict.json beside the entries."""
-    from shiftsim.planners.learned.diffusion.network import PREFIXES, build_network
-
-    network = build_network()
-    last = "decoder.decoder.dit.final_layer.proj.4"
-    drive = {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]}
-    return {
-        "parameters": lambda _: sum(value.numel() for value in network.parameters()),
-        "parameters_encoder": lambda _: sum(v.numel() for v in network.encoder.parameters()),
-        "checkpoint": lambda given: {
-            **given,
-            "prefix": PREFIXES[0] + given["prefix"][len(PREFIXES[0]) :],
-            "used_key": re.sub(r"^\w+", "ema_state_dict", given["used_key"]),
-        },
-        "drive_overrides": lambda _: drive,
-        "noise": lambda _: _NOISE,
+    steps = {
+        "step": np.arange(count) + 1,
+        "order": np.minimum(np.arange(count) + 1, 2),
+        "t": made.times[1:].numpy(),
+        "h": made.h.numpy(),
+        "c_x": made.c_x.numpy(),
+        "c_x0": made.c_x0.numpy(),
+        "r0": np.array([np.nan, *made.r0.tolist()]),
     }
+    file.match(file.name, ours, SCHEDULE, quantity=NAME)
+    listed = file["steps"]
+    theirs = {name: [step[name] for step in listed] for name in listed[0]}
+    table = Source("sampler steps", "field", theirs, file.report)
+    table.match(file.name, steps, SCHEDULE, quantity=f"{NAME} sampler")
+    table.finish()
 
 
-def _verify_forward(path: Path, report: Report, networks: _Networks) -> None:
+def _verify_forward(file: Source, scenes: Scenes) -> None:
     """The network on stored inputs."""
     import torch
 
-    file = ArrayFile(path, report)
-    meta = json.loads(str(file["meta"]))
-    case = path.stem.removeprefix("forward_")
-    variants = sorted({n.split(".")[1] for n in file.arrays if n.count(".") > 1})
-    expected = {"case": case, "variants": variants}
-    report.compare(
-        f"{NAME} meta", path.name, [*map(str, expected.items())], [*map(str, meta.items())]
-    )
-    given = {name: file[f"in.{name}"] for name in INPUTS}
-    noise = keyed_normals(f"noise:{case}", (1, *NOISE_SHAPE)).astype(np.float32)
-    report.compare(f"{NAME} start noise", path.name, noise, file["in.noise"])
-    given["route_lanes_speed_limit"] = file["in.route_lanes_speed_limit"]
-    for name in ("lanes", "route_lanes"):  # those of the route are read by nobody
-        limits, known = given[f"{name}_speed_limit"], file[f"in.{name}_has_speed_limit"]
-        report.compare(f"{NAME} has limit", f"{path.name} {name}", limits != 0.0, known)
+    case, given = file.name.removeprefix("forward_"), file.below("in.")
+    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
+    match_meta(file, NAME, {"case": case, "variants": variants})
+    limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
+    known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
+    given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
     with torch.inference_mode():
-        inputs = {name: torch.from_numpy(value) for name, value in given.items()}
-        scene = networks("base").normalise(inputs)
-        for name, value in scene.items():
-            if name in networks("base").normalisers:
-                _compare(file, "normalised", f"norm.{name}", value, 1e-6)
-        _compare(file, "encoding", "out.encoding", networks("base").encode(scene), NETWORK)
-        route = networks("base").dit[0].route_encoder(scene["route_lanes"])
-        _compare(file, "route encoding", "out.route_encoding", route, NETWORK)
+        inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
+        network = make_network(NAME, "base")
+        scene = network.normalise(inputs)
+        normalised = {name: scene[name].numpy() for name in network.normalisers}
+        file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
+        encoded = {
+            "encoding": network.encode(scene).numpy(),
+            "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]).numpy(),
+        }
+        file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
         for variant in variants:
-            _verify_sampling(file, variant, networks(variant), scene, inputs)
-    file.finish()
+            _verify_sampling(file, variant, scene, inputs)
 
 
 def _verify_sampling(
-    file: ArrayFile, variant: str, network: Any, scene: dict[str, Any], inputs: dict[str, Any]
+    file: Source, variant: str, scene: dict[str, Any], inputs: dict[str, Any]
 ) -> None:
     """All calls of the sampler with one variant of the weights."""
     import torch
@@ -241,9 +186,9 @@ def _verify_sampling(
     from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE as TIMES
     from shiftsim.planners.learned.diffusion.network.sampler import sample
 
+    network, stored = make_network(NAME, variant), file.below(f"out.{variant}.")
     current, absent = network.present(scene)
-    prepared = network.prepare(scene, absent)
-    noise = torch.from_numpy(file["in.noise"])
+    prepared, noise = network.prepare(scene, absent), torch.from_numpy(file["in.noise"])
     seen, made = [], []
 
     def call(x: Any, number: int) -> Any:
@@ -254,103 +199,134 @@ def _verify_sampling(
     def sampled(function: Callable[[Any, int], Any]) -> Any:
         return network.denormalise(sample(function, current, noise)[:, :, 1:])
 
-    start, bound = f"out.{variant}.", SAMPLED[variant]
-    _compare(file, f"prediction {variant}", f"{start}prediction", sampled(call), bound)
-    _compare(file, "call times", f"{start}step_t", TIMES.call_times, SCHEDULE)
-    _compare(file, "first call", f"{start}dit_first", made[0], NETWORK)
-    # of the other calls the ego's input and the last output are stored
-    _compare(file, "ego in calls", f"{start}step_ego_x", torch.stack(seen), bound / SCALE)
-    _compare(file, "last call", f"{start}dit_last", made[-1], bound / SCALE)
-    if f"{start}guided_prediction" in file.arrays:
+    bound = SAMPLED[variant]
+    ours = {
+        "prediction": (sampled(call), bound),
+        "step_t": (TIMES.call_times, SCHEDULE),
+        "dit_first": (made[0], NETWORK),
+        # of the other calls the ego's input and the last output are stored
+        "step_ego_x": (torch.stack(seen), bound / SCALE),
+        "dit_last": (made[-1], bound / SCALE),
+    }
+    if "guided_prediction" in stored:
         guided = with_guidance(call, network, inputs["neighbor_agents_past"], absent)
-        _compare(file, "guided prediction", f"{start}guided_prediction", sampled(guided), bound)
+        ours["guided_prediction"] = (sampled(guided), bound)
+    for name, (value, atol) in ours.items():
+        where = f"{file.name} {variant}"
+        stored.match(where, {name: value.numpy()}, atol, quantity=NAME)
 
 
-def _compare(file: ArrayFile, quantity: str, name: str, ours: Any, atol: float) -> None:
-    file.report.compare(
-        f"{NAME} {quantity}", f"{file.name} {name}", ours.numpy(), file[name], atol=atol
-    )
-
-
-def _verify_loop(path: Path, report: Report, scenes: Scenes, networks: _Networks) -> None:
-    """Plan again at every recorded iteration."""
-    loop = open_loop(path, report, scenes, NAME)
-    if loop is None:
+def _compare(loop: Loop) -> None:
+    """Compare one iteration; features, ids and all outputs are stored for some."""
+    bound = SAMPLED[loop.variant]
+    loop.compare("ego_prediction", loop.output[0], loop.recorded("ego_prediction"), bound)
+    loop.compare_plan(POSITION)
+    if not list(loop.stored):
         return
-    file, network = loop.file, networks(loop.variant)
-    stored = file.take("out/trajectory", -1, NOISE_SHAPE[1] + 1, len(_PLAN))
-    count = len(stored)  # the official planner may have failed at the next iteration
-    times = file.take("out/trajectory_time_us", count, NOISE_SHAPE[1] + 1)
-    egos = file.take("out/ego_prediction", count, *NOISE_SHAPE[1:])
-    failed = min(count, len(loop.ego) - 1) if loop.error else -1
-    build = FeatureBuilder(loop.info, lane_lines(loop.scenario.map))
-    plans: list[Trajectory | Command] = []
-    for iteration in range(len(loop.ego)):
-        where, seen = f"iteration {iteration}", loop.observation(iteration)
-        key = f"noise:{loop.scenario.token}:{iteration}"
-        noise = keyed_normals(key, (1, *NOISE_SHAPE)).astype(np.float32)[0]
-        features = build(seen, noise)
-        makeshift = bool(why_makeshift(features, len(seen.history.ego)))
-        loop.compare(f"{NAME} makeshift", where, makeshift, iteration == failed)
-        made = _infer(network, features)
-        _compare_iteration(loop, iteration, features, made)
-        if iteration >= count:
-            continue
-        ego, atol = made["prediction"][0], SAMPLED[loop.variant]
-        loop.compare(f"{NAME} ego [m]", where, ego, egos[iteration], atol)
-        plan = decode_ego(made["prediction"], seen)
-        _compare_plan(loop, where, plan, stored[iteration], times[iteration])
-        states = np.zeros((len(plan.time_us), NUM_STATE))
-        states[:, : len(_PLAN)] = stored[iteration]
-        plans.append(Trajectory(times[iteration], states))
-    report.compare(f"{NAME} plans", path.name, len(loop.ego) - len(plans), int(bool(loop.error)))
-    compare_driven(loop, plans, NAME)
-    file.finish()
+    features, road, tokens = loop.features, loop.scenario.map, loop.scenario.tracks.tokens
+    names = (*INPUTS, "route_lanes_speed_limit", "route_lanes_has_speed_limit")
+    ours = {
+        "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
+        "agent_tokens": [tokens[track] for track in features.agents.tolist()],
+        "corrected_route_ids": [road.blocks.ids[block] for block in features.route or ()],
+        "prediction": loop.output,
+        **{f"feature/{name}": getattr(features, name) for name in names},
+    }
+    if "encoding" in loop.stored:
+        ours["encoding"] = _encoding(loop.variant, features)
+    loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
 
 
-def _infer(network: Any, features: Features) -> dict[str, Any]:
-    """Tokens of the scene (107, 192) and trajectories (11, 80, 4)."""
+def _encoding(variant: str, features: Features) -> Any:
+    """Tokens of the scene (107, 192)."""
     import torch
 
+    network = make_network(NAME, variant)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
-        noise = torch.from_numpy(features.noise[None])
-        encoding = network.encode(network.normalise(inputs))
-        return {
-            "encoding": encoding[0].numpy(),
-            "prediction": network(inputs, noise)[0].numpy(),
-        }
+        return network.encode(network.normalise(inputs))[0].numpy()
 
 
-def _compare_iteration(
-    loop: Loop, iteration: int, features: Features, made: dict[str, Any]
-) -> None:
-    """Compare what is stored for some iterations: features, ids and outputs."""
-    start, road = f"it{iteration:02d}/", loop.scenario.map
-    tokens = loop.scenario.tracks.tokens
-    ours: dict[str, tuple[object, float]] = {
-        "lane_ids": ([road.edges.ids[edge] for edge in features.edges.tolist()], 0.0),
-        "agent_tokens": ([tokens[track] for track in features.agents.tolist()], 0.0),
-        "corrected_route_ids": ([road.blocks.ids[b] for b in features.route or ()], 0.0),
-        "encoding": (made["encoding"], NETWORK),
-        "prediction": (made["prediction"], SAMPLED[loop.variant]),
-    }
-    for name in (n.removeprefix(start) for n in loop.file.arrays if n.startswith(start)):
-        if name in ours:
-            value, atol = ours[name]
-        elif name.startswith("feature/") and hasattr(features, name.removeprefix("feature/")):
-            value, atol = getattr(features, name.removeprefix("feature/")), FEATURE
-        else:
-            continue
-        given = loop.file[start + name]
-        theirs = given.tolist() if given.dtype.kind in "US" else given
-        loop.compare(f"{NAME} {name}", start[:-1], value, theirs, atol)
+def _verify_agents(file: Source, scenes: Scenes) -> None:
+    """Which agents and objects are kept where there are too many, and their histories."""
+    match_meta(file, NAME, {"frame_columns": _TRACK_COLUMNS})
+    if f"in.frame{SAMPLES:02d}" in file:
+        file.note("older than what the network reads; says no more than the types", "in.frame00")
+    made = agent_features(_tracks(file), file.take("in.anchor", 3))
+    ours = dict(zip(("agents", "static", "selected"), made, strict=True))
+    file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
 
-def _compare_plan(loop: Loop, where: str, plan: Trajectory, stored: Any, times: Any) -> None:
-    loop.compare(f"{NAME} plan time [us]", where, plan.time_us, times)
-    gap = plan.states[:, : len(_PLAN)] - stored
-    gap[:, 2] = wrap_angles(gap[:, 2])
-    for column, name in enumerate(_PLAN):
-        atol = HEADING if name == "heading" else POSITION
-        loop.compare(f"{NAME} plan {name}", where, gap[:, column], np.zeros(len(gap)), atol)
+def _tracks(file: Source) -> Tracks:
+    """The frames as tracks, in the order of the last frame; static objects after them."""
+    names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
+    frames = [file.take(name, -1, len(_TRACK_COLUMNS)) for name in names]
+    kinds: dict[int, int] = {}
+    for name, frame in zip(names[::-1], frames[::-1], strict=True):
+        for track, kind in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True):
+            if kinds.setdefault(int(track), kind) != kind:
+                raise DataError("a track changes its type")
+    static = file.take("in.static", -1, 5)
+    static_kinds = [
+        AgentKind[_STATIC[kind]] for kind in file.take("in.static_type", len(static)).tolist()
+    ]
+    column = {track: index for index, track in enumerate(kinds)}
+    shape = (len(frames), len(column) + len(static))
+    values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)
+    for sample, frame in enumerate(frames):
+        where = [column[int(track)] for track in frame[:, 0]]
+        valid[sample, where] = True
+        values[sample, where] = frame[:, [6, 7, 3, 1, 2, 5, 4]]
+    valid[-1, len(column) :] = True
+    values[-1, len(column) :, [0, 1, 2, 6, 5]] = static.T
+    poses, velocities, sizes = np.split(values, (3, 5), axis=2)
+    codes = np.array([*kinds.values(), *static_kinds], np.int64)
+    return Tracks(valid, poses, velocities, sizes, codes, tuple(map(str, range(shape[1]))))
+
+
+def _verify_lanes(file: Source, scenes: Scenes) -> None:
+    """Which lanes and route lanes are kept where there are too many, and their rows."""
+    match_meta(file, NAME, {"light": "green, yellow, red, unknown"})
+    anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
+    lines, left, right = (_lines(file, n) for n in ("lane", "left_boundary", "right_boundary"))
+    index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
+    limits = np.where(file["in.has_limit"], file["in.limit"].astype(np.float64), np.nan)
+    blocks = np.array([index[name] for name in owner], np.int64)
+    resampled = resample_lanes(lines, left, right)
+    lanes = LaneLines(resampled, line_bounds(lines), limits, blocks)
+    # the lanes come in the order of the distance to their areas, which are not there
+    point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
+    edges = nearest_lanes(np.arange(len(owner)), point, lines, anchor[0], anchor[1], LANES)
+    lights = file.take("in.light", len(owner), 4)
+    file.report.compare(
+        f"{NAME} lights", file.name, lights.sum(axis=1), np.ones(len(owner), np.int64)
+    )
+    rows = lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, LANES)
+    on_route = lanes_on_route(
+        lanes.blocks[edges], [index.get(name, -1) for name in file["in.route"].tolist()]
+    )
+    ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), rows, strict=True))
+    for name, array in list(ours.items()):
+        ours[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+        ours[f"route_{name}"][: len(on_route)] = array[on_route]
+    file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
+
+
+def _lines(file: Source, name: str) -> Polylines:
+    xy, lengths = file.take(f"in.{name}", -1, 2), file.take(f"in.{name}_len", -1)
+    if lengths.sum() != len(xy):
+        raise DataError(f"array 'in.{name}_len' does not divide 'in.{name}' into lines")
+    return make_polylines(np.split(xy, np.cumsum(lengths)[:-1]))
+
+
+FILES = {
+    "args.json": _verify_args,
+    "sampler.json": _verify_sampler,
+    "state_dict.json": _verify_manifest,
+    "forward_*.npz": _verify_forward,
+    "closed_loop_*.npz": partial(
+        verify_loop, make=KeyedPlanner, compare=_compare, recorded=(*PLANS, "ego_prediction")
+    ),
+    "overflow_agents_*.npz": _verify_agents,
+    "overflow_lanes_*.npz": _verify_lanes,
+}

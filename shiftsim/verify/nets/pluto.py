@@ -1,97 +1,206 @@
-"""PLUTO with deterministic weights against the official code (planner-pluto.md §10)."""
+"""PLUTO: network, features, scores of the proposals, emergency brake and plans."""
 
-import dataclasses
-from pathlib import Path
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from shiftsim.planners.learned.features import SAMPLES
-from shiftsim.planners.learned.plan_states import STEP
+from shiftsim.planners.learned.map_features import CROSSWALK
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
-from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS
-from shiftsim.planners.proposals.tracker import STEPS
-from shiftsim.verify.array_file import ArrayFile
-from shiftsim.verify.nets.common import ERRORS, FILE_COLUMNS, STATE, Scenes, verify_state_dict
-from shiftsim.verify.nets.pluto_loops import verify_loop
-from shiftsim.verify.nets.pluto_network import NAME, verify_forward
-from shiftsim.verify.report import Report
-from shiftsim.world import state
+from shiftsim.planners.learned.pluto.inputs import stack
+from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS, Choice, Pluto, Sight
+from shiftsim.planners.learned.pluto.scoring import Place, Scores, aggregate, nearest_line, score
+from shiftsim.verify.files import Source
+from shiftsim.verify.nets.loops import (
+    FILE_COLUMNS,
+    HEADING,
+    PLANS,
+    POSITION,
+    STATE,
+    Loop,
+    verify_loop,
+)
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network
+from shiftsim.verify.nets.plantf import (
+    INPUTS,
+    compare_features,
+    compare_outputs,
+    derived_outputs,
+    run_network,
+    verify_forward,
+    verify_vector_manifest,
+)
+from shiftsim.verify.scenes import Scenes
+from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
+
+NAME = Pluto.name
+NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
+EXACT = 1e-8  # what follows from stored candidates and predictions alone
+MOTION = 1e-2  # m/s, m/s^2: derivatives of poses 0.1 s apart
+SCORE = 1e-4
+LINE = 1e-9  # m, rad: reference lines are made by the same operations
+SCORES = {  # stored array → field of `Scores`, tolerance where proposals are made from the log on
+    "rollout": ("driven", POSITION),
+    "progress": ("progress", POSITION),
+    "rule": ("rule", SCORE),
+    "weighted": ("terms", SCORE),
+    "multi": ("factors", 0.0),
+    "fault_t": ("fault_times", EXACT),
+    "footprints": ("flags", 0.0),
+    "speed_limit": ("speed_limits", 0.0),
+}
 
 
-def verify_pluto(folder: Path, report: Report, scenes: Scenes) -> None:
-    """Compare every file of the folder.
-
-    Args:
-        folder: With `state_dict.json` and npz files.
-        report: Filled with the comparisons.
-        scenes: The scenes that closed loops were recorded on.
-    """
-    for path in sorted(folder.iterdir()):
-        try:
-            if path.name == "state_dict.json":
-                _verify_manifest(path, report)
-            elif path.name.startswith("forward_") and path.suffix == ".npz":
-                verify_forward(ArrayFile(path, report))
-            elif path.name.startswith("closed_loop_") and path.suffix == ".npz":
-                verify_loop(path, report, scenes)
-            elif path.name == "emergency_brake.npz":
-                _verify_brake(ArrayFile(path, report))
-            else:
-                report.skip(f"{NAME}: file {path.name}")
-        except ERRORS as error:  # the official code got through, so this is a difference
-            report.fail(NAME, path.name, f"cannot be compared: {type(error).__name__} {error}")
-
-
-def _verify_manifest(path: Path, report: Report) -> None:
-    from shiftsim.planners.learned.pluto import network as pluto
-
-    network = pluto.build_network()
-    trained = sum(value.numel() for value in network.parameters())
-    everything = sum(value.numel() for value in network.state_dict().values())
-    heads = {
-        name: {"C": len(head.gain), **{k: list(v) for k, v in dataclasses.asdict(head).items()}}
-        for name, head in pluto.DRIVE_HEADS.items()
-    }
-    builder = {
-        "radius": RADIUS,
-        "history_horizon": (SAMPLES - 1) * STEP,
-        "future_horizon": STEPS * STEP,
-        "sample_interval": STEP,
-        "max_agents": MAX_AGENTS,
-        "build_reference_line": True,
-    }
-    verify_state_dict(
-        path,
-        report,
-        NAME,
-        {
-            "checkpoint": lambda given: {**given, "prefix": pluto.PREFIXES[0]},
-            "hyper_parameters": lambda given: pluto.RELEASED,
-            "feature_builder": lambda given: builder,
-            "total_elements": lambda given: everything,
-            "trainable_parameters": lambda given: trained,
-            "drive_overrides": lambda given: {
-                "meaning": given["meaning"],
-                "heads": heads,
-                "scale": pluto.DRIVE_SCALES,
-            },
-        },
-    )
-
-
-def _verify_brake(file: ArrayFile) -> None:
+def _verify_brake(file: Source, scenes: Scenes) -> None:
     """Unit cases of the emergency brake."""
-    ego, poses = file.take("ego", -1, state.NUM_STATE), file.take("candidate", -1, 81, 3)
-    times, speeds = file.take("fault_time", len(ego)), file.take("speed", len(ego))
-    braked, given = file["braked"], file.take("states", len(ego), 81, state.NUM_STATE)
-    file.columns("columns", FILE_COLUMNS)
-    for case in range(len(ego)):
-        speed = float(np.hypot(ego[case, state.VX], ego[case, state.VY]))
-        file.compare("speed", case, speed, speeds[case])
-        must = must_brake(speed, float(times[case]))
-        file.compare("braked", case, must, bool(braked[case]))
-        ours = np.full((81, state.NUM_STATE), np.nan)
-        if must:
-            ours = brake(poses[case], ego[case], float(times[case]), state.PACIFICA)
-        file.compare("states", case, ours, given[case], STATE)
-    file.finish()
+    egos, poses, times = file.take("ego", -1, NUM_STATE), file["candidate"], file["fault_time"]
+    speeds = np.hypot(egos[:, VX], egos[:, VY])
+    must = [must_brake(*pair) for pair in zip(speeds.tolist(), times.tolist(), strict=True)]
+    states = np.full((len(egos), 81, NUM_STATE), np.nan)
+    for case in np.flatnonzero(must).tolist():
+        states[case] = brake(poses[case], egos[case], float(times[case]), PACIFICA)
+    file.match("file", {"columns": list(FILE_COLUMNS)})
+    file.match_rows({"speed": speeds, "braked": must, "states": states}, {"speed": LINE, "": STATE})
+
+
+def _compare(loop: Loop) -> None:
+    """Compare everything stored of one iteration."""
+    sight, choice = loop.planner.sight, loop.planner.choice
+    if "agent_tokens" in loop.stored:  # one of the iterations stored in full
+        _compare_sight(loop, sight)
+        _compare_network(loop)
+    if choice is None:
+        loop.file.report.fail(f"{NAME} reference lines", loop.where, "none found")
+        return
+    _compare_choice(loop, choice)
+    if "agent_tokens" in loop.stored:
+        _compare_from_stored(loop, sight)
+    best = int(loop.recorded("best_index"))
+    if not _is_near_tie(loop, choice.best, best):
+        loop.compare("best proposal", choice.best, best)
+        loop.compare("emergency brake", choice.braked, bool(loop.recorded("emergency_brake")))
+        loop.compare_plan(MOTION)
+
+
+def _compare_sight(loop: Loop, sight: Sight) -> None:
+    inputs, road, near = loop.features._asdict(), loop.scenario.map, sight.road
+    blocks = [
+        0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
+        for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
+    ]
+    others = {
+        "current_state": inputs["current_state"],
+        "agent.category": inputs["category"],
+        "map.polygon_road_block_id": np.array(blocks, np.int64),
+        "reference_line.future_projection": np.zeros((len(sight.lines), 8, 2)),
+        **{INPUTS[name]: value for name, value in inputs.items() if name.startswith("line_")},
+    }
+    compare_features(loop, sight.agents, near, loop.planner.route.blocks, others)
+    stored = [name for name in loop.stored if name.startswith("reference_line_")]
+    loop.compare("reference lines", len(sight.lines), len(stored))
+    loop.match({f"reference_line_{i}": line for i, line in enumerate(sight.lines)}, LINE)
+    # the official code takes static objects out of a set: their order means nothing
+    theirs, pose = loop.stored.below("feature/static_objects."), inputs["object_pose"]
+    ours = {
+        "position": pose[:, :2],
+        "heading": pose[:, 2],
+        "shape": inputs["object_shape"],
+        "category": inputs["object_category"],
+        "valid_mask": inputs["object_valid"],
+    }
+    order, their_order = _by_place(pose[:, :2]), _by_place(theirs["position"])
+    for name, value in ours.items():
+        loop.compare(f"static_objects.{name}", value[order], theirs[name][their_order], FEATURE)
+
+
+def _by_place(positions: Any) -> Any:
+    """Order by place, to the centimetre."""
+    rounded = np.rint(np.asarray(positions, np.float64) * 100.0)
+    return np.lexsort((rounded[:, 1], rounded[:, 0]))
+
+
+def _compare_network(loop: Loop) -> None:
+    from shiftsim.planners.learned.pluto.network import Inputs
+
+    network, inputs = make_network(NAME, loop.variant), loop.features
+    raw = run_network(NAME, network, Inputs(*stack([inputs], "cpu")))
+    ours = {name: value[0] for name, value in raw.items()}
+    present = np.concatenate([inputs.position[1:, -1], inputs.heading[1:, -1:]], axis=1)
+    ours |= derived_outputs(ours, present)
+    del ours["trajectory"], ours["candidate_trajectories"]  # too large, not stored
+    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
+
+
+def _compare_choice(loop: Loop, choice: Choice) -> None:
+    """Compare proposals and scores that were made from the log on."""
+    stored, scores = loop.stored.below("post/"), choice.scores
+    ours = {
+        "cand": (choice.poses, POSITION),
+        "lscore": (choice.learned, SCORE),
+        "agents_pred": (choice.agents.poses, POSITION),
+        "agents_vel": (choice.agents.speeds, OUTPUT[loop.variant]),
+        **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
+    }
+    for name, (value, atol) in ours.items():
+        if name in stored:
+            loop.compare(name, value, stored[name], atol)
+            if name in ("cand", "rollout", "agents_pred"):
+                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], HEADING)
+    # what follows from the other stored scores
+    progress, rule = aggregate(stored["multi"], stored["weighted"], stored["progress"])
+    loop.compare("aggregated progress", progress, stored["weighted"][0], EXACT)
+    loop.compare("aggregated rule", rule, stored["rule"], EXACT)
+
+
+def _compare_from_stored(loop: Loop, sight: Sight) -> None:
+    """Compare what the scores of the stored proposals are, against the stored predictions."""
+    stored, scenario, ego = (
+        loop.stored.below("post/"),
+        loop.scenario,
+        loop.seen.history.ego[-1],
+    )
+    tokens = [scenario.tracks.tokens[track] for track in sight.agents.tracks.tolist()]
+    line = nearest_line(sight.lines, ego)
+    ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
+    stored.match(loop.where, ours, EXACT, quantity=NAME)
+    agents = loop.planner.choice.agents._replace(
+        poses=stored["agents_pred"], speeds=stored["agents_vel"]
+    )
+    world = loop.planner.world_of(loop.seen, agents)
+    place = Place(sight.drivable, scenario.map.edges.polygons, line)
+    proposals = np.ascontiguousarray(stored["cand"])
+    scores: Scores = score(proposals, stored["lscore"], ego, world, place, PACIFICA)
+    ours = {name: getattr(scores, field) for name, (field, _) in SCORES.items()}
+    stored.match(loop.where, ours, EXACT, quantity=f"{NAME} stored proposals'")
+
+
+def _is_near_tie(loop: Loop, ours: int, theirs: int) -> bool:
+    """Whether another proposal was chosen in a near-tie, which is listed."""
+    stored = loop.stored.below("post/")
+    total = stored["rule"] + 0.3 * stored["lscore"]
+    first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
+    if ours == theirs or first - second > NEAR_TIE:
+        return False
+    what = f"proposal {ours} instead of {theirs}, scores {first:.6f} and {second:.6f}"
+    loop.file.report.note(f"{NAME} {loop.where}: near-tie, {what}")
+    return True
+
+
+FILES = {
+    "state_dict.json": partial(
+        verify_vector_manifest,
+        planner=NAME,
+        radius=RADIUS,
+        max_agents=MAX_AGENTS,
+        build_reference_line=True,
+    ),
+    # the official code masks the agents of a batch in the wrong order
+    "forward_*.npz": partial(verify_forward, planner=NAME, radius=RADIUS, misordered_masks=True),
+    "closed_loop_*.npz": partial(
+        verify_loop,
+        make=Pluto,
+        compare=_compare,
+        recorded=(*PLANS, "best_index", "emergency_brake"),
+    ),
+    "emergency_brake.npz": _verify_brake,
+}

@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-from shiftsim.errors import DataError, ShiftsimError
-from shiftsim.verify.idm_calls import verify_idm_calls
-from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.files import verify_files
+from shiftsim.verify.pdm.idm_calls import verify_idm_calls
 from shiftsim.verify.pdm.kernels import verify_kernels
 from shiftsim.verify.pdm.loops import verify_loops
 from shiftsim.verify.pdm.routes import verify_routes
 from shiftsim.verify.report import Report
-from shiftsim.world.scenario import Scenario
-
-_ERRORS = (ShiftsimError, OSError, KeyError, ValueError, TypeError, IndexError, AttributeError)
+from shiftsim.verify.scenes import Scenes
 
 
 def verify_pdm(
@@ -25,32 +22,17 @@ def verify_pdm(
         mode: Only closed loops of this challenge (`NR` or `R`).
         scenes: Folder with the logs and maps, by default `nuplan` beside `folder`.
     """
-    source = scenes or folder.resolve().parent / "nuplan"
-    known = load_scenes(source) if source.is_dir() else {}
-    for path in sorted(folder.iterdir()):
-        if path.name == "README.md":
-            report.note("README.md: description of the folder")
-        elif path.name == "kernels" and path.is_dir():
-            verify_kernels(path, report)
-        elif path.name not in ("routes.json", "idm_calls.json", "loop"):
-            report.skip(f"file {path.name}")
-        elif not known:
+    known = Scenes(scenes or folder.resolve().parent / "nuplan")
+
+    def with_scenes(path: Path) -> None:
+        if not known:
             report.skip(f"{path.name}: the logs and maps of the scenes are not at hand")
-        else:
-            _verify_with_scenes(path, report, known, source, mode)
-
-
-def _verify_with_scenes(
-    path: Path, report: Report, scenes: dict[str, Scenario], source: Path, mode: str | None
-) -> None:
-    try:
-        if path.name == "routes.json":
-            verify_routes(path, report, scenes)
+        elif path.name == "routes.json":
+            verify_routes(path, report, known)
         elif path.name == "idm_calls.json":
-            verify_idm_calls(path.parent, report, scenes)
-        elif path.is_dir():
-            verify_loops(path, report, scenes, source, mode)
+            verify_idm_calls(path, report, known)
         else:
-            raise DataError("it is no folder")
-    except _ERRORS as error:
-        report.fail(path.name, path.name, f"cannot be compared: {type(error).__name__} {error}")
+            verify_loops(path, report, known, mode)
+
+    parts = dict.fromkeys(("routes.json", "idm_calls.json", "loop"), with_scenes)
+    verify_files(folder, report, {"kernels": lambda path: verify_kernels(path, report), **parts})

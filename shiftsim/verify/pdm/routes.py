@@ -1,11 +1,11 @@
 """Route correction, current lane and centerline of PDM-Closed (`routes.json`)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import ShiftsimError
 from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.route import (
@@ -18,22 +18,13 @@ from shiftsim.planners.pdm.route import (
 )
 from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.contacts import ego_box
-from shiftsim.verify.nuplan.reading import read_json
+from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, PACIFICA, center_poses
 
-TOLERANCE = 1e-9
-_INPUTS = {"scene", "route", "rear_axle"}
-_LABELS = {"route_name", "pose_name"}
-_OUTPUTS = (
-    *("start_block", "start_candidates", "corrected", "route_lanes", "intersecting_lanes"),
-    *("heading_errors", "current_lane", "n_centerline", "centerline_first", "centerline_last"),
-    "centerline_length",
-)
 
-
-def verify_routes(path: Path, report: Report, scenes: dict[str, Scenario]) -> None:
+def verify_routes(path: Path, report: Report, scenes: Mapping[str, Scenario]) -> None:
     """Correct every route again and compare.
 
     Args:
@@ -41,30 +32,22 @@ def verify_routes(path: Path, report: Report, scenes: dict[str, Scenario]) -> No
         report: Receives the comparisons.
         scenes: The scenarios by scene name; cases of other scenes are named as not covered.
     """
-    report.note("routes.json: route_name, pose_name (labels)")
-    for number, case in enumerate(read_json(path)):
-        where = f"routes.json {number} ({case.get('scene')} {case.get('route_name')})"
-        for extra in sorted(set(case) - _INPUTS - _LABELS - set(_OUTPUTS) - {"error"}):
-            report.skip(f"routes.json: field {extra!r}")
+    for number, content in enumerate(read_json(path)):
+        case = Source("routes.json", "field", content, report)
+        case.note("label", "route_name", "pose_name")
+        where = f"routes.json {number} ({case['scene']} {content.get('route_name')})"
         if case["scene"] not in scenes:
             report.skip(f"routes of scene {case['scene']}, which is not at hand")
-            continue
-        if "error" in case:
+        elif "error" in case:
             report.note(f"{where}: the official code fails on it")
-            continue
-        try:
-            ours = _solve(case, scenes[case["scene"]])
-        except ShiftsimError as error:
-            report.fail("PDM route", where, str(error))
-            continue
-        for name in _OUTPUTS:
-            if name not in case:
-                report.fail(f"PDM {name}", where, f"no field {name!r}")
-                continue
-            report.compare(f"PDM {name}", where, ours[name], case[name], atol=TOLERANCE)
+        else:
+            with report.attempt("PDM route", where):
+                ours = _solve(case, scenes[case["scene"]])
+                case.match(where, ours, TOLERANCE, quantity="PDM")
+            case.finish()
 
 
-def _solve(case: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
+def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
     road = scenario.map
     ego = np.zeros(NUM_STATE)
     ego[:3] = case["rear_axle"]

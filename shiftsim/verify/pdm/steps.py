@@ -1,12 +1,11 @@
-"""Complete planning steps of PDM-Closed with their inputs (`step_NNN.json` and `.npz`)."""
+"""Planning steps of PDM-Closed: those recorded with all their inputs, and how any is compared."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
-from shiftsim.errors import DataError
+from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.forecast import (
@@ -19,96 +18,106 @@ from shiftsim.planners.pdm.forecast import (
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.rollout import Scene
 from shiftsim.planners.pdm.route import offset_poses
-from shiftsim.planners.pdm.scorer import Place
+from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
 from shiftsim.planners.pdm.step import Step, plan_step
 from shiftsim.planners.proposals.areas import areas_of
-from shiftsim.planners.proposals.contacts import ego_box
-from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
-from shiftsim.verify.array_file import ArrayFile
-from shiftsim.verify.nuplan.reading import read_json
-from shiftsim.verify.pdm.scores import Recorded, compare_scores
+from shiftsim.planners.proposals.contacts import Others, ego_box, touches_boxes
+from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
+from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, read_fields
 from shiftsim.verify.report import Report
+from shiftsim.verify.worlds import make_tracks
 from shiftsim.world.layers import make_polygons
-from shiftsim.world.state import PACIFICA, AgentKind, Tracks, center_poses
+from shiftsim.world.state import HEADING, PACIFICA, VX, VY, X, Y, center_poses
 
-TOLERANCE = 1e-6  # m, rad, m/s …, of the issue; coordinates near 5e6 are spaced 1e-9
+STEP_TOLERANCE = 1e-6  # m, rad, m/s …; coordinates near 5e6 are spaced 1e-9
 SHOWN_FORECASTS = (0, 11, 40)  # time indices of `map_boxes`
-_INPUTS = {
-    *("ego_state", "ego_time_us", "speed_limit_mps", "objects", "drivable"),
-    *("red_light_lane_ids", "intersections", "centerline"),
+UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
+SCORE_COLUMNS = {  # column of the reference: field of `Scores`, tolerance
+    "score": ("total", TOLERANCE),
+    "no_collision": ("no_collision", EXACT),
+    "drivable_area": ("drivable", EXACT),
+    "driving_direction": ("direction", EXACT),
+    "progress": ("progress", TOLERANCE),
+    "ttc": ("ttc", EXACT),
+    "comfort": ("comfort", EXACT),
+    "progress_raw": ("raw_progress", STEP_TOLERANCE),  # m
+    "collision_idx": ("collision_index", EXACT),
+    "ttc_idx": ("ttc_index", EXACT),
 }
-_OBJECT = {"token", "type", "x", "y", "heading", "length", "width", "vx", "vy"}
-_AREA = {"id", "on_route", "exterior"}
+_OBJECT = ("x", "y", "heading", "vx", "vy", "length", "width")
 
 
 class Planned(NamedTuple):
-    """One step that was planned again: what it saw, and what it came to."""
+    """One step that was planned: from which ego state, what it saw, and what it came to."""
 
+    ego: FloatArray
     tokens: list[str]
     forecast: Forecast
-    collided: list[str]
-    step: Step
     place: Place
+    step: Step
 
 
-def verify_step(path: Path, report: Report) -> dict[str, Any]:
+def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
     """Plan one recorded step again and compare everything.
 
     Args:
-        path: The `.npz`; its inputs are in the `.json` beside it.
         report: Receives the comparisons.
-
-    Returns:
-        The facts of this step that `step_core_summary.json` lists.
+        facts: Takes what `step_core_summary.json` lists of the steps, by name of the step.
+        path: The `.npz`; its inputs are in the `.json` beside it.
     """
-    inputs = read_json(path.with_suffix(".json"))
-    _name_unknown(inputs, report)
-    planned = _plan(inputs)
-    ego = np.array(inputs["ego_state"], np.float64)
-    file = ArrayFile(path, report)
-    _compare(file, report, path.stem, ego, int(inputs["ego_time_us"]), planned)
+    inputs = read_fields(path.with_suffix(".json"), report, "step_NNN.json")
+    file, where = read_arrays(path, report, "PDM"), path.stem
+    planned, collided = _plan(inputs)
+    boxes = planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
+    times = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
+    ours = {
+        "map_tokens": planned.tokens,
+        "collided_ids": collided,
+        "map_boxes": boxes,
+        "trajectory_time_us": times,
+        **step_arrays(planned),
+    }
+    file.match(where, ours, STEP_TOLERANCE)
+    names = ("no_collision", "drivable_area", "driving_direction", "progress", "ttc", "comfort")
+    rows = np.concatenate([file.take("multi", 3, -1), file.take("weighted", 3, -1)])
+    columns = dict(zip(names, rows, strict=True))
+    columns |= {name: file[name] for name in ("progress_raw", "collision_idx", "ttc_idx")}
+    theirs = Source("PDM", "score", {**columns, "score": file["scores"]}, report)
+    if compare_scores(where, planned, theirs, (int(file["best"]), bool(file["braked"]))):
+        file.match(where, {"trajectory_rear": planned.step.poses}, STEP_TOLERANCE)
+    file.note("compared where the same proposal is chosen", "trajectory_rear")
+    inputs.finish()
     file.finish()
     scores = planned.step.scores
-    return {
+    facts[where] = {
         "best": planned.step.best,
         "braked": planned.step.braked,
         "best_score": float(scores.total.max()),
         "n_objects": len(inputs["objects"]),
         "red": len(inputs["red_light_lane_ids"]),
-        "collided": len(planned.collided),
+        "collided": len(collided),
         "zero_scores": int((scores.total == 0.0).sum()),
         "at_fault": int(np.isfinite(scores.collision_index).sum()),
         "ttc": int(np.isfinite(scores.ttc_index).sum()),
     }
 
 
-def _name_unknown(inputs: dict[str, Any], report: Report) -> None:
-    for extra in sorted(set(inputs) - _INPUTS):
-        report.skip(f"step_NNN.json: field {extra!r}")
-    for field, known in (("objects", _OBJECT), ("drivable", _AREA)):
-        for extra in sorted({name for item in inputs[field] for name in item} - known):
-            report.skip(f"step_NNN.json: field {extra!r} of {field}")
-
-
-def _plan(inputs: dict[str, Any]) -> Planned:
+def _plan(inputs: Source) -> tuple[Planned, list[str]]:
     ego = np.array(inputs["ego_state"], np.float64)
-    tracks = _tracks(inputs["objects"])
+    things, parts = inputs.each("objects"), inputs.each("drivable")
+    values = np.array([[thing[name] for name in _OBJECT] for thing in things], np.float64)
+    kinds, names = ([thing[name] for thing in things] for name in ("type", "token"))
+    whole = (slice(None),)
+    tracks = make_tracks((1, len(things)), whole, values.reshape(1, -1, 7), kinds, names)
     center = center_poses(ego[None, :3])[0]
     chosen = select_tracks(tracks, center[0], center[1], set(), DEFAULT)
-    ids = [area["id"] for area in inputs["drivable"]]
-    rings = [np.array(area["exterior"], np.float64) for area in inputs["drivable"]]
-    polygons = make_polygons([[ring] for ring in rings])
-    areas = areas_of(
-        polygons,
-        np.array([area["on_route"] for area in inputs["drivable"]], np.bool_),
-        np.arange(len(ids)),
-    )
-    lights = [_open(rings[ids.index(name)]) for name in inputs["red_light_lane_ids"]]
-    forecast = make_forecast(tracks, chosen, lights)
-    tokens = [tracks.tokens[i] for i in chosen.tolist()]
-    tokens += [LIGHT_TOKEN + name for name in inputs["red_light_lane_ids"]]
-    footprint = boxes_to_corners(center, np.array([PACIFICA.length, PACIFICA.width]))
-    hit = touched(forecast, footprint)
+    ids, reds = [part["id"] for part in parts], inputs["red_light_lane_ids"]
+    rings = [np.array(part["exterior"], np.float64) for part in parts]
+    on_route = np.array([part["on_route"] for part in parts], np.bool_)
+    areas = areas_of(make_polygons([[ring] for ring in rings]), on_route, np.arange(len(ids)))
+    forecast = make_forecast(tracks, chosen, [_open(rings[ids.index(name)]) for name in reds])
+    tokens = [*(tracks.tokens[i] for i in chosen.tolist()), *(LIGHT_TOKEN + name for name in reds)]
+    hit = touched(forecast, boxes_to_corners(center, np.array([PACIFICA.length, PACIFICA.width])))
     forecast.ignored[hit] = True
     line = np.array(inputs["centerline"], np.float64)
     paths = [make_path(line), *(make_path(offset_poses(line, s)) for s in DEFAULT.lateral_offsets)]
@@ -119,92 +128,113 @@ def _plan(inputs: dict[str, Any]) -> Planned:
     targets = limit * np.array(DEFAULT.speed_fractions)
     scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
     step = plan_step(ego, targets, scene, place, PACIFICA, DEFAULT)
-    return Planned(tokens, forecast, [tokens[i] for i in hit], step, place)
+    return Planned(ego, tokens, forecast, place, step), [tokens[i] for i in hit]
 
 
 def _open(ring: FloatArray) -> FloatArray:
     return ring[:-1] if (ring[0] == ring[-1]).all() else ring
 
 
-def _tracks(objects: list[dict[str, Any]]) -> Tracks:
-    def table(*names: str) -> FloatArray:
-        rows = [[item[name] for name in names] for item in objects]
-        return np.array(rows, np.float64).reshape(1, len(objects), len(names))
-
-    for item in objects:
-        if item["type"].upper() not in AgentKind.__members__:
-            raise DataError(f"object {item['token']!r} has the unknown type {item['type']!r}")
-    return Tracks(
-        np.ones((1, len(objects)), np.bool_),
-        table("x", "y", "heading"),
-        table("vx", "vy"),
-        table("length", "width"),
-        np.array([AgentKind[item["type"].upper()] for item in objects], np.int64),
-        tuple(item["token"] for item in objects),
-    )
-
-
-def _compare(
-    file: ArrayFile, report: Report, where: str, ego: FloatArray, time_us: int, planned: Planned
-) -> None:
-    step, forecast = planned.step, planned.forecast
-    report.compare("PDM map tokens", where, planned.tokens, file["map_tokens"].tolist())
-    report.compare("PDM collided", where, planned.collided, file["collided_ids"].tolist())
-    boxes = forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
-    report.compare("PDM map boxes", where, boxes, file["map_boxes"], atol=TOLERANCE)
-    compare_arrays(report, where, step, {name: file[name] for name in STEP_ARRAYS})
-    multi, weighted = file.take("multi", 3, -1), file.take("weighted", 3, -1)
-    theirs = Recorded(
-        total=file["scores"],
-        no_collision=multi[0],
-        drivable=multi[1],
-        direction=multi[2],
-        progress=weighted[0],
-        ttc=weighted[1],
-        comfort=weighted[2],
-        raw_progress=file["progress_raw"],
-        collision_index=file["collision_idx"],
-        ttc_index=file["ttc_idx"],
-    )
-    choice = (int(file["best"]), bool(file["braked"]))
-    if compare_scores(report, where, ego, step, (forecast, planned.place), theirs, choice):
-        plan = file["trajectory_rear"]
-        report.compare("PDM plan", where, step.poses, plan, atol=TOLERANCE)
-    times = time_us + STEP_US * np.arange(STEPS + 1)
-    report.compare("PDM plan time", where, times, file["trajectory_time_us"])
-
-
-STEP_ARRAYS = ("proposal_poses", "idm", "lead", "simulated", "ego_areas")
-
-
-def compare_arrays(report: Report, where: str, step: Step, theirs: dict[str, np.ndarray]) -> None:
-    """Compare proposals, leads, driven states and areas of one step with arrays by name."""
-    made, scored = step.proposals, slice(0, SCORED + 1)
-    count = len(step.driven.states)
+def step_arrays(planned: Planned) -> dict[str, np.ndarray]:
+    """Proposals, leads, driven states and areas of a step by the names of the reference."""
+    step, made, scored = planned.step, planned.step.proposals, slice(0, SCORED + 1)
+    shape = step.driven.states.shape[:2]
     # the best proposal goes on to 8 s; what is recorded ends where proposals are compared
-    ours = {
-        "proposal_poses": made.poses[:, :, scored].reshape(count, SCORED + 1, 3),
-        "idm": made.motion[:, :, scored].reshape(count, SCORED + 1, 2),
-        "lead": made.leads[:, :, scored].reshape(count, SCORED + 1, 3),
+    return {
+        "proposal_poses": made.poses[:, :, scored].reshape(*shape, 3),
+        "idm": made.motion[:, :, scored].reshape(*shape, 2),
+        "lead": made.leads[:, :, scored].reshape(*shape, 3),
         "simulated": step.driven.states,
         "ego_areas": step.scores.flags,
     }
-    for name, array in theirs.items():
-        report.compare(f"PDM {name}", where, ours[name], array, atol=TOLERANCE)
 
 
-def verify_summary(path: Path, report: Report, steps: dict[str, dict[str, Any]]) -> None:
-    """Compare `step_core_summary.json` with what the steps came to."""
-    for entry in read_json(path):
-        name = entry.get("case", "?")
-        if name not in steps:
-            report.fail("PDM step summary", name, "this step is missing or cannot be compared")
+def compare_scores(where: str, planned: Planned, theirs: Source, choice: tuple[int, bool]) -> bool:
+    """Compare sub-scores, scores, choice and brake decision of one step.
+
+    Args:
+        where: Which step.
+        planned: Ours.
+        theirs: The recorded scores, named as in `SCORE_COLUMNS`.
+        choice: Number of the recorded best proposal, and whether the emergency brake came instead.
+
+    Returns:
+        Whether both chose the same plan, so that plans can be compared.
+    """
+    ours, report = _settled(where, planned, theirs), theirs.report
+    values = {column: getattr(ours, field) for column, (field, _) in SCORE_COLUMNS.items()}
+    tolerances = {column: atol for column, (_, atol) in SCORE_COLUMNS.items()}
+    theirs.match(where, values, tolerances, quantity="PDM")
+    best = int(np.argmax(ours.total))
+    report.compare("PDM choice", where, best, choice[0])
+    is_slow = np.hypot(planned.ego[VX], planned.ego[VY]) <= DEFAULT.brake_speed
+    braked = bool(is_slow and DT * ours.collision_index[best] <= DEFAULT.brake_time)
+    report.compare("PDM brake", where, braked, choice[1])
+    return (planned.step.best, planned.step.braked) == choice
+
+
+def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
+    """Our scores, with those times to collision of theirs that hang on an unstable bearing.
+
+    The bearing is an arccos of a number that may round beyond 1 where an object is exactly ahead or
+    behind; then it is overlooked. Differences that this explains are named.
+    """
+    ours, given, index = planned.step.scores, theirs["ttc"], theirs["ttc_idx"]
+    exempt = np.zeros(len(given), np.bool_)
+    for row in np.flatnonzero((ours.ttc != given) | (ours.ttc_index != index)).tolist():
+        states, others = planned.step.driven.states, planned.forecast.others
+        first = _unstable(states[row], others)
+        if not first:
             continue
-        for field, value in entry.items():
-            if field == "case":
-                continue
-            if field not in steps[name]:
-                report.skip(f"{path.name}: field {field!r}")
-                continue
-            ours = steps[name][field]
-            report.compare(f"PDM summary {field}", name, ours, value, atol=1e-9)
+        ignored: BoolArray = others.ignored.copy()
+        ignored[list(first)] = True
+        blind = others._replace(ignored=ignored)
+        rest = score(states, planned.place, blind, ego_box(PACIFICA), DEFAULT)
+        is_hit = np.isfinite(index[row])
+        if index[row] in {rest.ttc_index[row], *first.values()} and is_hit == (given[row] < 1.0):
+            exempt[row] = True
+            note = "an object exactly ahead or behind"
+            theirs.report.note(f"PDM ttc at {where}, proposal {row}: {note}")
+    ttc = np.where(exempt, given, ours.ttc)
+    factor = ours.no_collision * ours.drivable * ours.direction
+    return ours._replace(
+        ttc=ttc,
+        ttc_index=np.where(exempt, index, ours.ttc_index),
+        total=factor * weigh(ours.progress, ttc, ours.comfort, DEFAULT),
+    )
+
+
+def _unstable(driven: FloatArray, others: Others) -> dict[int, float]:
+    """Boxes exactly ahead or behind when the projected ego first touches them.
+
+    Returns:
+        Time index of the touch by box.
+    """
+    seen = others.ignored.copy()
+    size = np.array([PACIFICA.length, PACIFICA.width])
+    corners = boxes_to_corners(center_poses(driven[:, :3]), size)
+    out: dict[int, float] = {}
+    for index, row in enumerate(driven):
+        cos, sin = np.cos(row[HEADING]), np.sin(row[HEADING])
+        travel = DT * np.hypot(row[VX], row[VY]) * np.array([cos, sin])
+        for later in TTC_STEPS:
+            forecast = (index + later) // 2
+            box = corners[index] + later * travel
+            for hit in np.flatnonzero(touches_boxes(box, others.boxes[forecast]) & ~seen):
+                seen[hit] = True
+                dx, dy = others.centers[forecast, hit] - row[[X, Y]]
+                turn = np.arctan2(abs(cos * dy - sin * dx), abs(cos * dx + sin * dy))
+                if turn < UNSTABLE_BEARING:
+                    out[int(hit)] = float(index)
+    return out
+
+
+def verify_summary(report: Report, facts: dict[str, dict[str, Any]], entries: Any) -> None:
+    """Compare the entries of `step_core_summary.json` with what the steps came to."""
+    for entry in entries:
+        name = entry.get("case", "?")
+        theirs = Source("step_core_summary.json", "field", entry, report)
+        theirs.note("label", "case")
+        with report.attempt("PDM step summary", name):
+            theirs.match(name, facts[name], TOLERANCE, quantity="PDM summary")
+            theirs.finish()

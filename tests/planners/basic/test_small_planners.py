@@ -7,7 +7,7 @@ from worlds import cruise_scenario
 from shiftsim.errors import ConfigError, DataError, PlannerError
 from shiftsim.planners.contract import check_planner, frozen_inputs
 from shiftsim.planners.registry import load_planner
-from shiftsim.verify.observing import observe, scene_info
+from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.state import AX, VX, VY, Command
 
 T0 = 1_600_000_000_000_000 + 60 * 50_000  # iteration 0 of the toy scenario [us]
@@ -17,7 +17,7 @@ def plan_at(name, scenario, iteration=0, ego=None, arguments=None):
     planner = load_planner(name, arguments)
     planner.reset(scene_info(scenario))
     state = scenario.expert[iteration] if ego is None else ego
-    return planner.plan(observe(scenario, iteration, state))
+    return planner.plan(observe_log(scenario, iteration, ego=state, samples=1))
 
 
 def test_constant_velocity_is_20_m_further_after_two_seconds_at_10_m_per_s():
@@ -43,12 +43,14 @@ def test_log_future_repeats_its_last_plan_where_the_recording_ends():
     scenario = cruise_scenario(iterations=11, future_rows=4)
     planner = load_planner("log-future")
     planner.reset(scene_info(scenario))
-    last = [planner.plan(observe(scenario, i, scenario.expert[i])) for i in range(10)]
+    last = [
+        planner.plan(observe_log(scenario, i, ego=scenario.expert[i], samples=1)) for i in range(10)
+    ]
     assert len(last[7].time_us) == 2  # iteration 7 is row 74, the last row is 84
     assert last[9] is last[7]
     planner.reset(scene_info(scenario))
     with pytest.raises(PlannerError, match=r"no recorded state 0\.5 s after iteration 9"):
-        planner.plan(observe(scenario, 9, scenario.expert[9]))
+        planner.plan(observe_log(scenario, 9, ego=scenario.expert[9], samples=1))
 
 
 def test_simple_keeps_a_speed_below_its_limit():

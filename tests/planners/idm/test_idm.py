@@ -15,7 +15,7 @@ from shiftsim.geometry.corridors import CLEAR, HIT, OPEN
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, find_lead, find_sides
 from shiftsim.planners.idm.planner import Idm
 from shiftsim.planners.routes.search import search_levels
-from shiftsim.verify.observing import observe, scene_info
+from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.layers import make_lists
 from shiftsim.world.state import VX, AgentKind, TrafficLights
 
@@ -31,7 +31,7 @@ def started(scenario) -> Idm:
 def roll_out(scenario, ego=None):
     planner = started(scenario)
     state = scenario.expert[0] if ego is None else ego
-    return planner.roll_out(observe(scenario, 0, state))
+    return planner.roll_out(observe_log(scenario, 0, ego=state, samples=1))
 
 
 def with_objects(*poses, kind=AgentKind.VEHICLE, **options):
@@ -53,7 +53,7 @@ def test_a_slow_ego_on_a_free_road_follows_the_formula():
 def test_the_path_keeps_to_the_lane_it_starts_in_and_loses_its_last_vertex():
     scenario = cruise_scenario(start=(10.0, 3.5, 0.0))
     planner = started(scenario)
-    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert [scenario.map.edges.ids[e] for e in planner.route_plan.path] == ["10", "20", "30"]
     assert planner.route_plan.found
     assert planner.path.end == 419.0
@@ -105,7 +105,7 @@ def test_the_target_is_the_limit_or_the_default_but_never_below_the_start_speed(
     for limit, speed, target in ((15.0, 8.0, 15.0), (None, 8.0, 10.0), (5.0, 8.0, 8.0)):
         scenario = cruise_scenario(speed=speed, road=straight_road(limit))
         planner = started(scenario)
-        planner.plan(observe(scenario, 0, scenario.expert[0]))
+        planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
         assert planner.target_velocity == target
 
 
@@ -116,14 +116,16 @@ def test_a_reset_forgets_the_path_and_the_target_of_the_scenario_before():
     plans = []
     for scenario in (other, fast, other):
         planner.reset(scene_info(scenario))
-        plans.append(planner.plan(observe(scenario, 0, scenario.expert[0])).states)
+        plans.append(
+            planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1)).states
+        )
     np.testing.assert_array_equal(plans[0], plans[2])
 
 
 def test_a_start_outside_the_route_takes_the_nearest_lane():
     scenario = cruise_scenario(start=(-20.0, -6.0, 0.0))
     planner = started(scenario)
-    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert scenario.map.edges.ids[planner.route_plan.path[0]] == "11"
 
 
@@ -131,7 +133,7 @@ def test_a_start_outside_the_route_takes_the_nearest_lane():
 def test_a_route_that_cannot_be_driven_block_by_block_falls_back(route):
     scenario = replace(cruise_scenario(), route=route)
     planner = started(scenario)
-    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert not planner.route_plan.found
 
 
@@ -152,7 +154,7 @@ def test_a_route_nuplan_would_fail_on_is_refused(route, message):
 def test_an_unknown_block_in_the_middle_of_a_route_is_passed_over():
     scenario = replace(cruise_scenario(), route=("1", "2", "x", "3"))
     planner = started(scenario)
-    planner.plan(observe(scenario, 0, scenario.expert[0]))
+    planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert not planner.route_plan.found  # the depth does not fit any more
 
 

@@ -12,7 +12,7 @@ from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.planners.learned.carl import view as carl_view
 from shiftsim.planners.learned.carl.planner import Carl, command_of
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
-from shiftsim.verify.observing import observe, scene_info
+from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.state import AgentKind, Command, LightStatus, TrafficLights
 
 pytest.importorskip("torch")
@@ -34,7 +34,7 @@ def planner():
 def look(planner, scenario, lights=None, ego=None):
     """The picture of the first iteration, and the measurements."""
     planner.reset(scene_info(scenario))
-    seen = observe(scenario, 0, scenario.expert[0] if ego is None else ego)
+    seen = observe_log(scenario, 0, ego=scenario.expert[0] if ego is None else ego, samples=1)
     seen = seen if lights is None else replace(seen, lights=lights)
     features = planner.features(seen)
     return features.pictures.copy(), features.measurements, seen
@@ -118,7 +118,7 @@ def test_lights_are_drawn_on_their_connector(planner, status, value):
 
 def test_a_light_of_unknown_status_is_not_drawn_and_the_step_counts_as_degraded(planner):
     near, far = cruise_scenario(start=(180.0, 0.0, 0.0)), cruise_scenario()
-    for scenario, text in ((near, "a light in the picture has an unknown status"), (far, "")):
+    for scenario, text in ((near, "a light in the raster has an unknown status"), (far, "")):
         picture, _, seen = look(planner, scenario, lights_of(c20=LightStatus.UNKNOWN))
         assert not picture[carl_view.LIGHTS].any()
         planner.plan(seen)
@@ -153,7 +153,7 @@ def test_off_the_map_the_planner_goes_on_and_says_so(planner):
     assert not picture[: carl_view.VEHICLES].any()
     command = planner.plan(seen)
     assert np.isfinite([command.acceleration, command.steering_rate]).all()
-    assert planner.degraded == "no road within the picture"
+    assert planner.degraded == "no road within the raster"
 
 
 def test_the_ego_is_measured_at_its_centre_after_the_last_action(planner):
@@ -230,7 +230,9 @@ def test_nothing_is_left_over_from_another_scenario(planner):
 
 def test_a_plan_before_a_scenario_is_an_error():
     with pytest.raises(PlannerError, match="before reset"):
-        Carl("deterministic:base").plan(observe(cruise_scenario(), 0, np.zeros(11)))
+        Carl("deterministic:base").plan(
+            observe_log(cruise_scenario(), 0, ego=np.zeros(11), samples=1)
+        )
 
 
 def some_scenes(rng, count):
@@ -256,7 +258,7 @@ def test_actions_of_a_batch_are_those_of_its_scenes(planner, rng):
     for scene in some_scenes(rng, 9):
         fork = planner.fork()
         fork.reset(scene_info(scene))
-        features.append(fork.features(observe(scene, 0, scene.expert[0])))
+        features.append(fork.features(observe_log(scene, 0, ego=scene.expert[0], samples=1)))
     together = planner.infer(features)
     for one, action in zip(features, together, strict=True):
         np.testing.assert_allclose(action, planner.infer([one])[0], atol=2e-5)
@@ -276,7 +278,9 @@ def test_an_ensemble_does_the_mean_of_its_members(tmp_path):
     actions = []
     for planner in (*members, Carl(",".join(paths)), Carl(str(tmp_path))):
         planner.reset(scene_info(scenario))
-        actions += planner.infer([planner.features(observe(scenario, 0, scenario.expert[0]))])
+        actions += planner.infer(
+            [planner.features(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))]
+        )
     np.testing.assert_allclose(actions[2], (actions[0] + actions[1]) / 2, atol=1e-6)
     np.testing.assert_array_equal(actions[2], actions[3])
 

@@ -11,8 +11,8 @@ import pytest
 
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import read_scenario
-from shiftsim.verify.idm_calls import verify_idm_calls
-from shiftsim.verify.nuplan.planners import verify_planners
+from shiftsim.verify.nuplan.runs import verify_planners
+from shiftsim.verify.pdm.idm_calls import verify_idm_calls
 from shiftsim.verify.report import Report
 
 GOLDEN = places.GOLDEN / "planners"
@@ -35,7 +35,7 @@ def scenes(nuplan_reference):
 
 def test_every_recorded_plan_comes_out_again(nuplan_reference, scenes):
     report = Report()
-    verify_planners(nuplan_reference, report, scenes)
+    verify_planners(nuplan_reference / "expected", report, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.quantities["idm plan x"].cases == 224
@@ -45,7 +45,7 @@ def test_every_recorded_plan_comes_out_again(nuplan_reference, scenes):
 
 def test_every_recorded_call_of_the_idm_planner_comes_out_again(scenes):
     report = Report()
-    verify_idm_calls(GOLDEN, report, scenes)
+    verify_idm_calls(GOLDEN / "idm_calls.json", report, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.quantities["IDM plan"].cases == 54
@@ -66,7 +66,7 @@ def falsified(nuplan_reference, tmp_path):
         values[row] = change(values[row])
         index = content.column_names.index(column)
         pq.write_table(content.set_column(index, column, pa.array(values)), path)
-        return tmp_path
+        return tmp_path / "expected"
 
     return make
 
@@ -93,13 +93,13 @@ def test_a_changed_plan_is_noticed(falsified, scenes, column, row, change):
 
 def test_an_additional_column_is_named(falsified, nuplan_reference, scenes):
     folder = falsified("trajectories", "x", 0, lambda v: v)
-    path = folder / "expected" / "trajectories.parquet"
+    path = folder / "trajectories.parquet"
     content = pq.read_table(path)
     pq.write_table(content.append_column("z", pa.array(np.zeros(len(content)))), path)
     report = Report()
     verify_planners(folder, report, scenes, "PT")
     verify_planners(folder, report, scenes, "NR")
-    assert report.not_covered == {"trajectories.parquet: column z": 25}
+    assert list(report.not_covered) == ["trajectories: column 'z'"]
 
 
 @pytest.mark.parametrize(
@@ -129,5 +129,5 @@ def test_a_changed_call_is_noticed(tmp_path, scenes, change):
     change(calls[1])
     (tmp_path / "idm_calls.json").write_text(json.dumps(calls))
     report = Report()
-    verify_idm_calls(tmp_path, report, scenes)
+    verify_idm_calls(tmp_path / "idm_calls.json", report, scenes)
     assert report.mismatches

@@ -19,7 +19,7 @@ from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
 from shiftsim.planners.proposals.tracker import fit_speed
 from shiftsim.planners.registry import load_planner
-from shiftsim.verify.observing import observe, scene_info
+from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 
 NUM_ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`
@@ -29,7 +29,7 @@ VEHICLE, PEDESTRIAN, CONE = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.T
 def one_step(scenario, lights=None, **arguments):
     planner = PdmClosed(**arguments)
     planner.reset(scene_info(scenario))
-    seen = observe(scenario, 0, scenario.expert[0])
+    seen = observe_log(scenario, 0, ego=scenario.expert[0], samples=1)
     return planner, planner.step(seen if lights is None else replace(seen, lights=lights))
 
 
@@ -77,7 +77,7 @@ def test_an_object_that_touches_the_ego_is_ignored_from_then_on():
     planner, step = one_step(scenario)
     assert planner.collided == ["0" * 16]
     assert np.isinf(step.scores.collision_index).all()
-    again = planner.step(observe(scenario, 1, scenario.expert[1]))
+    again = planner.step(observe_log(scenario, 1, ego=scenario.expert[1], samples=1))
     assert planner.seen.tokens == []
     assert again.best == 4
 
@@ -140,7 +140,7 @@ def test_turning_the_whole_world_turns_the_plan(seed, angle):
 
 def test_errors_name_what_to_mend():
     with pytest.raises(PlannerError, match="before reset"):
-        PdmClosed().plan(observe(cruise_scenario(), 0, np.zeros(11)))
+        PdmClosed().plan(observe_log(cruise_scenario(), 0, ego=np.zeros(11), samples=1))
     scenario = replace(cruise_scenario(), route=("1", "nowhere"))
     with pytest.raises(PlannerError, match="no roadblock 'nowhere'"):
         PdmClosed().reset(scene_info(scenario))
@@ -156,7 +156,7 @@ def test_parameters_are_plain_data():
     planner = load_planner("pdm-closed", {"speed_fractions": "0.5,1", "lateral_offsets": ""})
     scenario = cruise_scenario()
     planner.reset(scene_info(scenario))
-    step = planner.step(observe(scenario, 0, scenario.expert[0]))
+    step = planner.step(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert step.driven.states.shape == (2, 41, 11)
     assert planner.parameters == PdmParameters(speed_fractions=(0.5, 1.0), lateral_offsets=())
 
@@ -165,7 +165,7 @@ def test_the_speed_limit_of_zero_gives_a_plan_without_numbers_that_are_not_finit
     planner = PdmClosed()
     scenario = cruise_scenario(road=straight_road(speed_limit=0.0))
     planner.reset(scene_info(scenario))
-    plan = planner.plan(observe(scenario, 0, scenario.expert[0]))
+    plan = planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
     assert np.isfinite(plan.states).all()
 
 

@@ -64,11 +64,11 @@ def test_bundled_references_agree_and_are_covered_completely():
 
 @pytest.mark.golden
 @pytest.mark.slow
-def test_all_references_agree_and_only_reactive_worlds_are_left(shared):
+def test_all_references_agree_and_are_covered_completely(shared):
     report = verified(shared / "reference" / "dynamics")
 
     assert report.mismatches == []
-    assert set(report.not_covered) <= {"idm_world (reactive traffic)"}
+    assert report.not_covered == {}
 
 
 @pytest.mark.golden

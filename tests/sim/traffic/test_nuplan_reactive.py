@@ -7,24 +7,23 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.nuplan.reactive import verify_nuplan_reactive
-from shiftsim.verify.nuplan.reading import load_scenes
+from shiftsim.verify.nuplan.runs import verify_simulation
 from shiftsim.verify.report import Report
-from shiftsim.world.scenario import Scenario
+from shiftsim.verify.scenes import Scenes
 
 SCENE, PLANNER = "s04_left_turn", "log_future"
 
 
 @pytest.fixture(scope="module")
-def scenes(nuplan_reference: Path) -> dict[str, Scenario]:
-    return load_scenes(nuplan_reference)
+def scenes(nuplan_reference: Path) -> Scenes:
+    return Scenes(nuplan_reference)
 
 
 @pytest.fixture
 def one_run(nuplan_reference: Path, tmp_path: Path) -> Path:
     """The folder with the tables of a single reactive run, and what was replayed in it."""
     (tmp_path / "expected").mkdir()
-    for name in ("ego", "objects"):
+    for name in ("ego", "objects", "scores"):
         table = pq.read_table(nuplan_reference / "expected" / f"{name}.parquet")
         table = table.filter(pc.equal(table["scene"], SCENE))
         keep = pc.or_(pc.equal(table["planner"], PLANNER), pc.equal(table["planner"], "*"))
@@ -32,13 +31,13 @@ def one_run(nuplan_reference: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def verified(folder: Path, scenes: dict[str, Scenario]) -> Report:
+def verified(folder: Path, scenes: Scenes) -> Report:
     report = Report()
-    verify_nuplan_reactive(folder, report, scenes)
+    verify_simulation(folder / "expected", report, scenes, "R")
     return report
 
 
-def test_agents_are_where_nuplan_had_them(one_run: Path, scenes: dict[str, Scenario]) -> None:
+def test_agents_are_where_nuplan_had_them(one_run: Path, scenes: Scenes) -> None:
     report = verified(one_run, scenes)
 
     assert report.exit_code(require_all=True) == 0, report.lines()
@@ -46,9 +45,7 @@ def test_agents_are_where_nuplan_had_them(one_run: Path, scenes: dict[str, Scena
 
 
 @pytest.mark.parametrize("column", ["x", "y", "heading", "vx", "vy", "length", "width", "height"])
-def test_a_falsified_value_is_noticed(
-    one_run: Path, scenes: dict[str, Scenario], column: str
-) -> None:
+def test_a_falsified_value_is_noticed(one_run: Path, scenes: Scenes, column: str) -> None:
     path = one_run / "expected" / "objects.parquet"
     table = pq.read_table(path)
     values = table[column].to_pylist()
@@ -60,7 +57,7 @@ def test_a_falsified_value_is_noticed(
     assert verified(one_run, scenes).exit_code() == 1
 
 
-def test_missing_objects_are_noticed(one_run: Path, scenes: dict[str, Scenario]) -> None:
+def test_missing_objects_are_noticed(one_run: Path, scenes: Scenes) -> None:
     path = one_run / "expected" / "objects.parquet"
     table = pq.read_table(path)
     pq.write_table(table.filter(pc.not_equal(table["challenge"], "R")), path)
@@ -68,7 +65,7 @@ def test_missing_objects_are_noticed(one_run: Path, scenes: dict[str, Scenario])
     assert verified(one_run, scenes).exit_code() == 1
 
 
-def test_an_unknown_column_is_named(one_run: Path, scenes: dict[str, Scenario]) -> None:
+def test_an_unknown_column_is_named(one_run: Path, scenes: Scenes) -> None:
     path = one_run / "expected" / "objects.parquet"
     table = pq.read_table(path)
     pq.write_table(table.append_column("colour", pa.array(["red"] * len(table))), path)

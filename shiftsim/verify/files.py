@@ -1,0 +1,272 @@
+"""Reference files: named values, which of them were used, and their comparison with ours.
+
+The values of a file are the arrays of an `.npz`, the columns of a `.parquet` or the fields of a
+`.json`. All three are a `Source`: what it hands out counts as used, `finish` names the rest as not
+covered. `match` compares values of ours with those of the same names.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import ArrayLike
+
+from shiftsim.errors import DataError
+from shiftsim.verify.report import Report
+
+EXACT = 0.0
+TOLERANCE = 1e-9  # of floats, unless a comparison names another
+RUN_KEY = ("scene", "challenge", "planner")
+# Tolerance of all, or by name, "" being that of all others; exact where there is none
+Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
+
+
+@dataclass
+class Source:
+    """Named values of one file, or of a part of it.
+
+    Attributes:
+        name: Name of the file without its ending; begins the names of compared quantities.
+        what: What one of its values is called.
+        values: All values by name.
+        report: Receives the comparisons.
+        used: Names of the values that were read or noted; shared by all parts of a file.
+        rows: Which rows of the values this part has; None for all.
+        prefix: Of the names in the file, for a part with shorter ones.
+    """
+
+    name: str
+    what: str
+    values: Mapping[str, Any]
+    report: Report
+    used: set[str] = field(default_factory=set)
+    rows: Any = None
+    prefix: str = ""
+    _parts: "dict[str, list[Source]]" = field(init=False, default_factory=dict)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+    def __getitem__(self, name: str) -> Any:
+        """A value, which is used from now on; a `DataError` if there is none."""
+        if name not in self.values:
+            raise DataError(f"{self.name}: {self.what} {name!r} is missing")
+        self.used.add(self.prefix + name)
+        return self.values[name] if self.rows is None else self.values[name][self.rows]
+
+    def take(self, name: str, *shape: int) -> Any:
+        """An array of a given shape, contiguous; -1 is any length."""
+        array = np.ascontiguousarray(self[name])
+        sizes = zip(shape, array.shape, strict=False)
+        if array.ndim != len(shape) or any(wanted not in (-1, size) for wanted, size in sizes):
+            found = f"{self.what} {name!r} has shape {array.shape}"
+            raise DataError(f"{self.name}: {found}, not {shape}")
+        return array
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of a table, or of a part of one."""
+        return len(next(iter(self.values.values())) if self.rows is None else self.rows)
+
+    def at(self, rows: Any) -> "Source":
+        """Some rows of every value: an index, indices or a mask."""
+        if getattr(rows, "dtype", None) == np.bool_:
+            rows = np.flatnonzero(rows)
+        return replace(self, rows=rows if self.rows is None else self.rows[rows])
+
+    def below(self, prefix: str) -> "Source":
+        """The values whose names begin with a prefix, by the rest of their names."""
+        values = {n.removeprefix(prefix): v for n, v in self.values.items() if n.startswith(prefix)}
+        return replace(self, values=values, prefix=self.prefix + prefix)
+
+    def groups(self, *key: str) -> "dict[tuple[str, ...], Source]":
+        """The rows by the values of key columns, in the order of the file."""
+        groups: dict[tuple[str, ...], list[int]] = {}
+        for row, values in enumerate(zip(*(self[name].tolist() for name in key), strict=True)):
+            groups.setdefault(tuple(map(str, values)), []).append(row)
+        return {values: self.at(np.array(rows)) for values, rows in groups.items()}
+
+    def by(self, key: str, value: str) -> "Source":
+        """One column as values that another one names, such as scores by metric."""
+        pairs = zip(self[key].tolist(), self[value].tolist(), strict=True)
+        return Source(self.name, key, dict(pairs), self.report)
+
+    def each(self, name: str) -> "list[Source]":
+        """The objects in a list of a `.json`, as parts of the file; or the one that is not listed.
+
+        `finish` names the fields of these objects that nothing used.
+        """
+        if name not in self._parts:
+            found, label, used = self[name], f"{self.name} {name}", set[str]()
+            items = found if isinstance(found, list) else [found]
+            parts = [Source(label, self.what, item, self.report, used) for item in items]
+            self._parts[name] = parts
+        return self._parts[name]
+
+    def match(
+        self,
+        where: str,
+        ours: Mapping[str, object],
+        atol: Tolerances = EXACT,
+        *,
+        quantity: str | None = None,
+    ) -> bool:
+        """Compare values of ours with those of the same names; a missing one is a mismatch.
+
+        Args:
+            where: Which case.
+            ours: Our value by name.
+            atol: Tolerances.
+            quantity: Begins the names of the quantities, instead of the name of the file.
+
+        Returns:
+            Whether all agree.
+        """
+        prefix, agree = self.name if quantity is None else quantity, True
+        for name, value in ours.items():
+            bound = atol if isinstance(atol, float) else atol.get(name, atol.get("", EXACT))
+            label = f"{prefix} {name}".strip()
+            if name in self:
+                agree &= self.report.compare(label, where, value, self[name], atol=bound)
+            else:
+                self.report.fail(label, where, f"no {self.what} {name!r}")
+                agree = False
+        return agree
+
+    def match_rows(
+        self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
+    ) -> None:
+        """`match`, where every row is a case of its own; a `DataError` if ours are not as many."""
+        counts = {len(value) for value in (*ours.values(), *(self[n] for n in ours if n in self))}
+        if len(counts) != 1:
+            raise DataError(f"{self.name}: {', '.join(ours)}: rows are {sorted(counts)}")
+        for row in range(counts.pop()):
+            self.at(row).match(f"{where} {row}", {n: v[row] for n, v in ours.items()}, atol)
+
+    def note(self, what: str, *names: str) -> None:
+        """Name values that need not be compared."""
+        self.used.update(self.prefix + name for name in names)
+        self.report.note(f"{self.name} {', '.join(names)}{': ' if names else ''}{what}")
+
+    def finish(self) -> None:
+        """Name the values that nothing used."""
+        for name in self.values:
+            if self.prefix + name not in self.used:
+                self.report.skip(f"{self.name}: {self.what} {name!r}")
+        for part in (part for parts in self._parts.values() for part in parts):
+            part.finish()
+
+
+def read_arrays(path: Path, report: Report, name: str = "") -> Source:
+    """The arrays of an `.npz`; `name` is another name for it."""
+    with np.load(path, allow_pickle=False) as archive:
+        return Source(name or path.stem, "array", {n: archive[n] for n in archive.files}, report)
+
+
+def read_table(path: Path, report: Report) -> Source:
+    """The columns of a `.parquet`: strings are object arrays, absent values None or NaN."""
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a readable Parquet file ({error})") from error
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    return Source(path.stem, "column", columns, report)
+
+
+def read_fields(path: Path, report: Report, name: str = "") -> Source:
+    """The fields of a `.json` that holds one object; `name` is another name for it."""
+    return Source(name or path.stem, "field", read_json(path), report)
+
+
+def read_json(path: Path) -> Any:
+    """Content of a `.json`; a `DataError` if it cannot be read."""
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not readable JSON: {error}") from error
+
+
+class Groups:
+    """The rows of a `.parquet` by key, and which of them were asked for."""
+
+    def __init__(self, path: Path, report: Report, key: tuple[str, ...] = RUN_KEY) -> None:
+        """A file that does not exist is named as not covered, and has no rows."""
+        self._groups: dict[tuple[str, ...], Source] = {}
+        self._asked: set[tuple[str, ...]] = set()
+        if path.is_file():
+            self.table = read_table(path, report)
+            self._groups = self.table.groups(*key)
+        else:
+            self.table = Source(path.stem, "column", {}, report)
+            report.skip(f"{path.name} is missing")
+
+    def __iter__(self) -> Iterator[tuple[str, ...]]:
+        return iter(self._groups)
+
+    def __len__(self) -> int:
+        return len(self._groups)
+
+    def get(self, *key: str) -> Source | None:
+        """The rows of a key, if there are any."""
+        self._asked.add(key)
+        return self._groups.get(key)
+
+    def __getitem__(self, key: tuple[str, ...]) -> Source:
+        if (rows := self.get(*key)) is None:
+            raise DataError(f"{self.table.name}: no rows of {' '.join(key)}")
+        return rows
+
+    def match(
+        self,
+        key: tuple[str, ...],
+        ours: Mapping[str, Any],
+        atol: Tolerances = EXACT,
+        *,
+        quantity: str | None = None,
+    ) -> bool:
+        """`Source.match` for the rows of a key; where there are none, ours must have none."""
+        rows, where = self.get(*key), " ".join(key)
+        if rows is None:
+            count = len(next(iter(ours.values())))
+            return self.table.report.compare(f"{self.table.name} rows", where, count, 0)
+        return rows.match(where, ours, atol, quantity=quantity)
+
+    def finish(self, mode: str | None = None) -> None:
+        """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
+        for key in self._groups:
+            if key not in self._asked and (mode is None or mode in key):
+                self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
+        if self._asked & set(self._groups):
+            self.table.finish()
+
+
+def verify_files(
+    folder: Path, report: Report, parts: Mapping[str, Callable[[Path], object] | None]
+) -> None:
+    """Give every file of a folder to the part whose pattern is the first to match its name.
+
+    Args:
+        folder: The folder.
+        report: Receives what no part takes, and as a mismatch what a part raises.
+        parts: By glob pattern what compares such a file or sub-folder; None for one that need not
+            be compared, as `README*` never need be.
+    """
+    for path in sorted(folder.iterdir()):
+        pattern = next((p for p in (*parts, "README*") if fnmatch(path.name, p)), None)
+        part = None if pattern is None else parts.get(pattern)
+        if pattern is None:
+            report.skip(f"file {path.name}")
+        elif part is None:
+            report.note(f"{path.name} (for reading)")
+        else:
+            with report.attempt(path.stem, path.name):
+                part(path)

@@ -1,0 +1,179 @@
+"""Closed loops of the learned planners: every recorded step is made again on its own.
+
+The planner sees the recorded ego history, and the tracks and lights of the scene's own log.
+"""
+
+import hashlib
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from shiftsim.sim.dynamics.bicycle import command_and_step
+from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
+from shiftsim.sim.observation import HISTORY_SAMPLES, observe_log, past_rows, scene_info
+from shiftsim.verify.files import Source
+from shiftsim.verify.scenes import Scenes
+from shiftsim.world import state
+
+POSITION, HEADING = 2e-3, 2e-4  # m, rad: plans of closed loops
+STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
+
+# As in state.STATE_COLUMNS, in the words of the files.
+FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_acceleration")
+PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
+PLANS = ("trajectory", "trajectory_time_us")  # arrays with a row for every plan
+KNOWN_ERRORS = (  # of official planners, which ours answer with a fallback
+    "ValueError: zero-size array to reduction operation maximum which has no identity",
+)
+
+
+class Loop:
+    """One closed-loop file, and its iteration that is compared just now.
+
+    Attributes:
+        file: Its arrays.
+        scenario: The scene.
+        planner: The planner after this iteration.
+        name: Name of the planner.
+        variant: Variant of its weights.
+        ego: (N, 11) recorded ego states, columns of `state.STATE_COLUMNS`.
+        past: (22, 11) ego states up to iteration 0.
+        number: The iteration.
+        stored: What is stored of it alone.
+        seen: What the planner saw.
+        features: What its network read.
+        output: What its network said of them.
+        plan: What it made of that.
+    """
+
+    def __init__(self, file: Source, planner: Any, scenes: Scenes) -> None:
+        self.file, self.planner, self.name = file, planner, planner.name
+        self.scenario, self.number = scenes[str(file["meta/scene"])], 0
+        self.variant = str(file["meta/variant"])
+        self.ego = file.take("ego/current", -1, state.NUM_STATE)
+        self.past = file.take("ego/initial_history", HISTORY_SAMPLES, state.NUM_STATE)
+        planner.reset(scene_info(self.scenario))
+
+    @property
+    def where(self) -> str:
+        """The case, for the report."""
+        return f"{self.file.name} iteration {self.number}"
+
+    def compare(self, quantity: str, ours: object, theirs: object, atol: float = 0.0) -> None:
+        """Compare one quantity of this iteration."""
+        report = self.file.report
+        report.compare(f"{self.name} {quantity}", self.where, ours, theirs, atol=atol)
+
+    def match(self, ours: Mapping[str, object], atol: float | Mapping[str, float] = 0.0) -> None:
+        """Compare with the arrays of the same names that are stored of this iteration alone."""
+        self.stored.match(self.where, ours, atol, quantity=self.name)
+
+    def recorded(self, name: str) -> Any:
+        """The row for this iteration of an array of the whole loop."""
+        return self.file[f"out/{name}"][self.number]
+
+    def compare_plan(self, motion: float) -> None:
+        """Compare the plan with the recorded one; `motion` is the tolerance behind the poses."""
+        theirs, ours = self.recorded("trajectory"), self.plan.states[:, :PLAN_COLUMNS]
+        self.compare("plan time [us]", self.plan.time_us, self.recorded("trajectory_time_us"))
+        self.compare("plan [m]", ours[:, :2], theirs[:, :2], POSITION)
+        self.compare("plan [rad]", ours[:, 2], theirs[:, 2], HEADING)
+        self.compare("plan motion", ours[:, 3:], theirs[:, 3:], motion)
+
+    def step(self, number: int) -> None:
+        """Go to an iteration: make everything again that the planner makes there."""
+        ego = np.concatenate([self.past, self.ego[1 : number + 1]])[-HISTORY_SAMPLES:]
+        self.number, self.stored = number, self.file.below(f"it{number:02d}/")
+        self.seen = observe_log(self.scenario, number, ego=ego)
+        self.features = self.planner.features(self.seen)
+        (self.output,) = self.planner.infer([self.features])
+        self.plan = self.planner.decode(self.output, self.seen)
+
+    def compare_scene(self, scenes: Scenes) -> None:
+        """Compare what the file says about its scene, and which files that was made from."""
+        scenario, rows, meta = self.scenario, past_rows(self.scenario, 0), self.file.below("meta/")
+        sources = scenes.sources(str(meta["scene"]))
+        content = [path.read_bytes() for path in sources]
+        sums = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
+        made = {
+            "db_md5": sums[0],
+            "map_md5": sums[1],
+            "source_files": [path.relative_to(scenes.folder).as_posix() for path in sources],
+            "source_crc32": [zlib.crc32(data) for data in content],
+        }
+        facts = {
+            "token": scenario.token,
+            "scenario_type": scenario.scenario_type,
+            "map_name": scenario.map.name,
+            "route_roadblock_ids": list(scenario.route),
+            "state_columns": list(FILE_COLUMNS),
+            **{name: value for name, value in made.items() if name in meta},
+        }
+        meta.match(self.file.name, facts, quantity=f"{self.name} scene")
+        logged = {
+            "initial_history": scenario.ego[rows],
+            "initial_history_time_us": scenario.time_us[rows],
+            "current_time_us": scenario.iteration_times[: len(self.ego)],
+        }
+        self.file.below("ego/").match(self.file.name, logged, STATE, quantity=self.name)
+        self.compare("logged ego", scenario.ego[rows[-1]], self.ego[0], STATE)
+
+    def compare_driven(self) -> None:
+        """Compare the recorded ego states with what the recorded plans lead to."""
+        command, after, times = (
+            np.empty(2),
+            np.empty(state.NUM_STATE),
+            self.file["ego/current_time_us"],
+        )
+        for number in range(len(self.ego) - 1):
+            self.number, step = number, (*times[number : number + 2].tolist(), self.ego[number])
+            if "out/command" in self.file:
+                command_and_step(*step, self.recorded("command"), 0.0, 0.0, after)
+            else:
+                plan, plan_us = self.recorded("trajectory"), self.recorded("trajectory_time_us")
+                states = np.zeros((len(plan), state.NUM_STATE))
+                states[:, :PLAN_COLUMNS] = plan
+                status = track_and_step(*step, plan_us, states, 0.0, 0.0, after, command)
+                raise_for_status(status, step[0], plan_us)
+            self.compare("driven ego", after, self.ego[number + 1], STATE)
+
+
+def verify_loop(
+    file: Source,
+    scenes: Scenes,
+    make: Callable[[str], Any],
+    compare: Callable[[Loop], None],
+    recorded: Sequence[str],
+) -> None:
+    """Make every step of a closed loop again and compare.
+
+    Args:
+        file: The file.
+        scenes: The scenes.
+        make: Makes the planner from the name of its weights.
+        compare: Compares one step.
+        recorded: Names of the arrays with a row for every plan.
+    """
+    loop = Loop(file, _planner(make, f"deterministic:{file['meta/variant']}").fork(), scenes)
+    loop.compare_scene(scenes)
+    counts = [len(file[f"out/{name}"]) for name in recorded]
+    loop.compare("plans", counts, counts[:1] * len(counts))
+    where, _, error = str(file["meta/error"]).partition(": ")
+    if error not in ("", *KNOWN_ERRORS):
+        file.report.skip(f"{file.name}: the official failure {error!r}")
+    loop.compare("failure", f"iteration {counts[0]}" if counts[0] < len(loop.ego) else "", where)
+    for number in range(len(loop.ego)):
+        loop.step(number)
+        # where the official planner failed, ours says that its answer is a fallback
+        loop.compare("failure", bool(loop.planner.degraded), number == counts[0])
+        if number < counts[0]:
+            compare(loop)
+    loop.compare_driven()
+
+
+@cache
+def _planner(make: Callable[[str], Any], weights: str) -> Any:
+    return make(weights)

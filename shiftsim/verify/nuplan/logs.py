@@ -1,0 +1,215 @@
+"""The importer against what the official stack reads from the same logs and maps."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.nuplan.boxes import read_boxes
+from shiftsim.data.nuplan.log import Log, open_log, read_ego
+from shiftsim.data.nuplan.scenarios import find_maps
+from shiftsim.verify.files import Groups, Source, read_json
+from shiftsim.verify.nuplan.maps import METRES, RADIANS, verify_maps
+from shiftsim.verify.report import Report
+from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind, LightStatus, center_poses
+
+POSE = np.array([METRES, METRES, RADIANS])
+_EGO = {
+    **dict.fromkeys(("x", "y", "center_x", "center_y"), METRES),
+    **dict.fromkeys(("heading", "center_heading"), RADIANS),
+}
+_BOX = ("x", "y", "heading", "vx", "vy", "length", "width", "height")
+# What log_ego holds: name -> samples asked for, horizon in rows, direction, from which iteration.
+_EXCERPTS = {
+    "past_2s": (20, 40, -1, 0),
+    "future_8s_of_iteration_0": (80, 160, 1, 0),
+    "future_8s_of_last_iteration": (16, 160, 1, -1),
+}
+_MAX_SECONDS = 60.0  # nuPlan looks so far ahead at most for a route
+_ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples asked for
+
+
+def verify_nuplan_import(folder: Path, report: Report) -> None:
+    """Compare maps, logged ego states, objects, lights and scene facts with the official ones.
+
+    Args:
+        folder: Folder with `scenes.json`, `logs`, `maps` and `expected`.
+        report: Filled with the comparisons.
+    """
+    scenes, expected = Scenes(folder), folder / "expected"
+    verify_maps(expected, scenes.maps, report)
+    ego = Groups(expected / "log_ego.parquet", report, ("scene", "kind"))
+    objects = Groups(expected / "objects.parquet", report)
+    lights = Groups(expected / "traffic_lights.parquet", report, ("scene",))
+    scripts = Groups(folder / "scripted.parquet", report, ("scene", "planner"))
+    listed = [Source("scenes.json", "field", entry, report) for entry in scenes.entries.values()]
+    path = expected / "scenario_meta.json"
+    meta = Source("scenario_meta.json", "scene", read_json(path), report)
+    for entry in listed:
+        name = entry["scene"]
+        with report.attempt("importer", name), open_log(folder / entry["db"]) as log:
+            scene = scenes[name]
+            drawn = sorted(planner[9:] for of, planner in scripts if of == name)  # scripted_…
+            _compare_entry(entry, scene, log, drawn)
+            _compare_meta(name, meta.each(name)[0], scene, log)
+            for kind in ("iteration", *_EXCERPTS):
+                _compare_ego((name, kind), scene, ego)
+            _compare_objects((name, "NR", "*"), scene, log, objects)
+            _compare_lights(name, scene, lights)
+    for table in (ego, lights):
+        table.finish()
+    for source in (meta, *listed):
+        source.finish()
+    _name_files(folder, scenes, report)
+
+
+def _name_files(folder: Path, scenes: Scenes, report: Report) -> None:
+    """Name every file among the inputs that nothing reads."""
+    used = {folder / entry["db"] for entry in scenes.entries.values()}
+    used |= {*find_maps(folder / "maps").values(), *(folder / "maps").glob("*maps*.json")}
+    for path in sorted(p for sub in ("logs", "maps") for p in (folder / sub).rglob("*")):
+        if path.is_file() and path not in used:
+            report.skip(f"{path.relative_to(folder)} is not named by scenes.json or the map index")
+    report.note("README.md, RESULTS.md (for reading; RESULTS repeats scores.parquet)")
+    report.note("maps/*.json: raster layers of the index (not used for planning)")
+    report.note("scenes.json: purpose of each script (a label)")
+
+
+def _compare_entry(entry: Source, scene: Scenario, log: Log, scripts: list[str]) -> None:
+    where, report = entry["scene"], entry.report
+    offered = bool(log.is_offered[log.row_of[entry["token"]]])
+    report.compare("scenes.json offered by the log", where, offered, True)
+    names = sorted(script["name"] for script in entry["scripts"])
+    report.compare("scenes.json scripts", where, scripts, names)
+    ours = {
+        "scene": scene.log_name,
+        "db": f"logs/{scene.log_name}.db",
+        "map": log.map_name,
+        "scenario_type": scene.scenario_type,
+        "token": scene.token,
+        "t0_us": int(scene.iteration_times[0]),
+        "route_roadblock_ids": list(scene.route),
+        "n_lidar_pc": len(log.time_us),
+        "n_tracks": log.database.query("SELECT COUNT(*) FROM track", "table 'track'")[0][0],
+        "time_jitter": bool((np.diff(log.time_us) != 50_000).any()),
+        "epsg": scene.map.epsg,
+        "mission_goal": scene.mission_goal,
+    }
+    entry.match(where, ours, {"mission_goal": POSE})
+
+
+def _compare_meta(where: str, meta: Source, scene: Scenario, log: Log) -> None:
+    times = scene.iteration_times
+    # nuPlan rule 602: both stamps become seconds first, the difference is cut to microseconds
+    duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
+    ours = {
+        "token": scene.token,
+        "log_name": scene.log_name,
+        "iterations": scene.num_iterations,
+        "route_roadblock_ids": list(scene.route),
+        "route_from_expert": expert_route(scene.map, expert_points(log, log.row_of[scene.token])),
+        "database_interval": 0.05 / scene.mapping[2],
+        "duration_s": int(duration * 1e6) / 1e6,
+        "time_us": times.tolist(),
+        "mission_goal": scene.mission_goal,
+        "expert_goal_state": scene.expert[-1, :3],
+    }
+    meta.match(where, ours, {"mission_goal": POSE, "expert_goal_state": POSE}, quantity="meta")
+
+
+def expert_points(log: Log, row: int) -> FloatArray:
+    """(K, 2) rear axle positions after a row that nuPlan derives a route from [m]."""
+    ahead = min((int(log.time_us[-1]) - int(log.time_us[row])) * 1e-6, _MAX_SECONDS)
+    number, available = int(ahead / _SAMPLE), int(ahead / _ROW) + 1
+    step = available // number
+    last = min(row + step * number + 1, len(log.time_us))
+    return read_ego(log, row, last)[step::step, :2]
+
+
+def expert_route(road: VectorMap, points: FloatArray) -> list[str]:
+    """Ids of the blocks that points (K, 2) pass through, in order."""
+    route: list[int] = []
+    after: list[int] = []
+    for x, y in points.tolist():
+        holding = road.blocks.containing(x, y).tolist()
+        if route and route[-1] in holding:
+            continue
+        if route and not after:
+            after = road.block_outgoing.at(route[-1]).tolist()
+        # nuPlan rule 603: successors of the last block go first; only where none of them holds the
+        # point are there others, and of these roadblocks go before connectors
+        after = [block for block in after if block in holding]
+        after = after or [block for block in holding if block < road.num_roadblocks] or holding
+        if len(after) == 1:
+            route.append(after.pop())
+    return [road.blocks.ids[block] for block in route]
+
+
+def excerpt_rows(scene: Scenario, row: int, num: int, horizon: int, direction: int) -> IntArray:
+    """Rows that nuPlan reads for `num` samples over `horizon` rows ahead (1) or back (-1)."""
+    step = (horizon + 1) // num
+    rows = row + direction * step * np.arange(1, num + 1)
+    # nuPlan rule 604: rows are counted, and those outside the log are silently left out
+    return np.sort(rows[(rows >= 0) & (rows < len(scene.time_us))])
+
+
+def _compare_ego(key: tuple[str, str], scene: Scenario, ego: Groups) -> None:
+    rows = scene.iteration_rows
+    if key[1] in _EXCERPTS:
+        num, horizon, direction, iteration = _EXCERPTS[key[1]]
+        rows = excerpt_rows(scene, int(rows[iteration]), num, horizon, direction)
+    states = scene.ego[rows]
+    ours = {
+        "index": np.arange(len(rows)),
+        "time_us": scene.time_us[rows],
+        **dict(zip(EGO_COLUMNS, states.T, strict=True)),
+        **dict(zip(CENTER_COLUMNS, center_poses(states[:, :3]).T, strict=True)),
+    }
+    ego.match(key, ours, _EGO)
+
+
+def _compare_objects(key: tuple[str, ...], scene: Scenario, log: Log, objects: Groups) -> None:
+    """Objects of every sample, in nuPlan's order, with their heights (which only the log has)."""
+    sampled = np.searchsorted(log.time_us, scene.iteration_times[:-1])
+    boxes = read_boxes(log, int(sampled[0]), int(sampled[-1]) + 1)
+    chosen = np.flatnonzero(np.isin(boxes.row, sampled))
+    kinds, values = boxes.kind[chosen], boxes.values[chosen].copy()
+    static = kinds > AgentKind.BICYCLE
+    values[static, 3:5] = 0.0  # static objects have no velocity, which the table shows as 0
+    ours = {
+        "iteration": np.searchsorted(sampled, boxes.row[chosen]),
+        "track_token": [boxes.token[index] for index in chosen.tolist()],
+        "type": [AgentKind(kind).name for kind in kinds.tolist()],
+        **dict(zip(_BOX, values.T, strict=True)),
+    }
+    objects.match(key, ours, _EGO)
+    # the dense tracks of the scenario hold the same boxes in the same order
+    tracks = scene.tracks.rows(scene.iteration_rows[:-1])
+    frame, track = np.nonzero(tracks.valid)
+    parts = (tracks.poses, tracks.velocities, tracks.sizes)
+    dense = np.column_stack([part[frame, track] for part in parts])
+    values[static, 3:5] = np.nan
+    names = [tracks.tokens[index] for index in track.tolist()]
+    for name, mine, listed in (
+        ("iteration", frame, ours["iteration"]),
+        ("track_token", names, ours["track_token"]),
+        ("values", dense, values[:, :7]),
+    ):
+        objects.table.report.compare(f"dense tracks {name}", key[0], mine, listed)
+
+
+def _compare_lights(name: str, scene: Scenario, table: Groups) -> None:
+    sampled, lights = scene.iteration_rows[:-1], scene.traffic_lights
+    iteration, connector = np.nonzero(lights.status[sampled] != LightStatus.ABSENT)
+    status = lights.status[sampled][iteration, connector]
+    ours = {
+        "iteration": iteration,
+        "lane_connector_id": [int(lights.connector_ids[index]) for index in connector],
+        "status": [LightStatus(code).name for code in status.tolist()],
+        "timestamp": scene.time_us[sampled][iteration],
+    }
+    table.match((name,), ours)

@@ -1,0 +1,205 @@
+"""Runs of nuPlan: simulated again from the log, and planned again from the recorded states.
+
+A simulated run is compared with the recorded one state by state; a reactive one object by object
+too, a scored one score by score.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.metrics import judge, measure
+from shiftsim.planners.registry import PLANNERS, load_planner
+from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.loop import simulate
+from shiftsim.sim.observation import observe_log, scene_info
+from shiftsim.sim.planner import Observation, Planner
+from shiftsim.sim.traffic.idm.agents import order_observed
+from shiftsim.verify.files import TOLERANCE, Groups, Source
+from shiftsim.verify.metric_worlds import known_scores
+from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
+from shiftsim.verify.report import Report
+from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS, ego_states
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, Trajectory, center_poses
+
+EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
+# m, rad, m/s; the README of the folder allows 1e-3 m
+OBJECT_TOLERANCES = {"x": 1e-4, "y": 1e-4, "heading": 1e-5, "vx": 1e-4, "vy": 1e-4}
+PLAN_COLUMNS = EGO_COLUMNS[:8]
+EVERY = 10  # iterations between recorded plans; the last one is recorded as well
+CHALLENGES = {  # controller and traffic
+    "NR": ("lqr", "nonreactive"),
+    "PT": ("perfect", "nonreactive"),
+    "R": ("lqr", "reactive"),
+}
+_SCRIPTED = "scripted_"
+
+
+def verify_simulation(
+    folder: Path,
+    report: Report,
+    scenes: Mapping[str, Scenario],
+    mode: str | None = None,
+    *,
+    logged: Path | None = None,
+) -> None:
+    """Simulate every run of `ego.parquet` and compare states, reactive objects and scores.
+
+    Args:
+        folder: Folder with the tables of the runs; scripts are in `scripted.parquet` beside it.
+        report: Filled with the comparisons.
+        scenes: The scenarios by scene name.
+        mode: Only runs of this challenge.
+        logged: Folder with the table of logged objects, if that is another one.
+    """
+    runs = Groups(folder / "ego.parquet", report)
+    objects = Groups(folder / "objects.parquet", report)
+    replayed = Groups(logged / "objects.parquet", report) if logged else objects
+    scores = Groups(folder / "scores.parquet", report, PROFILE_KEY)
+    for key in dict.fromkeys([*runs, *(key for key in objects if key[1] == "R")]):
+        scene, challenge, planner = key
+        where = " ".join(key)
+        if mode not in (None, challenge):
+            continue
+        with report.attempt("simulation", where):
+            controller, traffic = CHALLENGES[challenge]
+            name, args = reference_planner(planner, folder.parent)
+            driver = load_planner(name, args)
+            log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
+            _compare_ego(where, log, runs[key])
+            if challenge == "R":
+                heights = _heights(replayed.get(scene, "NR", "*"))
+                _compare_objects(key, log, objects, heights)
+            measured = measure(log, scenes[scene].map)
+            for thresholds, profile in PROFILES.items():
+                ours = {name: [s] for name, s in known_scores(judge(measured, profile)).items()}
+                theirs, at = scores[*key, thresholds], f"{where} {thresholds}"
+                theirs.match(at, ours, TOLERANCE, quantity="simulated score")
+    if mode in (None, "R"):
+        objects.table.finish()
+
+
+def reference_planner(name: str, folder: Path) -> tuple[str, dict[str, str]]:
+    """Our planner and its arguments for a planner name of the reference."""
+    if name.startswith(_SCRIPTED):
+        file = str(folder / "scripted.parquet")
+        return "scripted", {"file": file, "name": name.removeprefix(_SCRIPTED)}
+    return name.replace("_", "-"), {}
+
+
+def _compare_ego(where: str, log: SimulationLog, rows: Source) -> None:
+    centers = center_poses(log.ego[:, :3])
+    ours = {
+        "iteration": np.arange(len(log.time_us)),
+        "time_us": log.time_us,
+        **dict(zip(EGO_COLUMNS, log.ego.T, strict=True)),
+        **dict(zip(CENTER_COLUMNS, centers.T, strict=True)),
+    }
+    rows.match(where, ours, EGO_TOLERANCES, quantity="ego")
+
+
+def _heights(rows: Source | None) -> dict[tuple[int, str], float]:
+    """Heights of logged objects by iteration and token; shiftsim keeps none."""
+    if rows is None:
+        return {}
+    columns = (rows[name].tolist() for name in ("iteration", "track_token", "height"))
+    return {(index, token): height for index, token, height in zip(*columns, strict=True)}
+
+
+def _compare_objects(
+    key: tuple[str, ...],
+    log: SimulationLog,
+    objects: Groups,
+    heights: dict[tuple[int, str], float],
+) -> None:
+    tracks = log.tracks
+    orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
+    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
+    track = np.concatenate(orders)
+    kinds, tokens = tracks.kinds[track], [tracks.tokens[i] for i in track.tolist()]
+    velocities = np.where(
+        kinds[:, None] > LAST_AGENT_KIND, 0.0, tracks.velocities[iteration, track]
+    )
+    # of vehicles as in the first frame, of others as replayed
+    first = np.where(kinds == AgentKind.VEHICLE, 0, iteration).tolist()
+    ours = {
+        "iteration": iteration,
+        "track_token": tokens,
+        "type": [AgentKind(kind).name for kind in kinds],
+        **dict(zip(("x", "y", "heading"), tracks.poses[iteration, track].T, strict=True)),
+        **dict(zip(("length", "width"), tracks.sizes[iteration, track].T, strict=True)),
+        **dict(zip(("vx", "vy"), velocities.T, strict=True)),
+        "height": [heights.get(pair, np.nan) for pair in zip(first, tokens, strict=True)],
+    }
+    objects.match(key, ours, OBJECT_TOLERANCES, quantity="reactive")
+
+
+def verify_planners(
+    folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
+) -> None:
+    """Plan again at every iteration of `trajectories.parquet` and compare the states.
+
+    Args:
+        folder: Folder with the tables of the runs.
+        report: Filled with the comparisons.
+        scenes: The scenarios by scene name.
+        mode: Only runs of this challenge.
+    """
+    plans = Groups(folder / "trajectories.parquet", report)
+    egos = Groups(folder / "ego.parquet", report)
+    objects = Groups(folder / "objects.parquet", report)
+    for key in {**dict.fromkeys(egos), **dict.fromkeys(plans)}:
+        scene, challenge, name = key
+        if name.startswith(_SCRIPTED) or mode not in (None, challenge):
+            continue
+        spec = name.replace("_", "-")
+        if spec not in PLANNERS or scene not in scenes:
+            report.skip(f"plans of {name} in {scene}, which is not known")
+            continue
+        with report.attempt("plan", " ".join(key)):
+            ego = egos[key]
+            seen = Seen(scenes[scene], ego, objects.get(*key), challenge)
+            _plan_again(" ".join(key), load_planner(spec), seen, plans[key])
+    plans.finish(mode)
+
+
+class Seen:
+    """What a planner saw in a recorded run, from its ego states and its own objects.
+
+    A run that is not reactive shows the objects of the log.
+    """
+
+    def __init__(self, scenario: Scenario, ego: Source, objects: Source | None, challenge: str):
+        self.scenario = scenario
+        self.ego = ego_states({name: ego[name] for name in EGO_COLUMNS})
+        self._tracks = None
+        if challenge == "R":
+            count = len(self.ego)
+            self._tracks = Tracks.empty(count) if objects is None else tracks_of(objects, count)
+
+    def at(self, iteration: int) -> Observation:
+        """The present alone; the rule-based planners look at nothing else."""
+        row = slice(iteration, iteration + 1)
+        tracks = None if self._tracks is None else self._tracks.rows(row)
+        ego = self.ego[iteration]
+        return observe_log(self.scenario, iteration, ego=ego, tracks=tracks, samples=1)
+
+
+def _plan_again(where: str, planner: Planner, seen: Seen, rows: Source) -> None:
+    recorded, last = rows["iteration"], len(seen.ego) - 1
+    due = sorted({*range(0, last + 1, EVERY), last})
+    rows.report.compare("plan iterations", where, due, sorted(set(recorded.tolist())))
+    planner.reset(scene_info(seen.scenario))
+    name = rows["planner"][0]
+    for iteration in sorted({0, *recorded.tolist()}):
+        plan = planner.plan(seen.at(iteration))
+        if iteration in recorded and isinstance(plan, Trajectory):
+            ours = {
+                "index": np.arange(len(plan.time_us)),
+                "time_us": plan.time_us,
+                **dict(zip(PLAN_COLUMNS, plan.states.T[: len(PLAN_COLUMNS)], strict=True)),
+            }
+            here = rows.at(recorded == iteration)
+            here.match(f"{where} iteration {iteration}", ours, TOLERANCE, quantity=f"{name} plan")

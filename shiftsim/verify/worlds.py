@@ -1,0 +1,158 @@
+"""What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.errors import DataError
+from shiftsim.sim.log import SimulationLog
+from shiftsim.verify.files import Source
+from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.state import NUM_STATE, AgentKind, Tracks, TrafficLights
+
+# Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
+EGO_COLUMNS = (
+    *("x", "y", "heading", "vx", "vy", "ax", "ay"),
+    *("tire_steering_angle", "tire_steering_rate", "angular_velocity", "angular_acceleration"),
+)
+CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
+_SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
+
+
+def ego_states(columns: Mapping[str, Any]) -> FloatArray:
+    """(R, 11) ego states from columns by name; what has no column is 0."""
+    out = np.zeros((len(next(iter(columns.values()))), NUM_STATE))
+    for name, values in columns.items():
+        out[:, EGO_COLUMNS.index(_SHORT.get(name, name))] = values
+    return out
+
+
+def make_tracks(
+    shape: tuple[int, int],
+    where: tuple[IntArray, IntArray] | tuple[slice],
+    values: FloatArray,
+    kinds: Sequence[str],
+    tokens: Sequence[str],
+) -> Tracks:
+    """Dense tracks from what is known of them at some rows.
+
+    Args:
+        shape: Rows and tracks.
+        where: Row and track of each value; a whole slice where the values are dense.
+        values: (..., 7) x, y, heading, vx, vy, length, width; NaN where a track is absent.
+        kinds: Names of the types of the tracks.
+        tokens: Their tokens.
+    """
+    dense = np.full((*shape, 7), np.nan)
+    dense[where] = values
+    for name in kinds:
+        if name.upper() not in AgentKind.__members__:
+            raise DataError(f"unknown type {name!r}")
+    return Tracks(
+        valid=~np.isnan(dense[..., 0]),
+        poses=np.ascontiguousarray(dense[..., :3]),
+        velocities=np.ascontiguousarray(dense[..., 3:5]),
+        sizes=np.ascontiguousarray(dense[..., 5:]),
+        kinds=np.array([AgentKind[name.upper()] for name in kinds], np.int64),
+        tokens=tuple(tokens),
+    )
+
+
+def read_objects(objects: Sequence[Source], count: int) -> Tracks:
+    """Tracks of objects that list x, y, heading, vx, vy per frame, of which `count` are read."""
+    values = np.full((count, len(objects), 7), np.nan)
+    for column, thing in enumerate(objects):
+        for row, frame in enumerate(thing["frames"][:count]):
+            if frame is not None:
+                values[row, column] = [*frame, thing["length"], thing["width"]]
+    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
+    return make_tracks(values.shape[:2], (slice(None),), values, kinds, tokens)
+
+
+def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
+    """The map of a world.
+
+    Args:
+        world: Holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`.
+        fields: Fields of an edge besides those that every edge has, as named in `EdgeSpec`; the
+            block is `roadblock`.
+        stop_lines: Polygons of stop lines by id.
+
+    Raises:
+        DataError: A kind is unknown, or an id names nothing.
+    """
+    blocks = world["roadblocks"] if "roadblocks" in world else {}
+    road = build_map(
+        "world",
+        edges=[
+            EdgeSpec(
+                id=edge["id"],
+                is_connector=_is_connector(edge["kind"], "lane", "connector"),
+                polygon=shapely.Polygon(edge["polygon"]),
+                baseline=np.array(edge["baseline"], np.float64),
+                block_id=edge["roadblock"] if blocks else "",
+                outgoing=edge["outgoing"],
+                speed_limit=edge["speed_limit"],
+                **{name: edge[name] for name in fields},
+            )
+            for edge in world.each("edges")
+        ],
+        blocks=[
+            BlockSpec(
+                id=name,
+                is_connector=_is_connector(block["kind"], "roadblock", "roadblock_connector"),
+                polygon=shapely.Polygon(block["polygon"]),
+            )
+            for name, block in blocks.items()
+        ],
+        intersections=_areas(dict(enumerate(world["intersections"]))),
+        drivable_areas=_areas(dict(enumerate(world["drivable_area"]))) if blocks else (),
+        stop_polygons=_areas(stop_lines or {}),
+    )
+    # an edge of a map without blocks is in none
+    lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
+    if lost:
+        raise DataError(f"ids that name nothing: {', '.join(lost)}")
+    return road
+
+
+def _areas(rings: Mapping[Any, Any]) -> list[AreaSpec]:
+    return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings.items()]
+
+
+def _is_connector(kind: str, plain: str, connector: str) -> bool:
+    if kind not in (plain, connector):
+        raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
+    return kind == connector
+
+
+def recorded_log(
+    token: str,
+    time_us: IntArray,
+    ego: FloatArray,
+    tracks: Tracks,
+    expert_time_us: IntArray,
+    expert_ego: FloatArray,
+) -> SimulationLog:
+    """A rollout of which no more is known; arguments as the attributes of `SimulationLog`."""
+    count = len(ego)
+    if not 0 < count <= len(expert_time_us) == len(expert_ego):
+        raise DataError(f"{count} ego, {len(expert_ego)} expert states of {len(expert_time_us)}")
+    return SimulationLog(
+        token=token,
+        time_us=time_us,
+        ego=ego,
+        tracks=tracks,
+        traffic_lights=TrafficLights.empty(count),
+        expert_time_us=expert_time_us,
+        expert_ego=expert_ego,
+        route=(),
+        commands=np.full((count, 2), np.nan),
+        noise=np.zeros((count, 2)),
+        plans=np.full((count, 11, 3), np.nan),
+        planning_seconds=np.zeros(count),
+        degraded=np.zeros(count, np.bool_),
+    )
