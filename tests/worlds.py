@@ -166,3 +166,15 @@ def moved(scenario: Scenario, angle: float, shift: np.ndarray) -> Scenario:
     ego = scenario.ego.copy()
     ego[:, :3] = moved_poses(ego[:, :3], angle, shift)
     return replace(scenario, map=moved_map(scenario.map, angle, shift), ego=ego, tracks=turned)
+
+
+def join_tracks(parts: list[Tracks]) -> Tracks:
+    """Several sets of tracks over the same rows as one."""
+    return Tracks(
+        np.concatenate([part.valid for part in parts], axis=1),
+        np.concatenate([part.poses for part in parts], axis=1),
+        np.concatenate([part.velocities for part in parts], axis=1),
+        np.concatenate([part.sizes for part in parts], axis=1),
+        np.concatenate([part.kinds for part in parts]),
+        sum((part.tokens for part in parts), ()),
+    )

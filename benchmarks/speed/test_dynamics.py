@@ -6,7 +6,8 @@ Run with `pytest benchmarks/speed/test_dynamics.py -s`.
 import numpy as np
 import pytest
 
-from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bicycles
+from shiftsim.arrays import kernel
+from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bicycle
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import parse_noise, sample_noise
@@ -50,6 +51,12 @@ def test_interpolation(measure, plan):
 def test_command_and_bicycle(measure):
     state, out, command = np.zeros(NUM_STATE), np.empty(NUM_STATE), np.ones(2)
     measure(command_and_step, NOW, NOW + STEP_US, state, command, 0.1, 0.01, out)
+
+
+@kernel
+def step_bicycles(states, commands, wheel_base, dt, out):
+    for row in range(len(states)):
+        step_bicycle(states[row], commands[row, 0], commands[row, 1], wheel_base, dt, out[row])
 
 
 def test_bicycle_batch_of_fifteen(measure):

@@ -291,90 +291,72 @@ def build_map(
     Raises:
         MapError: An id occurs twice, or a baseline has fewer than two vertices.
     """
-    ordered = sorted(edges, key=lambda spec: spec.is_connector)
-    ordered_blocks = sorted(blocks, key=lambda spec: spec.is_connector)
-    edge_index = _index_ids([spec.id for spec in ordered], name, "lane or connector")
-    block_index = _index_ids([spec.id for spec in ordered_blocks], name, "roadblock")
+    edges = sorted(edges, key=lambda spec: spec.is_connector)
+    blocks = sorted(blocks, key=lambda spec: spec.is_connector)
+    edge_index = _index_ids([spec.id for spec in edges], name, "lane or connector")
+    block_index = _index_ids([spec.id for spec in blocks], name, "roadblock")
     stop_index = {spec.id: i for i, spec in enumerate(stop_polygons)}
     intersection_index = {spec.id: i for i, spec in enumerate(intersections)}
     flaws: dict[str, int] = {}
 
-    def look_up(index: dict[str, int], ids: Sequence[str | None], flaw: str) -> list[int]:
-        known = [index[i] for i in ids if i is not None and i in index]
+    def known(index: dict[str, int], ids: Sequence[str | None], flaw: str) -> list[int]:
         missing = sum(i is not None and i not in index for i in ids)
         if missing:
             flaws[flaw] = flaws.get(flaw, 0) + missing
-        return known
+        return [index[i] for i in ids if i is not None and i in index]
 
-    def single(index: dict[str, int], wanted: str | None, flaw: str) -> int:
-        return (look_up(index, [wanted], flaw) or [NONE])[0]
+    def to_edges(attribute: str) -> list[list[int]]:
+        flaw = "edge names an unknown edge"
+        return [known(edge_index, getattr(s, attribute), flaw) for s in edges]
 
-    for spec in ordered:
+    def to_blocks(attribute: str) -> list[list[int]]:
+        flaw = "roadblock names an unknown one"
+        return [known(block_index, getattr(s, attribute), flaw) for s in blocks]
+
+    def to_one(index: dict[str, int], attribute: str, what: str) -> IntArray:
+        flaw = f"edge names an unknown {what}"
+        found = [known(index, [getattr(s, attribute)], flaw) for s in edges]
+        return np.array([(one or [NONE])[0] for one in found], np.int64)
+
+    for spec in edges:
         if len(spec.baseline) < 2:
             raise MapError(f"map {name!r}: baseline of {spec.id!r} has fewer than two vertices")
-    block_of = np.array(
-        [single(block_index, s.block_id, "edge names an unknown roadblock") for s in ordered],
-        np.int64,
-    )
-    members: list[list[int]] = [[] for _ in ordered_blocks]
+    block_of = to_one(block_index, "block_id", "roadblock")
+    nothing = np.zeros((0, 2))
+    members: list[list[int]] = [[] for _ in blocks]
     for edge, block in enumerate(block_of.tolist()):
         if block != NONE:
             members[block].append(edge)
-    nothing = np.zeros((0, 2))
+    limits = [np.nan if s.speed_limit is None else s.speed_limit for s in edges]
+    positions = [NONE if s.lane_index is None else s.lane_index for s in edges]
     return VectorMap(
         name=name,
         epsg=epsg,
-        edges=make_layer([s.id for s in ordered], [s.polygon for s in ordered]),
-        num_lanes=sum(not s.is_connector for s in ordered),
-        baselines=make_polylines([s.baseline for s in ordered]),
-        left_boundaries=make_polylines([nothing if s.left is None else s.left for s in ordered]),
-        right_boundaries=make_polylines([nothing if s.right is None else s.right for s in ordered]),
-        boundary_ids=tuple((s.left_id, s.right_id) for s in ordered),
-        speed_limits=np.array(
-            [np.nan if s.speed_limit is None else s.speed_limit for s in ordered], np.float64
-        ),
-        lane_index=np.array(
-            [NONE if s.lane_index is None else s.lane_index for s in ordered], np.int64
-        ),
-        left_lane=np.array(
-            [single(edge_index, s.left_lane, "edge names an unknown edge") for s in ordered],
-            np.int64,
-        ),
-        right_lane=np.array(
-            [single(edge_index, s.right_lane, "edge names an unknown edge") for s in ordered],
-            np.int64,
-        ),
-        incoming=make_lists(
-            look_up(edge_index, s.incoming, "edge names an unknown edge") for s in ordered
-        ),
-        outgoing=make_lists(
-            look_up(edge_index, s.outgoing, "edge names an unknown edge") for s in ordered
-        ),
+        edges=make_layer([s.id for s in edges], [s.polygon for s in edges]),
+        num_lanes=sum(not s.is_connector for s in edges),
+        baselines=make_polylines([s.baseline for s in edges]),
+        left_boundaries=make_polylines([nothing if s.left is None else s.left for s in edges]),
+        right_boundaries=make_polylines([nothing if s.right is None else s.right for s in edges]),
+        boundary_ids=tuple((s.left_id, s.right_id) for s in edges),
+        speed_limits=np.array(limits, np.float64),
+        lane_index=np.array(positions, np.int64),
+        left_lane=to_one(edge_index, "left_lane", "edge"),
+        right_lane=to_one(edge_index, "right_lane", "edge"),
+        incoming=make_lists(to_edges("incoming")),
+        outgoing=make_lists(to_edges("outgoing")),
         block_of=block_of,
-        has_traffic_lights=np.array([s.has_traffic_lights for s in ordered], np.bool_),
+        has_traffic_lights=np.array([s.has_traffic_lights for s in edges], np.bool_),
         stop_lines=make_lists(
-            look_up(stop_index, s.stop_lines, "edge names an unknown stop line") for s in ordered
+            known(stop_index, s.stop_lines, "edge names an unknown stop line") for s in edges
         ),
-        intersection_of=np.array(
-            [
-                single(intersection_index, s.intersection_id, "edge names an unknown intersection")
-                for s in ordered
-            ],
-            np.int64,
-        ),
-        turn_type=np.array([s.turn_type for s in ordered], np.int64),
-        is_bike=np.array([s.is_bike for s in ordered], np.bool_),
-        blocks=make_layer([s.id for s in ordered_blocks], [s.polygon for s in ordered_blocks]),
-        num_roadblocks=sum(not s.is_connector for s in ordered_blocks),
+        intersection_of=to_one(intersection_index, "intersection_id", "intersection"),
+        turn_type=np.array([s.turn_type for s in edges], np.int64),
+        is_bike=np.array([s.is_bike for s in edges], np.bool_),
+        blocks=make_layer([s.id for s in blocks], [s.polygon for s in blocks]),
+        num_roadblocks=sum(not s.is_connector for s in blocks),
         block_edges=make_lists(members),
-        block_incoming=make_lists(
-            look_up(block_index, s.incoming, "roadblock names an unknown one")
-            for s in ordered_blocks
-        ),
-        block_outgoing=make_lists(
-            look_up(block_index, s.outgoing, "roadblock names an unknown one")
-            for s in ordered_blocks
-        ),
+        block_incoming=make_lists(to_blocks("incoming")),
+        block_outgoing=make_lists(to_blocks("outgoing")),
         intersections=_area_layer(intersections),
         intersection_kinds=np.array([s.kind for s in intersections], np.int64),
         stop_polygons=_area_layer(stop_polygons),

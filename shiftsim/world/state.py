@@ -4,7 +4,6 @@ Everything is an array with one row per time; the few objects here name the colu
 the rear axle, a track's pose is the centre of its box.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -345,15 +344,3 @@ def rear_states(center_states: FloatArray, vehicle: VehicleParameters = PACIFICA
 def speeds(states: FloatArray) -> FloatArray:
     """(...) speed at the rear axle [m/s], from (..., 11) states."""
     return np.hypot(states[..., VX], states[..., VY])
-
-
-def join_tracks(parts: Sequence[Tracks]) -> Tracks:
-    """Several sets of tracks over the same rows as one."""
-    return Tracks(
-        np.concatenate([part.valid for part in parts], axis=1),
-        np.concatenate([part.poses for part in parts], axis=1),
-        np.concatenate([part.velocities for part in parts], axis=1),
-        np.concatenate([part.sizes for part in parts], axis=1),
-        np.concatenate([part.kinds for part in parts]),
-        sum((part.tokens for part in parts), ()),
-    )

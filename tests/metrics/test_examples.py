@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from rollouts import boxes, rollout, states_of, straight_poses
-from worlds import straight_road
+from worlds import join_tracks, straight_road
 
 from shiftsim.metrics import MetricResult, MetricRow, compute_metrics, judge, measure
 from shiftsim.metrics.thresholds import Thresholds
-from shiftsim.world.state import VX, AgentKind, Tracks, join_tracks
+from shiftsim.world.state import VX, AgentKind, Tracks
 
 K = 60
 ROAD = straight_road()

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rollouts import WORLDS, boxes, load_world, move_world, with_tracks
 from strategies import OFFSETS, rigid_motions, seeds
+from worlds import join_tracks
 
 from shiftsim.metrics import MetricResult, compute_metrics
 from shiftsim.verify.metric_worlds import read_world
-from shiftsim.world.state import join_tracks
 
 LOADED = {path.stem: load_world(path) for path in WORLDS}
 worlds = st.sampled_from(sorted(LOADED))

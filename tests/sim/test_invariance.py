@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import seeds
-from worlds import cruise_scenario, moved, standing_tracks, straight_road
+from worlds import cruise_scenario, join_tracks, moved, standing_tracks, straight_road
 
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.world.state import AgentKind, Tracks, join_tracks
+from shiftsim.world.state import AgentKind, Tracks
 
 NUM_ROWS = 60 + 2 * 80 + 1 + 160
 ROAD = straight_road()

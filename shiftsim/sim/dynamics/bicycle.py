@@ -82,27 +82,6 @@ def step_bicycle(
 
 
 @lean_kernel
-def step_bicycles(
-    states: FloatArray,
-    commands: FloatArray,
-    wheel_base: float,
-    dt: float,
-    out: FloatArray,
-) -> None:
-    """Advance P independent vehicles by one step of `step_bicycle`.
-
-    Args:
-        states: (P, 11) columns of `state.STATE_COLUMNS`.
-        commands: (P, 2) acceleration [m/s^2], steering rate [rad/s].
-        wheel_base: Distance between the axles [m].
-        dt: Step [s].
-        out: (P, 11) receives the next states.
-    """
-    for row in range(len(states)):
-        step_bicycle(states[row], commands[row, 0], commands[row, 1], wheel_base, dt, out[row])
-
-
-@lean_kernel
 def command_and_step(
     now_us: int,
     next_us: int,

@@ -7,15 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import offsets, seeds
 
+from shiftsim.geometry.paths import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve, curve_capacity
 from shiftsim.sim.traffic.idm.shapes import (
     APART,
     MEETING,
-    PIECE,
     UNSURE,
-    bound_pieces,
     bound_ring,
-    num_pieces,
     ring_gap,
     touches_corridor,
 )
@@ -23,7 +21,7 @@ from shiftsim.sim.traffic.idm.shapes import (
 
 def outline(line: np.ndarray, distance: float) -> np.ndarray:
     out = np.zeros((curve_capacity(len(line)), 2))
-    count = buffer_curve(line, len(line), distance, np.zeros(len(line), np.bool_), out)
+    count = buffer_curve(line, distance, np.zeros(len(line), np.bool_), out)
     return out[:count]
 
 
@@ -62,7 +60,7 @@ def test_curve_and_geos_buffer_agree(
 def test_curve_that_does_not_fit_is_reported() -> None:
     line = crooked_line(1, (0.0, 0.0))
 
-    assert buffer_curve(line, len(line), 1.0, np.zeros(len(line), np.bool_), np.zeros((30, 2))) < 0
+    assert buffer_curve(line, 1.0, np.zeros(len(line), np.bool_), np.zeros((30, 2))) < 0
 
 
 @given(seed=seeds, other=seeds, shift=st.floats(-12, 12))
@@ -72,7 +70,7 @@ def test_gap_between_outlines_is_the_distance_of_their_areas(
     first, second = crooked_line(seed, (0.0, 0.0)), crooked_line(other, (3.0, shift))
     curves = outline(first, 1.0), outline(second, 1.1)
 
-    gap = ring_gap(curves[0], len(curves[0]), curves[1], len(curves[1]), np.inf)
+    gap = ring_gap(curves[0], curves[1], np.inf)
 
     areas = [
         shapely.LineString(line).buffer(distance, cap_style="flat")
@@ -85,16 +83,16 @@ def test_gap_between_outlines_is_the_distance_of_their_areas(
 def test_gap_inside_a_larger_ring_is_zero() -> None:
     box = np.array([[5.0, 5.0], [-5.0, 5.0], [-5.0, -5.0], [5.0, -5.0]])
 
-    assert ring_gap(0.1 * box, 4, box, 4, np.inf) == 0.0
-    assert ring_gap(box, 4, 0.1 * box, 4, np.inf) == 0.0
+    assert ring_gap(0.1 * box, box, np.inf) == 0.0
+    assert ring_gap(box, 0.1 * box, np.inf) == 0.0
 
 
 def test_gap_beyond_the_limit_is_the_limit() -> None:
     box = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
     far = box + np.array([7.0, 0.0])
-    assert ring_gap(box, 4, far, 4, 3.0) == 3.0
-    assert ring_gap(box, 4, far, 4, 9.0) == 5.0
+    assert ring_gap(box, far, 3.0) == 3.0
+    assert ring_gap(box, far, 9.0) == 5.0
 
 
 @given(seed=seeds, x=st.floats(-8, 40), y=st.floats(-8, 8), turn=st.floats(-3, 3))
@@ -106,23 +104,22 @@ def test_quick_corridor_answers_are_those_of_the_exact_buffer(
     spin = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     ring = np.ascontiguousarray(box @ spin + [x, y])
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    bound_ring(ring, 4, bounds)
-    pieces = np.zeros((len(line) // PIECE + 1, 4))
-    bound_pieces(line, len(line), pieces)
+    bound_ring(ring, bounds)
+    runs = np.zeros(((len(line) - 2) // RUN + 1, 4))
+    bound_runs(line, runs)
 
-    answer = touches_corridor(line, len(line), pieces, 1.0, ring, 4, bounds)
+    answer = touches_corridor(line, runs, 1.0, ring, bounds)
 
     area = shapely.LineString(line).buffer(1.0, cap_style="flat")
     truth = MEETING if area.intersects(shapely.Polygon(ring)) else APART
     assert answer in (truth, UNSURE)
 
 
-def test_pieces_cover_every_segment() -> None:
-    line = np.c_[np.arange(2.0 * PIECE + 2), np.zeros(2 * PIECE + 2)]
-    pieces = np.zeros((4, 4))
+def test_runs_cover_every_segment() -> None:
+    line = np.c_[np.arange(2.0 * RUN + 2), np.zeros(2 * RUN + 2)]
+    runs = np.zeros((3, 4))
 
-    bound_pieces(line, len(line), pieces)
+    bound_runs(line, runs)
 
-    assert num_pieces(len(line)) == 3
-    np.testing.assert_array_equal(pieces[:3, 0], [0, PIECE, 2 * PIECE])
-    np.testing.assert_array_equal(pieces[:3, 2], [PIECE, 2 * PIECE, 2 * PIECE + 1])
+    np.testing.assert_array_equal(runs[:, 0], [0, RUN, 2 * RUN])
+    np.testing.assert_array_equal(runs[:, 2], [RUN, 2 * RUN, 2 * RUN + 1])

@@ -28,12 +28,11 @@ def curve_capacity(num_points: int) -> int:
 
 
 @lean_kernel
-def buffer_curve(line: FloatArray, size: int, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
+def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
     """Outline of a polyline buffered with flat caps and round joins.
 
     Args:
-        line: (K, 2) vertices [m].
-        size: How many of them count, at least 2.
+        line: (K, 2) vertices, at least 2 [m].
         distance: Half width of the buffer [m].
         keep: (K,) scratch.
         out: (V, 2) room for the curve [m].
@@ -41,19 +40,20 @@ def buffer_curve(line: FloatArray, size: int, distance: float, keep: BoolArray, 
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
     """
-    count = np.int64(0)  # not a literal, for which kernels would be compiled a second time
+    count = np.int64(0)  # not a literal, see `_simplify`
     for side in range(2):
-        _simplify(line, size, distance * _SIMPLIFY, side == 0, keep)
-        count = _offset_side(line, size, distance, side == 0, keep, out, count)
+        _simplify(line, distance * _SIMPLIFY, side == 0, keep)
+        count = _offset_side(line, distance, side == 0, keep, out, count)
         if count < 0:
             return -1
     return count
 
 
 @lean_kernel
-def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: BoolArray) -> None:
+def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -> None:
     """Mark the vertices that stay when shallow turns to one side are left out."""
-    concave = 1 if left else -1
+    concave, size = 1 if left else -1, len(line)
+    ahead = np.int64(1)  # not a literal, for which kernels would be compiled a second time
     for vertex in range(size):
         keep[vertex] = (
             vertex == 0
@@ -63,9 +63,9 @@ def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: B
     changed = True
     while changed:
         changed = False
-        index = _next_kept(keep, size, np.int64(0))
-        middle = _next_kept(keep, size, index)
-        last = _next_kept(keep, size, middle)
+        index = _walk(keep, size, np.int64(0), ahead)
+        middle = _walk(keep, size, index, ahead)
+        last = _walk(keep, size, middle, ahead)
         while last < size:
             if _is_shallow(line, index, middle, last, tolerance, concave):
                 keep[middle] = False
@@ -73,16 +73,8 @@ def _simplify(line: FloatArray, size: int, tolerance: float, left: bool, keep: B
                 index = last
             else:
                 index = middle
-            middle = _next_kept(keep, size, index)
-            last = _next_kept(keep, size, middle)
-
-
-@lean_kernel
-def _next_kept(keep: BoolArray, size: int, index: int) -> int:
-    index += 1
-    while index < size and not keep[index]:
-        index += 1
-    return index
+            middle = _walk(keep, size, index, ahead)
+            last = _walk(keep, size, middle, ahead)
 
 
 @lean_kernel
@@ -107,7 +99,6 @@ def _is_shallow(
 @lean_kernel
 def _offset_side(
     line: FloatArray,
-    size: int,
     distance: float,
     left: bool,
     keep: BoolArray,
@@ -115,7 +106,7 @@ def _offset_side(
     count: int,
 ) -> int:
     """Append the offset of one side, to the left of the direction walked, and the cap after it."""
-    step = 1 if left else -1
+    size, step = len(line), 1 if left else -1
     at = 0 if left else size - 1
     while not keep[at]:
         at += step
@@ -144,6 +135,7 @@ def _offset_side(
 
 @lean_kernel
 def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
+    """The next vertex that is kept, or one beyond the ends."""
     at += step
     while 0 <= at < size and not keep[at]:
         at += step

@@ -26,7 +26,7 @@ def set_box(
     box_corners(x, y, heading, length, width, box)
     footprints.present[index] = True
     bounds[0], bounds[1], bounds[2], bounds[3] = x, y, x, y
-    bound_ring(box, len(box), bounds)
+    bound_ring(box, bounds)
 
 
 @lean_kernel
@@ -73,7 +73,7 @@ def move_agent(scene: Scene, agent: int) -> int:
     front = progress + 0.5 * length + fleet.speed[agent] * scene.parameters.headway
     points = _cut(path, size, progress - 0.5 * length, front, scratch.line)
     curve = footprints.curve[agent]
-    made = buffer_curve(scratch.line, points, 0.5 * width, scratch.keep, curve)
+    made = buffer_curve(scratch.line[:points], 0.5 * width, scratch.keep, curve)
     footprints.curve_size[agent] = max(made, 0)
-    bound_ring(curve, footprints.curve_size[agent], footprints.bounds[agent])
+    bound_ring(curve[: footprints.curve_size[agent]], footprints.bounds[agent])
     return made

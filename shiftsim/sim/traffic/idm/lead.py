@@ -1,18 +1,18 @@
 """Whom an agent follows: whoever is nearest in the corridor ahead, which its path makes."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.paths import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.footprints import remaining_path
-from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
-    PIECE,
     UNSURE,
-    bound_pieces,
-    last_near_piece,
-    num_pieces,
+    last_near_run,
     ring_gap,
     touches_corridor,
 )
@@ -24,6 +24,20 @@ _TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to 
 _MARGIN = 1.1  # corridors lie within this many half widths of their line
 
 
+class Corridor(NamedTuple):
+    """The path ahead of an agent, which is buffered by half its width with flat ends.
+
+    Attributes:
+        line: (K, 2) vertices [m].
+        runs: (R, 4) bounds of its runs of segments [m].
+        half_width: Of the buffer [m].
+    """
+
+    line: FloatArray
+    runs: FloatArray
+    half_width: float
+
+
 @lean_kernel
 def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
     """The nearest footprint in the corridor ahead of an agent, the first one on ties, and the gap.
@@ -33,15 +47,13 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         footprints [m].
     """
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
-    half_width = 0.5 * fleet.size[agent, 1]
-    size = remaining_path(fleet, agent, scratch.line)
-    bound_pieces(scratch.line, size, scratch.pieces)
+    corridor = _corridor_ahead(fleet, agent, scratch)
     path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
     if not fleet.progress[agent] < path_end and not _in_corridor(
-        footprints, agent, half_width, size, scratch
+        footprints, agent, corridor, scratch
     ):
         return OFF_PATH, 0.0  # nuPlan rule 128
-    found = _list_near(footprints, agent, half_width, size, scratch)
+    found = _list_near(footprints, agent, corridor, scratch)
     best, lead = np.inf, FREE
     for _ in range(found):
         nearest = 0
@@ -57,14 +69,22 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
             continue
         gap = _gap(footprints, agent, other, best * (1.0 + _TIE) + _TINY)
         closer = gap < best or (gap == best and other < lead)
-        if closer and _in_corridor(footprints, other, half_width, size, scratch):
+        if closer and _in_corridor(footprints, other, corridor, scratch):
             best, lead = gap, other
-    gap = _stop_gap(scene, agent, half_width, size, best)
+    gap = _stop_gap(scene, agent, corridor, best)
     return (len(footprints.present), gap) if gap < best else (lead, best)
 
 
 @lean_kernel
-def _stop_gap(scene: Scene, agent: int, half_width: float, size: int, limit: float) -> float:
+def _corridor_ahead(fleet: Fleet, agent: int, scratch: Scratch) -> Corridor:
+    size = remaining_path(fleet, agent, scratch.line)
+    line, runs = scratch.line[:size], scratch.runs[: (size - 2) // RUN + 1]
+    bound_runs(line, runs)
+    return Corridor(line, runs, 0.5 * fleet.size[agent, 1])
+
+
+@lean_kernel
+def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> float:
     """Distance from an agent's footprint to the red stop lines of its route, at most `limit`."""
     fleet, graph, scratch = scene.fleet, scene.graph, scene.scratch
     stops, stop_lines = graph.stops, graph.stop_lines
@@ -77,24 +97,22 @@ def _stop_gap(scene: Scene, agent: int, half_width: float, size: int, limit: flo
             stop = stop_lines.items[entry]
             shell = stops.poly_ptr[stop]
             ring = stops.xy[stops.ring_ptr[shell] : stops.ring_ptr[shell + 1]]
-            if _meets(half_width, ring, len(ring), stops.bounds[stop], size, scratch):
-                best = _ring_gap(scene.footprints, agent, ring, len(ring), best)
+            if _meets(corridor, ring, stops.bounds[stop], scratch):
+                best = _ring_gap(scene.footprints, agent, ring, best)
     return best
 
 
 @lean_kernel
-def _list_near(
-    footprints: Footprints, agent: int, half_width: float, size: int, scratch: Scratch
-) -> int:
+def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: Scratch) -> int:
     """List footprints whose bounds come near the corridor, in `scratch.near`; returns how many.
 
     `scratch.apart` gets lower bounds of their gaps to the agent.
     """
-    bounds, pieces, margin = footprints.bounds, scratch.pieces, _MARGIN * half_width
+    bounds, runs, margin = footprints.bounds, corridor.runs, _MARGIN * corridor.half_width
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for piece in range(num_pieces(size)):
-        low_x, low_y = min(low_x, pieces[piece, 0]), min(low_y, pieces[piece, 1])
-        high_x, high_y = max(high_x, pieces[piece, 2]), max(high_y, pieces[piece, 3])
+    for run in range(len(runs)):
+        low_x, low_y = min(low_x, runs[run, 0]), min(low_y, runs[run, 1])
+        high_x, high_y = max(high_x, runs[run, 2]), max(high_y, runs[run, 3])
     low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
     found = 0
     for other in range(len(bounds)):
@@ -115,37 +133,28 @@ def _list_near(
 
 
 @lean_kernel
-def _in_corridor(
-    footprints: Footprints, other: int, half_width: float, size: int, scratch: Scratch
-) -> bool:
-    """Whether a footprint meets the corridor along the first `size` vertices of `scratch.line`."""
-    bounds, box = footprints.bounds[other], footprints.box[other]
-    if _meets(half_width, box, len(box), bounds, size, scratch):
+def _in_corridor(footprints: Footprints, other: int, corridor: Corridor, scratch: Scratch) -> bool:
+    """Whether a footprint meets a corridor."""
+    bounds = footprints.bounds[other]
+    if _meets(corridor, footprints.box[other], bounds, scratch):
         return True
     if other >= len(footprints.curve) or footprints.curve_size[other] == 0:
         return False
-    curve, curve_size = footprints.curve[other], footprints.curve_size[other]
-    return _meets(half_width, curve, curve_size, bounds, size, scratch)
+    curve = footprints.curve[other, : footprints.curve_size[other]]
+    return _meets(corridor, curve, bounds, scratch)
 
 
 @lean_kernel
-def _meets(
-    half_width: float,
-    ring: FloatArray,
-    ring_size: int,
-    bounds: FloatArray,
-    size: int,
-    scratch: Scratch,
-) -> bool:
-    """Whether a ring meets the corridor along the first `size` vertices of `scratch.line`."""
-    line, pieces = scratch.line, scratch.pieces
-    found = touches_corridor(line, size, pieces, half_width, ring, ring_size, bounds)
+def _meets(corridor: Corridor, ring: FloatArray, bounds: FloatArray, scratch: Scratch) -> bool:
+    """Whether a ring with the given bounds (4,) meets a corridor."""
+    line, runs, half_width = corridor.line, corridor.runs, corridor.half_width
+    found = touches_corridor(line, runs, half_width, ring, bounds)
     if found != UNSURE:
         return found == MEETING
-    # of the exact corridor only what comes up to the ring is needed, and a piece to spare
-    near = min((last_near_piece(pieces, size, half_width, bounds) + 2) * PIECE + 1, size)
-    outline = buffer_curve(line, near, half_width, scratch.keep, scratch.corridor)
-    return ring_gap(ring, ring_size, scratch.corridor, outline, 1e-3) == 0.0
+    # of the exact corridor only what comes up to the ring is needed, and a run to spare
+    near = min((last_near_run(runs, half_width, bounds) + 2) * RUN + 1, len(line))
+    outline = buffer_curve(line[:near], half_width, scratch.keep, scratch.outline)
+    return ring_gap(ring, scratch.outline[:outline], 1e-3) == 0.0
 
 
 @lean_kernel
@@ -153,24 +162,19 @@ def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
     """Distance between the footprint of an agent and another one, at most `limit` [m]."""
     best = limit
     if other < len(footprints.curve) and footprints.curve_size[other]:
-        curve, curve_size = footprints.curve[other], footprints.curve_size[other]
-        best = _ring_gap(footprints, agent, curve, curve_size, best)
+        curve = footprints.curve[other, : footprints.curve_size[other]]
+        best = _ring_gap(footprints, agent, curve, best)
     if best > 0.0:
-        box = footprints.box[other]
-        best = _ring_gap(footprints, agent, box, len(box), best)
+        best = _ring_gap(footprints, agent, footprints.box[other], best)
     return best
 
 
 @lean_kernel
-def _ring_gap(
-    footprints: Footprints, agent: int, ring: FloatArray, ring_size: int, limit: float
-) -> float:
+def _ring_gap(footprints: Footprints, agent: int, ring: FloatArray, limit: float) -> float:
     """Distance from an agent's footprint to a ring, at most `limit` [m]."""
     best = limit
     if footprints.curve_size[agent]:
-        size = footprints.curve_size[agent]
-        best = ring_gap(footprints.curve[agent], size, ring, ring_size, best)
+        best = ring_gap(footprints.curve[agent, : footprints.curve_size[agent]], ring, best)
     if best > 0.0:
-        box = footprints.box[agent]
-        best = ring_gap(box, len(box), ring, ring_size, best)
+        best = ring_gap(footprints.box[agent], ring, best)
     return best

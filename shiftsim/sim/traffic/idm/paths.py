@@ -8,7 +8,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import point_on_polyline
+from shiftsim.geometry.polylines import interpolate, point_on_polyline, vertex_heading
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
     MAX_ROUTE,
@@ -31,12 +31,9 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
     """Append the vertices of a baseline to a raw path; returns the new number of vertices."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
     for vertex in range(start, stop):
-        other = min(vertex, stop - 2)  # the last vertex repeats the heading before it
-        dx = baselines.xy[other + 1, 0] - baselines.xy[other, 0]
-        dy = baselines.xy[other + 1, 1] - baselines.xy[other, 1]
         path[size, 0] = baselines.xy[vertex, 0]
         path[size, 1] = baselines.xy[vertex, 1]
-        path[size, HEADING] = np.arctan2(dy, dx)
+        path[size, HEADING] = vertex_heading(baselines.xy, vertex, stop)
         size += 1
     return size
 
@@ -94,14 +91,12 @@ def first_after(path: FloatArray, size: int, progress: float) -> int:
 @lean_kernel
 def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
-    after = min(max(first_after(path, size, progress), 1), size - 1)
-    span = path[after, PROGRESS] - path[after - 1, PROGRESS]
-    along = progress - path[after - 1, PROGRESS]
-    before = after - 1
-    x = (path[after, 0] - path[before, 0]) / span * along + path[before, 0]
-    y = (path[after, 1] - path[before, 1]) / span * along + path[before, 1]
-    turn = (path[after, HEADING] - path[before, HEADING]) / span
-    return x, y, wrap_angle(turn * along + path[before, HEADING])
+    index = min(max(first_after(path, size, progress), 1), size - 1)
+    before, after = path[index - 1], path[index]
+    span, along = after[PROGRESS] - before[PROGRESS], progress - before[PROGRESS]
+    x = interpolate(before[0], after[0], span, along)
+    y = interpolate(before[1], after[1], span, along)
+    return x, y, wrap_angle(interpolate(before[HEADING], after[HEADING], span, along))
 
 
 @lean_kernel

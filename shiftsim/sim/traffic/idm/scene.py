@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.geometry.paths import RUN
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
-from shiftsim.sim.traffic.idm.shapes import PIECE
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, LightStatus, Tracks
@@ -126,16 +126,16 @@ class Scratch(NamedTuple):
     Attributes:
         line: (K, 2) a piece of a path [m].
         keep: (K,) flags of its vertices.
-        pieces: (C, 4) bounding boxes of the line's pieces [m].
-        corridor: (W, 2) outline of the buffer of the path ahead [m].
+        runs: (R, 4) bounds of the line's runs of segments [m].
+        outline: (W, 2) outline of the buffer of a path [m].
         near: (M,) footprints that may be in the corridor.
         apart: (M,) lower bounds of the gaps to them [m].
     """
 
     line: FloatArray
     keep: BoolArray
-    pieces: FloatArray
-    corridor: FloatArray
+    runs: FloatArray
+    outline: FloatArray
     near: IntArray
     apart: FloatArray
 
@@ -212,8 +212,8 @@ def _make_scratch(longest_path: int, count: int) -> Scratch:
     return Scratch(
         line=np.zeros((points, 2)),
         keep=np.zeros(points, np.bool_),
-        pieces=np.zeros((points // PIECE + 1, 4)),
-        corridor=np.zeros((curve_capacity(points), 2)),
+        runs=np.zeros((points // RUN + 1, 4)),
+        outline=np.zeros((curve_capacity(points), 2)),
         near=np.zeros(count, np.int64),
         apart=np.zeros(count),
     )

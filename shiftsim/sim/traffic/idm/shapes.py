@@ -1,28 +1,28 @@
 """Gaps and contacts between the outlines of road users, and corridors along paths.
 
-An outline is one or two rings: a box, and the buffer of a piece of path (`idm_buffer`), whose ring
-may cross itself inside. Their union is meant; touching counts as contact. Rings are searched with
-bounding boxes, and exact predicates decide whether two edges meet.
+An outline is one or two rings: a box, and the buffer of a piece of path (`buffer`), whose ring may
+cross itself inside. Their union is meant; touching counts as contact. Rings are searched with
+bounding boxes, and exact predicates decide whether two edges meet. Corridors are searched by the
+runs of segments of their line (`geometry.paths`).
 """
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.paths import RUN
 from shiftsim.geometry.predicates import orientation
-from shiftsim.geometry.rings import point_segment_distance
+from shiftsim.geometry.rings import point_segment_distance, segments_meet
 
 APART, MEETING, UNSURE = 0, 1, 2
-PIECE = 12  # segments of a corridor that are searched together
-
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
-# bound), and shallow concave vertices are left out (outer bound; see idm_buffer).
+# bound), and shallow concave vertices are left out (outer bound; see `buffer`).
 _INNER, _OUTER = 0.97, 1.02
 
 
 @lean_kernel
-def bound_ring(ring: FloatArray, size: int, bounds: FloatArray) -> None:
-    """Widen `bounds` (4,) min x, min y, max x, max y by the first `size` vertices of a ring."""
-    for vertex in range(size):
+def bound_ring(ring: FloatArray, bounds: FloatArray) -> None:
+    """Widen `bounds` (4,) min x, min y, max x, max y by a ring (V, 2)."""
+    for vertex in range(len(ring)):
         bounds[0] = min(bounds[0], ring[vertex, 0])
         bounds[1] = min(bounds[1], ring[vertex, 1])
         bounds[2] = max(bounds[2], ring[vertex, 0])
@@ -30,25 +30,11 @@ def bound_ring(ring: FloatArray, size: int, bounds: FloatArray) -> None:
 
 
 @lean_kernel
-def segments_meet(
-    ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
-) -> bool:
-    """Whether the closed segments a-b and c-d share a point."""
-    if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx):
-        return False
-    if max(ay, by) < min(cy, dy) or max(cy, dy) < min(ay, by):
-        return False
-    if orientation(ax, ay, bx, by, cx, cy) * orientation(ax, ay, bx, by, dx, dy) > 0:
-        return False
-    return orientation(cx, cy, dx, dy, ax, ay) * orientation(cx, cy, dx, dy, bx, by) <= 0
-
-
-@lean_kernel
-def winds_around(ring: FloatArray, size: int, x: float, y: float) -> bool:
-    """Whether the first `size` vertices of a ring wind around a point, or have it on an edge."""
+def winds_around(ring: FloatArray, x: float, y: float) -> bool:
+    """Whether a ring (V, 2) winds around a point, or has it on an edge."""
     winding = 0
-    px, py = ring[size - 1, 0], ring[size - 1, 1]
-    for vertex in range(size):
+    px, py = ring[-1, 0], ring[-1, 1]
+    for vertex in range(len(ring)):
         qx, qy = ring[vertex, 0], ring[vertex, 1]
         if min(py, qy) <= y <= max(py, qy):
             side = orientation(px, py, qx, qy, x, y)
@@ -63,65 +49,55 @@ def winds_around(ring: FloatArray, size: int, x: float, y: float) -> bool:
 
 
 @lean_kernel
-def ring_gap(a: FloatArray, a_size: int, b: FloatArray, b_size: int, limit: float) -> float:
-    """Distance between what two rings enclose, at most `limit`; 0 where they share a point [m].
-
-    Args:
-        a: (V, 2) a ring [m].
-        a_size: How many of its vertices count.
-        b: (W, 2) another ring [m].
-        b_size: How many of its vertices count.
-        limit: Distances beyond are not looked for [m].
-    """
+def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
+    """Distance between what two rings (V, 2) enclose, at most `limit`; 0 where they meet [m]."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for vertex in range(b_size):
+    for vertex in range(len(b)):
         low_x, high_x = min(low_x, b[vertex, 0]), max(high_x, b[vertex, 0])
         low_y, high_y = min(low_y, b[vertex, 1]), max(high_y, b[vertex, 1])
-    if _box_apart(a, a_size, low_x, low_y, high_x, high_y) >= limit:
+    if _box_apart(a, low_x, low_y, high_x, high_y) >= limit:
         return limit
-    best = min(limit, _vertex_distance(a, a_size, b, b_size) * (1.0 + 1e-12))
-    px, py = a[a_size - 1, 0], a[a_size - 1, 1]
-    for vertex in range(a_size):
+    best = min(limit, _vertex_distance(a, b) * (1.0 + 1e-12))
+    px, py = a[-1, 0], a[-1, 1]
+    for vertex in range(len(a)):
         qx, qy = a[vertex, 0], a[vertex, 1]
         apart_x = max(low_x - max(px, qx), min(px, qx) - high_x)
         apart_y = max(low_y - max(py, qy), min(py, qy) - high_y)
         if apart_x < best and apart_y < best:
-            best = _edge_gap(px, py, qx, qy, b, b_size, best)
+            best = _edge_gap(px, py, qx, qy, b, best)
             if best == 0.0:
                 return 0.0
         px, py = qx, qy
-    if winds_around(b, b_size, a[0, 0], a[0, 1]) or winds_around(a, a_size, b[0, 0], b[0, 1]):
+    if winds_around(b, a[0, 0], a[0, 1]) or winds_around(a, b[0, 0], b[0, 1]):
         return 0.0
     return best
 
 
 @lean_kernel
-def _box_apart(
-    ring: FloatArray, size: int, low_x: float, low_y: float, high_x: float, high_y: float
-) -> float:
+def _box_apart(ring: FloatArray, low_x: float, low_y: float, high_x: float, high_y: float) -> float:
     """Lower bound of the distance from a ring to what lies in an axis-parallel box [m]."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
-    for vertex in range(size):
+    for vertex in range(len(ring)):
         x0, x1 = min(x0, ring[vertex, 0]), max(x1, ring[vertex, 0])
         y0, y1 = min(y0, ring[vertex, 1]), max(y1, ring[vertex, 1])
     return max(low_x - x1, x0 - high_x, low_y - y1, y0 - high_y)
 
 
 @lean_kernel
-def _vertex_distance(a: FloatArray, a_size: int, b: FloatArray, b_size: int) -> float:
+def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between two close vertices: an upper bound that makes the search short."""
     found = 0
     x, y = a[0, 0], a[0, 1]
     best = np.inf
     for sweep in range(2):
         best = np.inf
-        for vertex in range(b_size):
+        for vertex in range(len(b)):
             square = (b[vertex, 0] - x) ** 2 + (b[vertex, 1] - y) ** 2
             if square < best:
                 best, found = square, vertex
         x, y = b[found, 0], b[found, 1]
         best = np.inf
-        for vertex in range(a_size):
+        for vertex in range(len(a)):
             square = (a[vertex, 0] - x) ** 2 + (a[vertex, 1] - y) ** 2
             if square < best:
                 best, found = square, vertex
@@ -131,14 +107,12 @@ def _vertex_distance(a: FloatArray, a_size: int, b: FloatArray, b_size: int) -> 
 
 
 @lean_kernel
-def _edge_gap(
-    px: float, py: float, qx: float, qy: float, ring: FloatArray, size: int, best: float
-) -> float:
+def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best: float) -> float:
     """Distance from the segment p-q to the edges of a ring where it is less than `best`."""
     low_x, high_x = min(px, qx) - best, max(px, qx) + best
     low_y, high_y = min(py, qy) - best, max(py, qy) + best
-    rx, ry = ring[size - 1, 0], ring[size - 1, 1]
-    for vertex in range(size):
+    rx, ry = ring[-1, 0], ring[-1, 1]
+    for vertex in range(len(ring)):
         sx, sy = ring[vertex, 0], ring[vertex, 1]
         if (
             (rx >= low_x or sx >= low_x)
@@ -181,53 +155,26 @@ def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: fl
 
 
 @lean_kernel
-def bound_pieces(line: FloatArray, size: int, pieces: FloatArray) -> None:
-    """Write the bounding boxes of consecutive pieces of a polyline.
-
-    Args:
-        line: (K, 2) vertices [m].
-        size: How many of them count, at least 2.
-        pieces: (C, 4) min x, min y, max x, max y of `PIECE` segments each [m].
-    """
-    for piece in range(num_pieces(size)):
-        low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-        for vertex in range(piece * PIECE, min((piece + 1) * PIECE + 1, size)):
-            x, y = line[vertex, 0], line[vertex, 1]
-            low_x, low_y = min(low_x, x), min(low_y, y)
-            high_x, high_y = max(high_x, x), max(high_y, y)
-        pieces[piece, 0], pieces[piece, 1] = low_x, low_y
-        pieces[piece, 2], pieces[piece, 3] = high_x, high_y
-
-
-@lean_kernel
-def num_pieces(size: int) -> int:
-    """How many pieces a polyline of `size` vertices has."""
-    return (size - 2) // PIECE + 1
-
-
-@lean_kernel
-def last_near_piece(pieces: FloatArray, size: int, half_width: float, bounds: FloatArray) -> int:
-    """The last piece of a corridor of `size` vertices that may reach into a bounding box, or 0."""
+def last_near_run(runs: FloatArray, half_width: float, bounds: FloatArray) -> int:
+    """The last run of a corridor that may reach into a bounding box, or 0."""
     reach = half_width * _OUTER
-    for piece in range(num_pieces(size) - 1, 0, -1):
+    for run in range(len(runs) - 1, 0, -1):
         if (
-            pieces[piece, 0] <= bounds[2] + reach
-            and pieces[piece, 1] <= bounds[3] + reach
-            and pieces[piece, 2] >= bounds[0] - reach
-            and pieces[piece, 3] >= bounds[1] - reach
+            runs[run, 0] <= bounds[2] + reach
+            and runs[run, 1] <= bounds[3] + reach
+            and runs[run, 2] >= bounds[0] - reach
+            and runs[run, 3] >= bounds[1] - reach
         ):
-            return piece
+            return run
     return 0
 
 
 @lean_kernel
 def touches_corridor(
     line: FloatArray,
-    size: int,
-    pieces: FloatArray,
+    runs: FloatArray,
     half_width: float,
     ring: FloatArray,
-    ring_size: int,
     bounds: FloatArray,
 ) -> int:
     """Whether a ring meets the flat-capped buffer of a polyline: APART, MEETING, or UNSURE.
@@ -235,27 +182,25 @@ def touches_corridor(
     UNSURE where the answer hangs on the exact shape of the buffer, or on its caps.
 
     Args:
-        line: (K, 2) vertices [m].
-        size: How many of them count, at least 2.
-        pieces: Bounding boxes of its pieces, see `bound_pieces` [m].
+        line: (K, 2) vertices, at least 2 [m].
+        runs: (R, 4) bounds of its runs [m].
         half_width: Distance of the buffer [m].
         ring: (V, 2) the ring [m].
-        ring_size: How many of its vertices count.
         bounds: (4,) bounding box of the ring [m].
     """
     reach = half_width * _OUTER
     low_x, low_y = bounds[0] - reach, bounds[1] - reach
     high_x, high_y = bounds[2] + reach, bounds[3] + reach
     answer = APART
-    for piece in range(num_pieces(size)):
+    for run in range(len(runs)):
         if (
-            pieces[piece, 0] > high_x
-            or pieces[piece, 1] > high_y
-            or pieces[piece, 2] < low_x
-            or pieces[piece, 3] < low_y
+            runs[run, 0] > high_x
+            or runs[run, 1] > high_y
+            or runs[run, 2] < low_x
+            or runs[run, 3] < low_y
         ):
             continue
-        for vertex in range(piece * PIECE + 1, min((piece + 1) * PIECE + 1, size)):
+        for vertex in range(run * RUN + 1, min((run + 1) * RUN + 1, len(line))):
             px, py = line[vertex - 1, 0], line[vertex - 1, 1]
             qx, qy = line[vertex, 0], line[vertex, 1]
             if (
@@ -265,14 +210,14 @@ def touches_corridor(
                 or (py > high_y and qy > high_y)
             ):
                 continue
-            found = _touches_segment(px, py, qx, qy, half_width, ring, ring_size)
+            found = _touches_segment(px, py, qx, qy, half_width, ring)
             if found == MEETING:
                 return MEETING
             if found == UNSURE:
                 answer = UNSURE
     x, y = line[0, 0], line[0, 1]
     around = bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
-    if answer == APART and around and winds_around(ring, ring_size, x, y):
+    if answer == APART and around and winds_around(ring, x, y):
         return MEETING
     return answer
 
@@ -285,7 +230,6 @@ def _touches_segment(
     qy: float,
     half_width: float,
     ring: FloatArray,
-    size: int,
 ) -> int:
     inner, outer = half_width * _INNER, half_width * _OUTER
     low_x, high_x = min(px, qx) - outer, max(px, qx) + outer
@@ -293,8 +237,8 @@ def _touches_segment(
     dx, dy = qx - px, qy - py
     square, limit = dx * dx + dy * dy, outer * outer
     answer = APART
-    rx, ry = ring[size - 1, 0], ring[size - 1, 1]
-    for vertex in range(size):
+    rx, ry = ring[-1, 0], ring[-1, 1]
+    for vertex in range(len(ring)):
         sx, sy = ring[vertex, 0], ring[vertex, 1]
         if (
             (rx >= low_x or sx >= low_x)
