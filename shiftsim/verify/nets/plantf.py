@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
+from inspect import signature
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -128,7 +129,7 @@ def network_inputs(planner: str, arrays: Source) -> Any:
 
     kind = network_module(planner).Inputs
     values = {}
-    for field in set(INPUTS) & set(kind._fields):
+    for field in set(INPUTS) & set(signature(kind).parameters):
         if field == "object_pose":
             pose = (arrays["static_objects.position"], arrays["static_objects.heading"][..., None])
             array = np.concatenate(pose, axis=-1)
