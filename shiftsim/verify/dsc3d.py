@@ -62,7 +62,7 @@ class LocalMap:
     def _area(self, key: LaneKey, low: float, high: float) -> shapely.Polygon:
         road = self._drive.roads[key.road]
         s = np.linspace(low, high, max(2, round((high - low) / 0.5) + 1))
-        borders = section_borders(road, key.section, s)
+        borders = section_borders(road, key.section, s, repair=True)
         poses = ReferenceLine(road.geometries).evaluate(s)
         inner, outer = (poses.offset(side[key.lane]) for side in (borders.inner, borders.outer))
         return shapely.Polygon(np.concatenate([inner, outer[::-1]]))

@@ -7,9 +7,10 @@ covered. `match` compares values of ours with those of the same names.
 
 import json
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -22,28 +23,32 @@ from shiftsim.verify.report import Report
 EXACT = 0.0
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 RUN_KEY = ("scene", "challenge", "planner")
+# Tolerance of all, or by name, "" being that of all others; exact where there is none
+Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
 
 
+@dataclass
 class Source:
-    """Named values of one file, or some rows of them.
+    """Named values of one file, or of a part of it.
 
     Attributes:
         name: Name of the file without its ending; begins the names of compared quantities.
         what: What one of its values is called.
-        report: Receives the comparisons.
         values: All values by name.
+        report: Receives the comparisons.
         used: Names of the values that were read or noted; shared by all parts of a file.
+        rows: Which rows of the values this part has; None for all.
+        prefix: Of the names in the file, for a part with shorter ones.
     """
 
-    def __init__(
-        self, name: str, what: str, values: Mapping[str, Any], report: Report, **shared: Any
-    ) -> None:
-        """`shared` is for parts of a file: `used`, `rows` (None for all) and `prefix` of names."""
-        self.name, self.what, self.values, self.report = name, what, values, report
-        self.used: set[str] = shared.get("used", set())
-        self._rows: Any = shared.get("rows")
-        self._prefix: str = shared.get("prefix", "")
-        self._parts: dict[str, list[Source]] = {}
+    name: str
+    what: str
+    values: Mapping[str, Any]
+    report: Report
+    used: set[str] = field(default_factory=set)
+    rows: Any = None
+    prefix: str = ""
+    _parts: "dict[str, list[Source]]" = field(init=False, default_factory=dict)
 
     def __contains__(self, name: str) -> bool:
         return name in self.values
@@ -52,49 +57,38 @@ class Source:
         return iter(self.values)
 
     def __getitem__(self, name: str) -> Any:
-        """A value, which is used from now on.
-
-        Raises:
-            DataError: There is none of this name.
-        """
+        """A value, which is used from now on; a `DataError` if there is none."""
         if name not in self.values:
             raise DataError(f"{self.name}: {self.what} {name!r} is missing")
-        self.used.add(self._prefix + name)
-        value = self.values[name]
-        return value if self._rows is None else value[self._rows]
+        self.used.add(self.prefix + name)
+        return self.values[name] if self.rows is None else self.values[name][self.rows]
 
     def take(self, name: str, *shape: int) -> Any:
         """An array of a given shape, contiguous; -1 is any length."""
         array = np.ascontiguousarray(self[name])
-        fits = array.ndim == len(shape) and all(
-            wanted in (-1, size) for wanted, size in zip(shape, array.shape, strict=True)
-        )
-        if not fits:
-            raise DataError(
-                f"{self.name}: {self.what} {name!r} has shape {array.shape}, not {shape}"
-            )
+        sizes = zip(shape, array.shape, strict=False)
+        if array.ndim != len(shape) or any(wanted not in (-1, size) for wanted, size in sizes):
+            found = f"{self.what} {name!r} has shape {array.shape}"
+            raise DataError(f"{self.name}: {found}, not {shape}")
         return array
 
     @property
     def num_rows(self) -> int:
         """Rows of a table, or of a part of one."""
-        return len(next(iter(self.values.values())) if self._rows is None else self._rows)
+        return len(next(iter(self.values.values())) if self.rows is None else self.rows)
 
     def at(self, rows: Any) -> "Source":
-        """Some rows of every value: an index, a slice, a mask or indices."""
-        if self._rows is not None:
-            rows = self._rows[rows]
-        elif getattr(rows, "dtype", None) == np.bool_:
+        """Some rows of every value: an index, indices or a mask."""
+        if getattr(rows, "dtype", None) == np.bool_:
             rows = np.flatnonzero(rows)
-        return Source(self.name, self.what, self.values, self.report, used=self.used, rows=rows)
+        return replace(self, rows=rows if self.rows is None else self.rows[rows])
 
     def below(self, prefix: str) -> "Source":
         """The values whose names begin with a prefix, by the rest of their names."""
         values = {n.removeprefix(prefix): v for n, v in self.values.items() if n.startswith(prefix)}
-        shared = {"used": self.used, "rows": self._rows, "prefix": self._prefix + prefix}
-        return Source(self.name, self.what, values, self.report, **shared)
+        return replace(self, values=values, prefix=self.prefix + prefix)
 
-    def groups(self, *key: str) -> dict[tuple[str, ...], "Source"]:
+    def groups(self, *key: str) -> "dict[tuple[str, ...], Source]":
         """The rows by the values of key columns, in the order of the file."""
         groups: dict[tuple[str, ...], list[int]] = {}
         for row, values in enumerate(zip(*(self[name].tolist() for name in key), strict=True)):
@@ -112,19 +106,17 @@ class Source:
         `finish` names the fields of these objects that nothing used.
         """
         if name not in self._parts:
-            found, used = self[name], set[str]()
+            found, label, used = self[name], f"{self.name} {name}", set[str]()
             items = found if isinstance(found, list) else [found]
-            self._parts[name] = [
-                Source(f"{self.name} {name}", self.what, item, self.report, used=used)
-                for item in items
-            ]
+            parts = [Source(label, self.what, item, self.report, used) for item in items]
+            self._parts[name] = parts
         return self._parts[name]
 
     def match(
         self,
         where: str,
         ours: Mapping[str, object],
-        atol: float | Mapping[str, ArrayLike] = EXACT,
+        atol: Tolerances = EXACT,
         *,
         quantity: str | None = None,
     ) -> bool:
@@ -133,7 +125,7 @@ class Source:
         Args:
             where: Which case.
             ours: Our value by name.
-            atol: Tolerance of all, or by name, "" being that of all others; else exact.
+            atol: Tolerances.
             quantity: Begins the names of the quantities, instead of the name of the file.
 
         Returns:
@@ -143,42 +135,32 @@ class Source:
         for name, value in ours.items():
             bound = atol if isinstance(atol, float) else atol.get(name, atol.get("", EXACT))
             label = f"{prefix} {name}".strip()
-            if name not in self:
+            if name in self:
+                agree &= self.report.compare(label, where, value, self[name], atol=bound)
+            else:
                 self.report.fail(label, where, f"no {self.what} {name!r}")
                 agree = False
-            else:
-                agree &= self.report.compare(label, where, value, self[name], atol=bound)
         return agree
 
     def match_rows(
-        self,
-        ours: Mapping[str, Any],
-        atol: float | Mapping[str, ArrayLike] = EXACT,
-        *,
-        where: str = "case",
-        quantity: str | None = None,
+        self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
     ) -> None:
-        """`match`, where every row is a case of its own.
-
-        Raises:
-            DataError: Ours are not as many rows.
-        """
+        """`match`, where every row is a case of its own; a `DataError` if ours are not as many."""
         counts = {len(value) for value in (*ours.values(), *(self[n] for n in ours if n in self))}
         if len(counts) != 1:
             raise DataError(f"{self.name}: {', '.join(ours)}: rows are {sorted(counts)}")
         for row in range(counts.pop()):
-            values = {name: value[row] for name, value in ours.items()}
-            self.at(row).match(f"{where} {row}", values, atol, quantity=quantity)
+            self.at(row).match(f"{where} {row}", {n: v[row] for n, v in ours.items()}, atol)
 
     def note(self, what: str, *names: str) -> None:
         """Name values that need not be compared."""
-        self.used.update(self._prefix + name for name in names)
+        self.used.update(self.prefix + name for name in names)
         self.report.note(f"{self.name} {', '.join(names)}{': ' if names else ''}{what}")
 
     def finish(self) -> None:
         """Name the values that nothing used."""
         for name in self.values:
-            if name not in self.used:
+            if self.prefix + name not in self.used:
                 self.report.skip(f"{self.name}: {self.what} {name!r}")
         for part in (part for parts in self._parts.values() for part in parts):
             part.finish()
@@ -191,17 +173,26 @@ def read_arrays(path: Path, report: Report, name: str = "") -> Source:
 
 
 def read_table(path: Path, report: Report) -> Source:
-    """The columns of a `.parquet`: strings are object arrays, absent values None or NaN.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
+    """The columns of a `.parquet`: strings are object arrays, absent values None or NaN."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise DataError(f"{path}: not a readable Parquet file ({error})") from error
     columns = {name: table[name].to_numpy() for name in table.column_names}
     return Source(path.stem, "column", columns, report)
+
+
+def read_fields(path: Path, report: Report, name: str = "") -> Source:
+    """The fields of a `.json` that holds one object; `name` is another name for it."""
+    return Source(name or path.stem, "field", read_json(path), report)
+
+
+def read_json(path: Path) -> Any:
+    """Content of a `.json`; a `DataError` if it cannot be read."""
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not readable JSON: {error}") from error
 
 
 class Groups:
@@ -230,8 +221,7 @@ class Groups:
         return self._groups.get(key)
 
     def __getitem__(self, key: tuple[str, ...]) -> Source:
-        rows = self.get(*key)
-        if rows is None:
+        if (rows := self.get(*key)) is None:
             raise DataError(f"{self.table.name}: no rows of {' '.join(key)}")
         return rows
 
@@ -239,7 +229,7 @@ class Groups:
         self,
         key: tuple[str, ...],
         ours: Mapping[str, Any],
-        atol: float | Mapping[str, ArrayLike] = EXACT,
+        atol: Tolerances = EXACT,
         *,
         quantity: str | None = None,
     ) -> bool:
@@ -259,23 +249,6 @@ class Groups:
             self.table.finish()
 
 
-def read_json(path: Path) -> Any:
-    """Content of a `.json`.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
-    try:
-        return json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: not readable JSON: {error}") from error
-
-
-def read_fields(path: Path, report: Report, name: str = "") -> Source:
-    """The fields of a `.json` that holds one object; `name` is another name for it."""
-    return Source(name or path.stem, "field", read_json(path), report)
-
-
 def verify_files(
     folder: Path, report: Report, parts: Mapping[str, Callable[[Path], object] | None]
 ) -> None:
@@ -288,10 +261,11 @@ def verify_files(
             be compared, as `README*` never need be.
     """
     for path in sorted(folder.iterdir()):
-        pattern = next((pattern for pattern in parts if fnmatch(path.name, pattern)), None)
-        if pattern is None and not path.name.startswith("README"):
+        pattern = next((p for p in (*parts, "README*") if fnmatch(path.name, p)), None)
+        part = None if pattern is None else parts.get(pattern)
+        if pattern is None:
             report.skip(f"file {path.name}")
-        elif pattern is None or (part := parts[pattern]) is None:
+        elif part is None:
             report.note(f"{path.name} (for reading)")
         else:
             with report.attempt(path.stem, path.name):

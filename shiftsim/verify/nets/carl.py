@@ -105,7 +105,7 @@ def _verify_decoding(file: Source, scenes: Scenes) -> None:
         commands[row] = _numbers(command_of(action, ego))
         step_bicycle(ego, *commands[row], WHEEL_BASE, 0.1, after[row])
     ours = {"command": commands, "next_state": after}
-    file.below("out.").match_rows(ours, DECODED, where=file.name, quantity=NAME)
+    file.below("out.").match_rows(ours, DECODED, where=file.name)
 
 
 def _numbers(command: Command) -> tuple[float, float]:

@@ -1,9 +1,8 @@
 """PlanTF, and what its comparisons share with PLUTO's: features, inputs and outputs of networks."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
-from inspect import signature
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,7 +13,8 @@ from shiftsim.planners.learned.map_features import RoadFeatures
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.planners.learned.plantf.planner import MAX_AGENTS, RADIUS, PlanTF, make_batch
-from shiftsim.planners.learned.pluto.proposals import STEPS, headings_of
+from shiftsim.planners.learned.pluto.proposals import headings_of
+from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLAN_COLUMNS, PLANS, POSITION, Loop, verify_loop
 from shiftsim.verify.nets.networks import (
@@ -128,7 +128,7 @@ def network_inputs(planner: str, arrays: Source) -> Any:
 
     kind = network_module(planner).Inputs
     values = {}
-    for field in set(INPUTS) & set(signature(kind).parameters):
+    for field in set(INPUTS) & {item.name for item in fields(kind)}:
         if field == "object_pose":
             pose = (arrays["static_objects.position"], arrays["static_objects.heading"][..., None])
             array = np.concatenate(pose, axis=-1)

@@ -137,8 +137,8 @@ def _compare_choice(loop: Loop, choice: Choice) -> None:
     ours = {
         "cand": (choice.poses, POSITION),
         "lscore": (choice.learned, SCORE),
-        "agents_pred": (choice.agents[0], POSITION),
-        "agents_vel": (choice.agents[1], OUTPUT[loop.variant]),
+        "agents_pred": (choice.agents.poses, POSITION),
+        "agents_vel": (choice.agents.speeds, OUTPUT[loop.variant]),
         **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
     }
     for name, (value, atol) in ours.items():
@@ -163,7 +163,10 @@ def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     line = nearest_line(sight.lines, ego)
     ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
     stored.match(loop.where, ours, EXACT, quantity=NAME)
-    world = loop.planner.world_of(loop.seen, (stored["agents_pred"], stored["agents_vel"]))
+    agents = loop.planner.choice.agents._replace(
+        poses=stored["agents_pred"], speeds=stored["agents_vel"]
+    )
+    world = loop.planner.world_of(loop.seen, agents)
     place = Place(sight.drivable, scenario.map.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
     scores: Scores = score(proposals, stored["lscore"], ego, world, place, PACIFICA)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.route_correction import (
+from shiftsim.planners.routes.correction import (
     RouteCorrector,
     correct_route,
     find_start,
