@@ -32,12 +32,7 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    make_network,
-    match_meta,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks

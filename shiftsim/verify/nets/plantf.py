@@ -17,12 +17,7 @@ from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLAN_COLUMNS, PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    OUTPUT,
-    make_network,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network, verify_manifest
 from shiftsim.verify.scenes import Scenes
 
 Arrays: TypeAlias = dict[str, np.ndarray]
