@@ -32,13 +32,7 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    make_network,
-    match_meta,
-    num_elements,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
@@ -94,13 +88,10 @@ class KeyedPlanner(DiffusionPlanner):
 
 
 def _verify_manifest(file: Source, scenes: Scenes) -> None:
-    from shiftsim.planners.learned.diffusion.network import PREFIXES, build_network
+    from shiftsim.planners.learned.diffusion.network import PREFIXES
 
-    network = build_network()
     last = "decoder.decoder.dit.final_layer.proj.4"
     others = {
-        "parameters": num_elements(network.state_dict().values()),
-        "parameters_encoder": num_elements(network.encoder.parameters()),
         "checkpoint": lambda given: {
             **given,
             "prefix": PREFIXES[0] + given["prefix"][len(PREFIXES[0]) :],
@@ -109,7 +100,7 @@ def _verify_manifest(file: Source, scenes: Scenes) -> None:
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
         "noise": _NOISE,
     }
-    verify_manifest(file, NAME, others)
+    verify_manifest(file, NAME, {"parameters": "", "parameters_encoder": "encoder"}, others)
 
 
 def _verify_args(file: Source, scenes: Scenes) -> None:
@@ -127,20 +118,20 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
 
     made, count = sampler.SCHEDULE, sampler.STEPS
     ours = {
-        "timesteps": made.times.numpy(),
-        "lambda": made.half_snr.numpy(),
-        "log_alpha": made.log_alpha.numpy(),
-        "alpha": made.alpha.numpy(),
-        "sigma": made.sigma.numpy(),
+        "timesteps": made.times,
+        "lambda": made.half_snr,
+        "log_alpha": made.log_alpha,
+        "alpha": made.alpha,
+        "sigma": made.sigma,
         "final_denoise_t": sampler.LAST_TIME,
     }
     steps = {
         "step": np.arange(count) + 1,
         "order": np.minimum(np.arange(count) + 1, 2),
-        "t": made.times[1:].numpy(),
-        "h": made.h.numpy(),
-        "c_x": made.c_x.numpy(),
-        "c_x0": made.c_x0.numpy(),
+        "t": made.times[1:],
+        "h": made.h,
+        "c_x": made.c_x,
+        "c_x0": made.c_x0,
         "r0": np.array([np.nan, *made.r0.tolist()]),
     }
     file.match(file.name, ours, SCHEDULE, quantity=NAME)
@@ -165,11 +156,11 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
         inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
         network = make_network(NAME, "base")
         scene = network.normalise(inputs)
-        normalised = {name: scene[name].numpy() for name in network.normalisers}
+        normalised = {name: scene[name] for name in network.normalisers}
         file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
         encoded = {
-            "encoding": network.encode(scene).numpy(),
-            "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]).numpy(),
+            "encoding": network.encode(scene),
+            "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]),
         }
         file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
         for variant in variants:
@@ -212,8 +203,7 @@ def _verify_sampling(
         guided = with_guidance(call, network, inputs["neighbor_agents_past"], absent)
         ours["guided_prediction"] = (sampled(guided), bound)
     for name, (value, atol) in ours.items():
-        where = f"{file.name} {variant}"
-        stored.match(where, {name: value.numpy()}, atol, quantity=NAME)
+        stored.match(f"{file.name} {variant}", {name: value}, atol, quantity=NAME)
 
 
 def _compare(loop: Loop) -> None:
@@ -244,7 +234,7 @@ def _encoding(variant: str, features: Features) -> Any:
     network = make_network(NAME, variant)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
-        return network.encode(network.normalise(inputs))[0].numpy()
+        return network.encode(network.normalise(inputs))[0]
 
 
 def _verify_agents(file: Source, scenes: Scenes) -> None:

@@ -1,6 +1,7 @@
 """Networks with deterministic weights, and the manifests that say how they are made."""
 
 import json
+import re
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -19,10 +20,7 @@ OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale u
 def make_network(planner: str, variant: str, **args: Any) -> Any:
     """The network of a planner with deterministic weights, ready to be called.
 
-    Args:
-        planner: Its name.
-        variant: `base` or `drive`.
-        args: Hyper-parameters that differ from the released ones.
+    `variant` is that of the weights, `args` are hyper-parameters that differ from the released.
     """
     if variant not in OUTPUT:
         raise DataError(f"unknown variant {variant!r} of the weights")
@@ -31,22 +29,21 @@ def make_network(planner: str, variant: str, **args: Any) -> Any:
     return network.eval()
 
 
-def num_elements(tensors: Any) -> int:
-    """How many numbers tensors hold together."""
-    return sum(int(tensor.numel()) for tensor in tensors)
-
-
 def match_meta(file: Source, planner: str, ours: Mapping[str, object]) -> None:
     """Compare the JSON text in the array `meta`."""
     file.report.compare(f"{planner} meta", file.name, ours, json.loads(str(file["meta"])))
 
 
-def verify_manifest(manifest: Source, planner: str, others: Mapping[str, Any]) -> None:
+def verify_manifest(
+    manifest: Source, planner: str, counts: Mapping[str, str], others: Mapping[str, Any]
+) -> None:
     """Compare the manifest of a network: names, shapes, types, rules and weights.
 
     Args:
         manifest: The file `state_dict.json`.
         planner: Name of the planner.
+        counts: By field that is the size of all weights, or of the trainable ones if it says so:
+            pattern of their names.
         others: Further fields: our value, a function that makes it from theirs, or None for a text
             that need not be compared.
     """
@@ -83,10 +80,13 @@ def verify_manifest(manifest: Source, planner: str, others: Mapping[str, Any]) -
         for name in check:
             first = weights[name].ravel()[: len(check[name])].astype(float)
             report.compare(f"{planner} selfcheck", name, first, check[name])
-    for name, ours in others.items():
-        if ours is None:
-            manifest.note("description", name)
-        else:
-            value = ours(manifest[name]) if callable(ours) else ours
-            manifest.match(manifest.name, {name: value}, quantity=f"{planner} manifest")
+    sizes = {field: 0 for field in counts}
+    for field, pattern in counts.items():
+        some = parameters if "trainable" in field else built
+        sizes[field] = sum(built[name].size for name in some if re.match(pattern, name))
+    made = {name: ours(manifest[name]) if callable(ours) else ours for name, ours in others.items()}
+    for name in [name for name, ours in made.items() if ours is None]:
+        manifest.note("description", name)
+        del made[name]
+    manifest.match(manifest.name, sizes | made, quantity=f"{planner} manifest")
     manifest.used.add("planner")

@@ -154,11 +154,7 @@ def _compare_choice(loop: Loop, choice: Choice) -> None:
 
 def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     """Compare what the scores of the stored proposals are, against the stored predictions."""
-    stored, scenario, ego = (
-        loop.stored.below("post/"),
-        loop.scenario,
-        loop.seen.history.ego[-1],
-    )
+    stored, scenario, ego = (loop.stored.below("post/"), loop.scenario, loop.seen.history.ego[-1])
     tokens = [scenario.tracks.tokens[track] for track in sight.agents.tracks.tolist()]
     line = nearest_line(sight.lines, ego)
     ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
