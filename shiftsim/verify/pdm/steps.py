@@ -105,8 +105,7 @@ def _plan(inputs: Source) -> tuple[Planned, list[str]]:
     things, parts = inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in _OBJECT] for thing in things], np.float64)
     kinds, names = ([thing[name] for thing in things] for name in ("type", "token"))
-    whole = (slice(None),)
-    tracks = make_tracks((1, len(things)), whole, values.reshape(1, -1, 7), kinds, names)
+    tracks = make_tracks((1, len(things)), ..., values.reshape(1, -1, 7), kinds, names)
     center = center_poses(ego[None, :3])[0]
     chosen = select_tracks(tracks, center[0], center[1], set(), DEFAULT)
     ids, reds = [part["id"] for part in parts], inputs["red_light_lane_ids"]
