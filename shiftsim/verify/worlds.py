@@ -12,7 +12,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import Source
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import NUM_STATE, AgentKind, Tracks, TrafficLights
+from shiftsim.world.state import NUM_STATE, AgentKind, Tracks, TrafficLights, center_poses
 
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
@@ -29,6 +29,12 @@ def ego_states(columns: Mapping[str, Any]) -> FloatArray:
     for name, values in columns.items():
         out[:, EGO_COLUMNS.index(_SHORT.get(name, name))] = values
     return out
+
+
+def ego_columns(states: FloatArray) -> dict[str, FloatArray]:
+    """Columns of the official tables by name, from (R, 11) ego states: rear axle and centre."""
+    columns = np.concatenate([states, center_poses(states[:, :3])], axis=1)
+    return dict(zip((*EGO_COLUMNS, *CENTER_COLUMNS), columns.T, strict=True))
 
 
 def make_tracks(

@@ -11,10 +11,10 @@ from shiftsim.verify.files import Groups, Source, read_json
 from shiftsim.verify.nuplan.maps import METRES, RADIANS, verify_maps
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS
+from shiftsim.verify.worlds import ego_columns
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, LightStatus, center_poses
+from shiftsim.world.state import AgentKind, LightStatus
 
 POSE = np.array([METRES, METRES, RADIANS])
 _EGO = {
@@ -33,12 +33,7 @@ _ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples 
 
 
 def verify_nuplan_import(folder: Path, report: Report) -> None:
-    """Compare maps, logged ego states, objects, lights and scene facts with the official ones.
-
-    Args:
-        folder: Folder with `scenes.json`, `logs`, `maps` and `expected`.
-        report: Filled with the comparisons.
-    """
+    """Compare maps, logged ego states, objects, lights and scene facts with the official ones."""
     scenes, expected = Scenes(folder), folder / "expected"
     verify_maps(expected, scenes.maps, report)
     ego = Groups(expected / "log_ego.parquet", report, ("scene", "kind"))
@@ -161,14 +156,8 @@ def _compare_ego(key: tuple[str, str], scene: Scenario, ego: Groups) -> None:
     if key[1] in _EXCERPTS:
         num, horizon, direction, iteration = _EXCERPTS[key[1]]
         rows = excerpt_rows(scene, int(rows[iteration]), num, horizon, direction)
-    states = scene.ego[rows]
-    ours = {
-        "index": np.arange(len(rows)),
-        "time_us": scene.time_us[rows],
-        **dict(zip(EGO_COLUMNS, states.T, strict=True)),
-        **dict(zip(CENTER_COLUMNS, center_poses(states[:, :3]).T, strict=True)),
-    }
-    ego.match(key, ours, _EGO)
+    samples = {"index": np.arange(len(rows)), "time_us": scene.time_us[rows]}
+    ego.match(key, {**samples, **ego_columns(scene.ego[rows])}, _EGO)
 
 
 def _compare_objects(key: tuple[str, ...], scene: Scenario, log: Log, objects: Groups) -> None:
