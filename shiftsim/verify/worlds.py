@@ -12,7 +12,14 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import Source
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import NUM_STATE, AgentKind, Tracks, TrafficLights, center_poses
+from shiftsim.world.state import (
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    AgentKind,
+    Tracks,
+    TrafficLights,
+    center_poses,
+)
 
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
@@ -20,6 +27,7 @@ EGO_COLUMNS = (
     *("tire_steering_angle", "tire_steering_rate", "angular_velocity", "angular_acceleration"),
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
+BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
@@ -35,6 +43,21 @@ def ego_columns(states: FloatArray) -> dict[str, FloatArray]:
     """Columns of the official tables by name, from (R, 11) ego states: rear axle and centre."""
     columns = np.concatenate([states, center_poses(states[:, :3])], axis=1)
     return dict(zip((*EGO_COLUMNS, *CENTER_COLUMNS), columns.T, strict=True))
+
+
+def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str, Any]:
+    """Columns of `objects.parquet` but for heights: tracks at rows, both (R,)."""
+    kinds = tracks.kinds[index]
+    # the official table shows static objects, which have no velocity, as standing
+    moves = tracks.velocities[rows, index]
+    moves = np.where(kinds[:, None] > LAST_AGENT_KIND, np.nan_to_num(moves), moves)
+    values = [tracks.poses[rows, index], moves, tracks.sizes[rows, index]]
+    return {
+        "iteration": rows,
+        "track_token": [tracks.tokens[i] for i in index.tolist()],
+        "type": [AgentKind(kind).name for kind in kinds.tolist()],
+        **dict(zip(BOX_COLUMNS, np.concatenate(values, axis=1).T, strict=True)),
+    }
 
 
 def make_tracks(

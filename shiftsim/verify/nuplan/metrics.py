@@ -11,7 +11,14 @@ from shiftsim.verify.files import EXACT, RUN_KEY, TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, make_tracks, recorded_log
+from shiftsim.verify.worlds import (
+    BOX_COLUMNS,
+    EGO_COLUMNS,
+    ego_columns,
+    ego_states,
+    make_tracks,
+    recorded_log,
+)
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -114,8 +121,7 @@ def tracks_of(rows: Source, count: int) -> Tracks:
         raise DataError("an object occurs twice at one iteration")
     if iteration.min() < 0 or iteration.max() >= count:
         raise DataError(f"objects at iteration {iteration.max()}, ego at {count} iterations")
-    names = ("x", "y", "heading", "vx", "vy", "length", "width")
-    values = np.column_stack([rows[name].astype(np.float64) for name in names])
+    values = np.column_stack([rows[name].astype(np.float64) for name in BOX_COLUMNS])
     listed = [kinds[token] for token in tokens]
     return make_tracks((count, len(tokens)), (iteration, track), values, listed, tokens)
 

@@ -21,9 +21,9 @@ from shiftsim.verify.files import TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import known_scores
 from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states
+from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, Trajectory
+from shiftsim.world.state import AgentKind, Tracks, Trajectory
 
 EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
 # m, rad, m/s; the README of the folder allows 1e-3 m
@@ -105,21 +105,11 @@ def _compare_objects(
     orders = [order_observed(tracks.kinds, row, open_loop) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
     track = np.concatenate(orders)
-    kinds, tokens = tracks.kinds[track], [tracks.tokens[i] for i in track.tolist()]
-    velocities = np.where(
-        kinds[:, None] > LAST_AGENT_KIND, 0.0, tracks.velocities[iteration, track]
-    )
+    ours = object_columns(tracks, iteration, track)
     # of vehicles as in the first frame, of others as replayed
-    first = np.where(kinds == AgentKind.VEHICLE, 0, iteration).tolist()
-    ours = {
-        "iteration": iteration,
-        "track_token": tokens,
-        "type": [AgentKind(kind).name for kind in kinds],
-        **dict(zip(("x", "y", "heading"), tracks.poses[iteration, track].T, strict=True)),
-        **dict(zip(("length", "width"), tracks.sizes[iteration, track].T, strict=True)),
-        **dict(zip(("vx", "vy"), velocities.T, strict=True)),
-        "height": [heights.get(pair, np.nan) for pair in zip(first, tokens, strict=True)],
-    }
+    first = np.where(tracks.kinds[track] == AgentKind.VEHICLE, 0, iteration).tolist()
+    pairs = zip(first, ours["track_token"], strict=True)
+    ours["height"] = [heights.get(pair, np.nan) for pair in pairs]
     objects.match(key, ours, OBJECT_TOLERANCES, quantity="reactive")
 
 
