@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-thorough test-docs test-kill test-browser lint types docs bench verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-docs test-kill test-browser lint types docs bench bench-smoke verify dist clean-cache
 
 install: .venv/installed
 
@@ -44,8 +44,19 @@ docs: install
 bench: install
 	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s -p no:cacheprovider --benchmark-disable-gc --benchmark-columns=median,iqr
 
+bench-smoke: install
+	$(BIN)/python -m pytest shiftsim/benchmarks/speed -q -p no:cacheprovider --benchmark-disable
+
+# folders of the references that are not compared yet; paper holds published figures
+NOT_VERIFIED := nuplan_experiment nuplan_lights open_data scenario_edits paper
+
 verify: install
-	for folder in ../shared/reference/*/; do $(BIN)/shiftsim verify $$folder || exit 1; done
+	for folder in ../shared/reference/*/; do \
+	  case " $(NOT_VERIFIED) " in \
+	    *" $$(basename $$folder) "*) echo "$$folder: not compared yet";; \
+	    *) $(BIN)/shiftsim verify $$folder || exit 1;; \
+	  esac; \
+	done
 
 dist: install
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .

@@ -98,23 +98,14 @@ def published() -> Published:
     )
     return Published(
         source=table["source"],
-        cities={short: tuple(names) for short, names in table["cities"].items()},
+        cities=table["cities"],
         scenarios=table["scenarios"],
-        columns=tuple(shift["columns"]),
-        semantic_shift={
-            traffic: {name: tuple(values) for name, values in rows.items()}
-            for traffic, rows in _tables(shift).items()
-        },
-        noises=tuple(noise["columns"]),
-        robustness={
-            traffic: {
-                name: {planner: tuple(map(tuple, cells)) for planner, cells in rows.items()}
-                for name, rows in sets.items()
-            }
-            for traffic, sets in _tables(noise).items()
-        },
-        sets=tuple(comparison["columns"]),
-        comparison={name: tuple(cells) for name, cells in comparison["rows"].items()},
+        columns=shift["columns"],
+        semantic_shift=_tables(shift),
+        noises=noise["columns"],
+        robustness=_tables(noise),
+        sets=comparison["columns"],
+        comparison=comparison["rows"],
     )
 
 

@@ -17,7 +17,8 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.config import DEFAULT_STORE, make_config
-from shiftsim.runs.execute import RUNS, Prepared, Progress, execute, prepare
+from shiftsim.runs.execute import Progress, execute
+from shiftsim.runs.prepare import RUNS, Prepared, prepare
 from shiftsim.runs.results import Run, open_run
 
 MANIFEST = "bench.json"
@@ -156,7 +157,7 @@ def run_bench(
 
         def show(progress: Progress, base: Progress = base, last: list[Progress] = last) -> None:
             last[0] = progress
-            on_progress(_added(base, progress))
+            on_progress(base + replace(progress, total=0))
 
         if prepared.before == "complete":
             out.append(open_run(prepared.folder))
@@ -164,20 +165,8 @@ def run_bench(
             on_progress(base)
         else:
             out.append(execute(prepared, on_progress=show, argv=argv))
-            base = _added(base, last[0])
+            base = base + replace(last[0], total=0)
     return out
-
-
-def _added(base: Progress, progress: Progress) -> Progress:
-    seconds = dict(base.seconds)
-    for name, value in progress.seconds.items():
-        seconds[name] = seconds.get(name, 0.0) + value
-    return replace(
-        base,
-        done=base.done + progress.done,
-        failed=base.failed + progress.failed,
-        seconds=seconds,
-    )
 
 
 def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:

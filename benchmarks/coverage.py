@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from shiftsim.benchmarks import Track
-from shiftsim.report.groups import TRAFFIC, Group
-from shiftsim.report.paper import distinct_sets
+from shiftsim.report.groups import TRAFFIC, Group, distinct_sets
 from shiftsim.report.tables import Cell, Number, Table
 
 

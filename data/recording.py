@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.data.track_order import copy_columns, order_of_columns
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
@@ -141,7 +140,7 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     )
     arrays = (chosen.valid, chosen.poses, chosen.velocities, chosen.sizes)
     sources = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
-    copy_columns(index, *map(np.ascontiguousarray, sources), *arrays)
+    _copy_columns(index, *map(np.ascontiguousarray, sources), *arrays)
     return chosen
 
 
@@ -171,3 +170,101 @@ def freeze(scene: Scenario) -> None:
         array.flags.writeable = False
     if scene.mission_goal is not None:
         scene.mission_goal.flags.writeable = False
+
+
+def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
+    """Order of dense tracks (R, N), such that every frame lists its tracks as nuPlan does.
+
+    nuPlan rule 410: by type, and within a type as the log lists them. The order depends only on the
+    rows given, so that a window of a longer recording is ordered as if it had been read alone.
+    """
+    before = np.zeros((len(kinds), len(kinds)), np.bool_)
+    first = np.full(len(kinds), len(valid), np.int64)
+    _link_columns(valid, kinds, before, first)
+    return sort_tracks(before, kinds, first)
+
+
+@kernel
+def _copy_columns(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
+    index: IntArray,
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    out_valid: BoolArray,
+    out_poses: FloatArray,
+    out_velocities: FloatArray,
+    out_sizes: FloatArray,
+):
+    """Copy the tracks `index` (N',) of dense arrays (R, N, …) into others (R, N', …)."""
+    for row in range(valid.shape[0]):
+        for to in range(len(index)):
+            track = index[to]
+            out_valid[row, to] = valid[row, track]
+            out_poses[row, to, 0] = poses[row, track, 0]
+            out_poses[row, to, 1] = poses[row, track, 1]
+            out_poses[row, to, 2] = poses[row, track, 2]
+            out_velocities[row, to, 0] = velocities[row, track, 0]
+            out_velocities[row, to, 1] = velocities[row, track, 1]
+            out_sizes[row, to, 0] = sizes[row, track, 0]
+            out_sizes[row, to, 1] = sizes[row, track, 1]
+
+
+@kernel
+def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: IntArray) -> None:
+    last = np.full(16, -1)
+    for frame in range(valid.shape[0]):
+        for kind in range(len(last)):
+            last[kind] = -1
+        for track in range(valid.shape[1]):
+            if not valid[frame, track]:
+                continue
+            kind = kinds[track]
+            if last[kind] >= 0:
+                before[last[kind], track] = True
+            last[kind] = track
+            first[track] = min(first[track], frame)
+
+
+@kernel
+def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
+    """Order tracks by kind, then as the frames list them, then by first appearance.
+
+    Args:
+        before: (N, N) whether the first directly precedes the second in a frame.
+        kinds: (N,) type of each track.
+        first: (N,) frame in which each appears first.
+
+    Returns:
+        (N,) indices of the tracks in their new order. Where frames contradict each other, the
+        track that appears first comes first.
+    """
+    num = len(kinds)
+    waiting = np.zeros(num, np.int64)
+    for a in range(num):
+        for b in range(num):
+            if before[a, b]:
+                waiting[b] += 1
+    done = np.zeros(num, np.bool_)
+    out = np.empty(num, np.int64)
+    for place in range(num):
+        best = -1
+        for track in range(num):
+            if not done[track] and (best < 0 or _precedes(track, best, waiting, kinds, first)):
+                best = track
+        out[place] = best
+        done[best] = True
+        for track in range(num):
+            if before[best, track]:
+                waiting[track] -= 1
+    return out
+
+
+@kernel
+def _precedes(a: int, b: int, waiting: IntArray, kinds: IntArray, first: IntArray) -> bool:
+    """Whether track a is to be placed before b: by kind, then free of predecessors, then age."""
+    if kinds[a] != kinds[b]:
+        return kinds[a] < kinds[b]
+    if (waiting[a] <= 0) != (waiting[b] <= 0):
+        return waiting[a] <= 0
+    return first[a] < first[b]

@@ -7,9 +7,16 @@ number of threshold profiles can be applied to it.
 from collections.abc import Sequence
 
 from shiftsim.metrics.custom import CustomMetric, add_metrics, load_metric
-from shiftsim.metrics.measurements import Measurements, measure
 from shiftsim.metrics.result import Collision, MetricRow, Series, Statistic, Violation
-from shiftsim.metrics.score import MULTIPLIERS, SHORT_NAMES, WEIGHTS, MetricResult, judge
+from shiftsim.metrics.score import (
+    MULTIPLIERS,
+    SHORT_NAMES,
+    WEIGHTS,
+    Measurements,
+    MetricResult,
+    judge,
+    measure,
+)
 from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN, PROFILES, Thresholds, thresholds_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap

@@ -1,12 +1,17 @@
-"""Collisions: first contact with every track, who is at fault, and the score."""
+"""Collisions: first contact with every track, who is at fault, and the score.
+
+In kernels a box is a row (x, y, cos h, sin h, cos(h + pi/2), sin(h + pi/2), half length, half
+width, half diagonal). Most pairs are decided by distances with a margin; the rest exactly, on
+corners.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.metrics import kernels_collision
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.boxes import BEHIND, bearing, boxes_to_corners, front_touches
+from shiftsim.geometry.rings import convex_intersect
 from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Statistic, Violation
 from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.state import (
@@ -20,6 +25,10 @@ from shiftsim.world.state import (
 
 NAME = "no_ego_at_fault_collisions"
 COLLISION_TYPES = ("stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral")
+STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
+STOPPED_SPEED = 5e-2  # m/s, nuPlan at-fault collisions
+BOX_SIZE = 9  # numbers that make a box in kernels
+_MARGIN = 1e-6  # m, far above rounding: gaps beyond it need no exact test
 GROUPS = {
     "VRUs": (AgentKind.PEDESTRIAN, AgentKind.BICYCLE),
     "vehicles": (AgentKind.VEHICLE,),
@@ -87,9 +96,10 @@ def flat_tracks(tracks: Tracks) -> FlatTracks:
 
 def first_contacts(ego: Ego, tracks: FlatTracks) -> Contacts:
     """When and how the ego first touches each track."""
+    # nuPlan rule 83: only the first contact with a track is classified
     count = len(tracks.is_static)
-    out = Contacts(np.empty(count, np.int64), np.zeros(count, np.int64), np.zeros(count))
-    kernels_collision.first_contacts(*ego, *tracks, *out)
+    out = Contacts(np.full(count, len(ego.states)), np.zeros(count, np.int64), np.zeros(count))
+    _first_contacts(ego, tracks, out)
     return out
 
 
@@ -98,14 +108,15 @@ def classify(
 ) -> tuple[Collision, ...]:
     """The contacts in order of time, type and track, with the verdict on the ego."""
     hit = np.flatnonzero(contacts.first < len(time_us))
-    # nuPlan: tracks of one sample are sorted by type
+    # nuPlan rule 60: tracks that are hit at one sample are sorted by kind
     order = hit[np.lexsort((tracks.kinds[hit], contacts.first[hit]))]
     found = []
     for track in order.tolist():
         sample, kind = int(contacts.first[track]), int(contacts.types[track])
-        always = kind in (kernels_collision.STOPPED_TRACK, kernels_collision.ACTIVE_FRONT)
-        # nuPlan: a lateral contact is the ego's fault only while it is between lanes or off road
-        lateral = kind == kernels_collision.ACTIVE_LATERAL and not is_common[sample]
+        always = kind in (STOPPED_TRACK, ACTIVE_FRONT)
+        # nuPlan rule 61: a track that stands is hit at fault, from wherever the ego comes
+        # nuPlan rule 62: a contact at the side is at fault only between lanes or off them
+        lateral = kind == ACTIVE_LATERAL and not is_common[sample]
         found.append(
             Collision(
                 sample,
@@ -166,3 +177,100 @@ def _energies(group: str, values: list[float]) -> list[Statistic]:
         Statistic(NAME, f"{how}_collision_energy_with_{group}", unit, how.upper(), float(value))
         for how, value in (("max", max(values)), ("min", min(values)), ("mean", np.mean(values)))
     ]
+
+
+@lean_kernel
+def set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> None:
+    """Write a box (9,) from its pose (3,) and size [m]."""
+    box[0], box[1] = pose[0], pose[1]
+    box[2], box[3] = np.cos(pose[2]), np.sin(pose[2])
+    box[4], box[5] = np.cos(pose[2] + np.pi / 2.0), np.sin(pose[2] + np.pi / 2.0)
+    set_size(box, length, width)
+
+
+@lean_kernel
+def set_size(box: FloatArray, length: float, width: float) -> None:
+    """Write the size of a box (9,) [m]."""
+    box[6], box[7] = 0.5 * length, 0.5 * width
+    box[8] = 0.5 * np.sqrt(length * length + width * width)
+
+
+@lean_kernel
+def _set_corners(box: FloatArray, out: FloatArray) -> None:
+    for index in range(4):
+        lon = box[6] if index == 0 or index == 3 else -box[6]
+        lat = box[7] if index < 2 else -box[7]
+        # the operations of geometry.box_corners, with the sines and cosines at hand
+        out[index, 0] = box[0] + (lat * box[4] + lon * box[2])
+        out[index, 1] = box[1] + (lat * box[5] + lon * box[3])
+
+
+@lean_kernel
+def _gap(a: FloatArray, b: FloatArray) -> float:
+    """Largest gap between two boxes along the axes of `a`; negative where they overlap [m]."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    cos, sin = abs(a[2] * b[2] + a[3] * b[3]), abs(a[2] * b[3] - a[3] * b[2])
+    lon = abs(dx * a[2] + dy * a[3]) - a[6] - b[6] * cos - b[7] * sin
+    lat = abs(dx * a[3] - dy * a[2]) - a[7] - b[6] * sin - b[7] * cos
+    return max(lon, lat)
+
+
+@lean_kernel
+def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
+    """Whether two boxes (9,) touch; `corners` (2, 4, 2) is scratch."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    reach = a[8] + b[8]
+    if not dx * dx + dy * dy < reach * reach:
+        return False
+    gap = max(_gap(a, b), _gap(b, a))
+    if abs(gap) > _MARGIN:
+        return gap < 0.0
+    _set_corners(a, corners[0])
+    _set_corners(b, corners[1])
+    return convex_intersect(corners[0], corners[1])
+
+
+@lean_kernel
+def _contact_type(
+    state: FloatArray,
+    speed: float,
+    track: FloatArray,
+    track_speed: float,
+    corners: FloatArray,
+    ring: FloatArray,
+) -> int:
+    """Position in `COLLISION_TYPES` of a contact; `ring` (4, 2) is scratch."""
+    if speed <= STOPPED_SPEED:
+        return STOPPED_EGO
+    if track_speed <= STOPPED_SPEED:
+        return STOPPED_TRACK
+    if bearing(state, track[0], track[1]) > BEHIND:
+        return ACTIVE_REAR
+    _set_corners(track, ring)
+    return ACTIVE_FRONT if front_touches(corners, ring) else ACTIVE_LATERAL
+
+
+@kernel
+def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
+    box, other, scratch = np.empty(BOX_SIZE), np.empty(BOX_SIZE), np.empty((2, 4, 2))
+    poses, sizes = tracks.poses, tracks.sizes
+    num_samples, num_tracks = tracks.valid.shape
+    for i in range(num_samples):
+        set_box(box, ego.centers[i], ego.size[0], ego.size[1])
+        for j in range(num_tracks):
+            if not tracks.valid[i, j] or out.first[j] < num_samples:
+                continue
+            dx, dy = poses[i, j, 0] - box[0], poses[i, j, 1] - box[1]
+            reach = box[8] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
+            if dx * dx + dy * dy > reach * reach:
+                continue
+            set_box(other, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])
+            if not collide(box, other, scratch):
+                continue
+            v, w = ego.speeds[i], 0.0
+            if not tracks.is_static[j]:
+                w = np.hypot(tracks.velocities[i, j, 0], tracks.velocities[i, j, 1])
+            out.first[j] = i
+            out.types[j] = _contact_type(ego.states[i], v, other, w, ego.corners[i], scratch[0])
+            angle = ego.states[i, 2] - poses[i, j, 2]
+            out.delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))

@@ -1,8 +1,8 @@
 """Comfort: seven smoothed or differentiated signals, and six bounds on them.
 
 Savitzky-Golay filters with `mode="interp"`: interior samples are weighted sums over a window, the
-first and last half windows lie on the polynomial fitted to the first or last window
-(nuplan-metrics.md §11). Signals shorter than the window lie on one fit altogether.
+first and last half windows lie on the polynomial fitted to the first or last window. Signals
+shorter than the window lie on one fit altogether.
 """
 
 from functools import lru_cache
@@ -13,15 +13,15 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import DataError
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
 from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.state import AX, AY, HEADING, center_accelerations
 
 NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
 _SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
-# nuPlan: an even window is centred half a sample ahead, so that interior output n is the fitted
-# value at n + 1/2, with a jump to the edge fits (nuplan-metrics.md §13 Q6)
+# nuPlan rule 79: an even window is centred half a sample ahead, so that interior output n is the
+# fitted value at n + 1/2, with a jump to the edge fits
 _SMOOTH_INTERIOR = np.array([-3.0, 3.0, 7.0, 9.0, 9.0, 7.0, 3.0, -3.0]) / 32.0
 
 
@@ -91,7 +91,7 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
         raise DataError(f"time stamps of the rollout do not increase at sample {at}")
     step = float(np.mean(steps))
     center = center_accelerations(states)
-    # nuPlan: magnitudes are taken at the rear axle, components at the centre (§13 Q7)
+    # nuPlan rule 80: magnitudes are taken at the rear axle, components at the centre
     magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
     lon, lat, mag = (_smooth(np.ascontiguousarray(v)) for v in (*center.T, magnitude))
     heading = _unwrap(states[:, HEADING])
@@ -154,10 +154,7 @@ def _judge_signal(
     margins = np.minimum(values - low, high - values)
     broken = ~((low < values) & (values < high))
     worst = int(np.argmin(margins))
-    violation = None
-    if broken.any():
-        at = int(np.argmax(broken))
-        violation = Violation(at, int(time_us[at]), None, float(values[at]))
+    violation = first_violation(broken, values, time_us)
     value = float(values[worst])
     nearest = low if value - low < high - value else high
     unit = _UNITS[metric]
@@ -178,7 +175,7 @@ def _percentile_90(values: FloatArray) -> float:
     """The 90th percentile by numpy's method `closest_observation`, without interpolation."""
     rank = len(values) * 0.9 - 1.5
     below = int(np.floor(rank))
-    # an exact tie goes to the even rank (numpy 1.26, as nuPlan pins it)
+    # nuPlan rule 82: an exact tie goes to the even rank, as in the numpy 1.26 that nuPlan pins
     tie = rank == below and below % 2 == 0
     return float(np.sort(values)[max(0, below if tie else below + 1)])
 
@@ -240,6 +237,6 @@ def _filter(values: FloatArray, interior: FloatArray, fit: FloatArray, scale: fl
         else:
             for j in range(window):
                 total += interior[j] * values[n - (window - 1) // 2 + j]
-        # nuPlan: rounded between smoothing and differentiation, and before comparison (§13 Q8)
+        # nuPlan rule 81: rounded between smoothing and differentiation, and before comparison
         out[n] = np.rint(total / scale * 1e8) / 1e8
     return out

@@ -1,23 +1,23 @@
-"""Drivable area: how far the corners of the ego leave the road."""
+"""Drivable area: how far the corners of the ego leave it."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.metrics import kernels_route
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.rings import boundary_distance_below
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
 
 NAME = "drivable_area_compliance"
 CORNERS_NAME = "corners_in_drivable_area"
 
 
-@dataclass(frozen=True, slots=True)
-class DrivableArea:
-    """Corners that leave the road.
+class DrivableArea(NamedTuple):
+    """Corners that leave the drivable area.
 
     Attributes:
         outside: (K, 4) whether a corner is in no lane, connector or drivable area.
@@ -29,21 +29,13 @@ class DrivableArea:
 
 
 def measure(
-    road: VectorMap, footprints: FloatArray, route: EdgeLists, corners: EdgeLists
+    map: VectorMap, footprints: FloatArray, route: EdgeLists, corners: EdgeLists
 ) -> DrivableArea:
     """Distance of every corner (K, 4, 2) from where it may be."""
     shape = corners.counts.shape
     out = DrivableArea(np.empty(shape, np.bool_), np.empty(shape))
-    kernels_route.corner_violations(
-        road.drivable_areas.polygons,
-        road.edges.polygons,
-        footprints,
-        corners.counts,
-        route.edges,
-        route.counts,
-        out.outside,
-        out.distances,
-    )
+    areas, edges = map.drivable_areas.polygons, map.edges.polygons
+    _corner_violations(areas, edges, footprints, corners.counts, route, out)
     return out
 
 
@@ -57,13 +49,18 @@ def judge(
     score = float(not far.any())
     compliance = MetricPart(
         MetricRow(
-            NAME, score, float(furthest.max()), "meters", bound, _first(far, furthest, time_us)
+            NAME,
+            score,
+            float(furthest.max()),
+            "meters",
+            bound,
+            first_violation(far, furthest, time_us),
         ),
         (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),),
     )
     outside = np.any(area.outside, axis=1)
     inside = float(not outside.any())
-    first = _first(outside, furthest, time_us)
+    first = first_violation(outside, furthest, time_us)
     corners = MetricPart(
         MetricRow(CORNERS_NAME, None, float(outside.sum()), "count", 0.0, first),
         (Statistic(CORNERS_NAME, CORNERS_NAME, "boolean", "BOOLEAN", inside),),
@@ -72,8 +69,85 @@ def judge(
     return compliance, corners
 
 
-def _first(broken: BoolArray, values: FloatArray, time_us: IntArray) -> Violation | None:
-    if not broken.any():
-        return None
-    at = int(np.argmax(broken))
-    return Violation(at, int(time_us[at]), None, float(values[at]))
+@kernel
+def _corner_violations(
+    drivable: Polygons,
+    edges: Polygons,
+    corners: FloatArray,
+    corner_counts: IntArray,
+    route: EdgeLists,
+    out: DrivableArea,
+) -> None:
+    """Write how far each corner is from where it may be.
+
+    Args:
+        drivable: Areas whose union is drivable.
+        edges: Areas of lanes and connectors.
+        corners: (K, 4, 2) [m].
+        corner_counts: (K, 4) number of edges that hold each corner.
+        route: (K, C) edges of the ego centre.
+        out: Written; distances are to the nearest drivable area or edge of the ego centre [m].
+    """
+    outside, distances = out.outside, out.distances
+    found = np.full(4, -1)  # nearest drivable area of each corner in the sample before
+    for i in range(len(corners)):
+        for corner in range(4):
+            x, y = corners[i, corner, 0], corners[i, corner, 1]
+            outside[i, corner] = corner_counts[i, corner] == 0 and not in_any(drivable, x, y)
+            distances[i, corner] = 0.0
+            if outside[i, corner]:
+                best = np.inf
+                for index in range(route.counts[i]):
+                    best = _distance_below(edges, route.edges[i, index], x, y, best)
+                if found[corner] >= 0:
+                    best = _distance_below(drivable, found[corner], x, y, best)
+                if best == np.inf:
+                    distances[i, corner] = _scan(drivable, x, y, found, corner)
+                else:
+                    distances[i, corner] = _scan_near(drivable, x, y, best, found, corner)
+
+
+@lean_kernel
+def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) -> float:
+    """Distance of a point from the nearest polygon, whose index goes to `found[corner]` [m]."""
+    best = np.inf
+    for poly in range(len(polygons.bounds)):
+        distance = _distance_below(polygons, poly, x, y, best)
+        if distance < best:
+            best, found[corner] = distance, poly
+    return best
+
+
+@lean_kernel
+def _scan_near(
+    polygons: Polygons, x: float, y: float, limit: float, found: IntArray, corner: int
+) -> float:
+    """The same where the nearest polygon is known to be no farther than `limit`: by the grid."""
+    best = limit
+    x0, y0, cell = polygons.grid[0], polygons.grid[1], polygons.grid[2]
+    first = max(int(np.floor((x - limit - x0) / cell)), 0)
+    last = min(int(np.floor((x + limit - x0) / cell)), polygons.shape[0] - 1)
+    low = max(int(np.floor((y - limit - y0) / cell)), 0)
+    high = min(int(np.floor((y + limit - y0) / cell)), polygons.shape[1] - 1)
+    for ix in range(first, last + 1):
+        for iy in range(low, high + 1):
+            at = ix * polygons.shape[1] + iy
+            for entry in range(polygons.cell_ptr[at], polygons.cell_ptr[at + 1]):
+                poly = polygons.cell_items[entry]
+                distance = _distance_below(polygons, poly, x, y, best)
+                if distance < best:
+                    best, found[corner] = distance, poly
+    return best
+
+
+@lean_kernel
+def _distance_below(polygons: Polygons, poly: int, x: float, y: float, limit: float) -> float:
+    """Distance of a point outside polygon `poly` from it, or `limit` where it is not below [m]."""
+    dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
+    dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
+    best = limit
+    if dx * dx + dy * dy < best * best:
+        for ring in range(polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]):
+            start, stop = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
+            best = boundary_distance_below(polygons.xy, start, stop, x, y, best)
+    return best

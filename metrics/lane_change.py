@@ -1,13 +1,52 @@
-"""Lane changes: counted and timed, never scored."""
+"""Lane changes: counted and timed, never scored; and whether all corners share lanes."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
+from shiftsim.arrays import BoolArray, IntArray, kernel, lean_kernel
 from shiftsim.metrics.result import MetricPart, MetricRow, Statistic
-from shiftsim.metrics.route import LaneChanges
+from shiftsim.metrics.route import EdgeLists, has
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.layers import Lists
+from shiftsim.world.map import VectorMap
 
 NAME = "ego_lane_change"
+
+
+@dataclass(frozen=True, slots=True)
+class LaneChanges:
+    """Lane changes of one rollout.
+
+    Attributes:
+        states: (K,) number of edges that hold all corners, connected ones included; 0 when the
+            ego is entirely outside lanes, -1 when its corners have none in common.
+        start: (L,) opening sample of each change.
+        end: (L,) closing sample.
+        failed: (L,) whether the ego came back, left the road, or did not finish.
+    """
+
+    states: IntArray
+    start: IntArray
+    end: IntArray
+    failed: BoolArray
+
+    @property
+    def is_common(self) -> BoolArray:
+        """(K,) whether all corners are in the same or in connected lanes."""
+        return self.states > 0
+
+
+def lane_changes(map: VectorMap, corners: EdgeLists) -> LaneChanges:
+    """The lane-change helper on the (K, 4, C) lists of the corners."""
+    num_samples = len(corners.counts)
+    widest = int(np.diff(map.outgoing.ptr).max(initial=0))
+    most = corners.edges.shape[2] * (1 + widest)
+    states = np.empty(num_samples, np.int64)
+    changes = np.empty((num_samples, 3), np.int64)
+    count = _lane_states(corners, map.incoming, map.outgoing, most, states, changes)
+    start, end, failed = changes[:count].T
+    return LaneChanges(states, start, end, failed > 0)
 
 
 def judge(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
@@ -28,3 +67,118 @@ def judge(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> Metr
     statistics.append(Statistic(NAME, name, "boolean", "BOOLEAN", float(within)))
     bound = thresholds.max_lane_change_fail_rate
     return MetricPart(MetricRow(NAME, None, ratio, "ratio", bound, None), tuple(statistics))
+
+
+@lean_kernel
+def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> bool:
+    """Whether an edge is among the first `count` items or the neighbours of one of them."""
+    if has(items, count, value):
+        return True
+    for index in range(count):
+        edge = items[index]
+        for item in range(neighbours.ptr[edge], neighbours.ptr[edge + 1]):
+            if neighbours.items[item] == value:
+                return True
+    return False
+
+
+@lean_kernel
+def _linked(
+    fl: IntArray,
+    rl: IntArray,
+    rr: IntArray,
+    fr: IntArray,
+    size: IntArray,
+    incoming: Lists,
+    outgoing: Lists,
+    out: IntArray,
+) -> int:
+    """Write the edges that connect the lanes of the corners; how many, or -1 for none."""
+    connected = False
+    for index in range(size[1]):
+        connected = connected or _in_extended(rr, size[2], outgoing, rl[index])
+    for index in range(size[2]):
+        connected = connected or _in_extended(rl, size[1], outgoing, rr[index])
+    if not connected:
+        return -1
+    found = 0
+    for index in range(size[2]):
+        first, last = outgoing.ptr[rr[index]], outgoing.ptr[rr[index] + 1]
+        for item in range(first - 1, last):
+            edge = rr[index] if item < first else outgoing.items[item]
+            if (
+                not has(out, found, edge)
+                and _in_extended(fl, size[0], incoming, edge)
+                and _in_extended(fr, size[3], incoming, edge)
+                and _in_extended(rl, size[1], outgoing, edge)
+            ):
+                out[found] = edge
+                found += 1
+    return found if found > 0 else -1
+
+
+@lean_kernel
+def _common(
+    lists: IntArray, size: IntArray, incoming: Lists, outgoing: Lists, out: IntArray
+) -> int:
+    """Write the edges common to the corners, else connecting them; 0 outside lanes, -1 for none."""
+    fl, rl, rr, fr = lists[0], lists[1], lists[2], lists[3]
+    empty = 0
+    for corner in range(4):
+        empty += size[corner] == 0
+    if empty > 0:
+        return 0 if empty == 4 else -1
+    found = 0
+    for index in range(size[0]):
+        edge = fl[index]
+        if has(rl, size[1], edge) and has(rr, size[2], edge) and has(fr, size[3], edge):
+            out[found] = edge
+            found += 1
+    return found if found > 0 else _linked(fl, rl, rr, fr, size, incoming, outgoing, out)
+
+
+@kernel
+def _lane_states(
+    corners: EdgeLists,
+    incoming: Lists,
+    outgoing: Lists,
+    most: int,
+    states: IntArray,
+    changes: IntArray,
+) -> int:
+    """Which samples have all corners in the same or connected lanes, and the lane changes.
+
+    Args:
+        corners: (K, 4, C) edges of each corner.
+        incoming: Edges that lead into an edge.
+        outgoing: Edges an edge leads to.
+        most: Upper bound on the number of edges common to the corners.
+        states: (K,) written: number of common or connected edges; 0 entirely outside lanes,
+            -1 none.
+        changes: (K, 3) written: opening sample, closing sample, 1 if it failed.
+
+    Returns:
+        Number of lane changes.
+    """
+    current, previous = np.empty(most, np.int64), np.empty(most, np.int64)
+    initial = np.empty(most, np.int64)
+    is_open, num, initial_size = False, 0, np.int64(0)
+    for i in range(len(corners.counts)):
+        state = _common(corners.edges[i], corners.counts[i], incoming, outgoing, current)
+        states[i] = state
+        if is_open and state >= 0:
+            failed = state == 0
+            for index in range(state):
+                failed = failed or _in_extended(initial, initial_size, outgoing, current[index])
+            changes[num, 1], changes[num, 2] = i, failed
+            num, is_open = num + 1, False
+        elif not is_open and i > 0 and state < 0 and states[i - 1] > 0:
+            initial_size = states[i - 1]
+            for index in range(initial_size):
+                initial[index] = previous[index]
+            changes[num, 0], is_open = i, True
+        current, previous = previous, current
+    if is_open:
+        changes[num, 1], changes[num, 2] = len(corners.counts) - 1, 1
+        num += 1
+    return num

@@ -1,24 +1,31 @@
-"""Progress along the route the expert drove, and making progress at all."""
+"""Progress: along the route the expert drove, making any at all, and along the driving direction.
+
+The driving direction is complied with where the ego goes back along its lane no more than a little
+within a short window.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
-from shiftsim.metrics import kernels_progress
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.layers import Polygons, Polylines, contains, project_on_line
 from shiftsim.world.map import NONE, VectorMap
 
 NAME = "ego_progress_along_expert_route"
 MAKING_NAME = "ego_is_making_progress"
+DIRECTION_NAME = "driving_direction_compliance"
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress along the expert's route. The expert has one sample more (nuplan-metrics.md §13 Q1).
+    """Progress along the expert's route.
+
+    nuPlan rule 71: the expert has one sample more than the ego.
 
     Attributes:
         ego: (K,) progress of each sample over the one before [m].
@@ -31,21 +38,19 @@ class Progress:
     has_route: bool
 
 
-def measure(road: VectorMap, centers: FloatArray, expert_centers: FloatArray) -> Progress:
+def measure(map: VectorMap, centers: FloatArray, expert_centers: FloatArray) -> Progress:
     """Progress of ego centres (K, 3) and expert centres (T, 3) along the expert's route."""
     out = Progress(np.zeros(len(centers)), np.zeros(len(expert_centers)), False)
-    chain = expert_chain(road, driven_route(road, expert_centers))
+    chain = expert_chain(map, driven_route(map, expert_centers))
     if len(chain) == 0:
         return out
-    blocks = road.block_of[chain]
+    blocks = map.block_of[chain]
     for poses, values in ((centers, out.ego), (expert_centers, out.expert)):
-        kernels_progress.progress_along(
-            road.blocks.polygons, road.baselines, blocks, chain, poses, values
-        )
+        _progress_along(map.blocks.polygons, map.baselines, blocks, chain, poses, values)
     return Progress(out.ego, out.expert, True)
 
 
-def expert_chain(road: VectorMap, route: EdgeLists) -> IntArray:
+def expert_chain(map: VectorMap, route: EdgeLists) -> IntArray:
     """Edges whose baselines measure progress, one per roadblock passed.
 
     Raises:
@@ -58,18 +63,18 @@ def expert_chain(road: VectorMap, route: EdgeLists) -> IntArray:
         if not edges or not set(edges).isdisjoint(last):
             continue
         last = edges
-        block = road.block_of[edges[0]]
+        block = map.block_of[edges[0]]
         if block == NONE:
             raise MapError(
-                f"map {road.name!r}: {road.edges.ids[edges[0]]!r} on the expert's route belongs to "
+                f"map {map.name!r}: {map.edges.ids[edges[0]]!r} on the expert's route belongs to "
                 "no roadblock, so progress cannot be measured"
             )
-        if not chain or block != road.block_of[chain[-1]]:
+        if not chain or block != map.block_of[chain[-1]]:
             chain.append(edges[0])
     return np.array(chain, np.int64)
 
 
-def _changes(route: EdgeLists) -> np.ndarray:
+def _changes(route: EdgeLists) -> BoolArray:
     """(K,) samples whose first edge or number of edges differs from the sample before."""
     changed = np.ones(len(route.counts), np.bool_)
     same_count = route.counts[1:] == route.counts[:-1]
@@ -101,3 +106,129 @@ def judge(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, Metri
         (Statistic(MAKING_NAME, MAKING_NAME, "boolean", "BOOLEAN", score),),
     )
     return along, making
+
+
+def lane_progress(map: VectorMap, route: EdgeLists, centers: FloatArray) -> FloatArray:
+    """(K,) progress of the centres (K, 3) along the baseline of their edge since the last [m]."""
+    out = np.empty(len(centers))
+    _progress_in_lane(map.baselines, route, centers, out)
+    return out
+
+
+def windowed(progress: FloatArray, time_us: IntArray, horizon: float) -> FloatArray:
+    """(K,) sum of the progress over the samples of the last `horizon` seconds [m]."""
+    # nuPlan rule 73: truncated division, then one sample more than that
+    steps = int(horizon * 1e6 / float(np.mean(np.diff(time_us))))
+    padded = np.concatenate([np.zeros(steps), progress])
+    sums: FloatArray = np.lib.stride_tricks.sliding_window_view(padded, steps + 1).sum(axis=1)
+    return sums
+
+
+def judge_direction(progress: FloatArray, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
+    """Score 1, 0.5 or 0 by the largest regress within a window."""
+    horizon = thresholds.driving_direction_horizon
+    sums = windowed(progress, time_us, horizon)
+    lowest = float(sums.min())
+    regress = abs(lowest)
+    score = 0.0
+    if regress < thresholds.driving_direction_compliance:
+        score = 1.0
+    elif regress < thresholds.driving_direction_violation:
+        score = 0.5
+    compliance = thresholds.driving_direction_compliance
+    violation = first_violation(-sums >= compliance, -sums, time_us)
+    seconds = f"{horizon:g}"
+    lowest_name = f"min_progress_along_driving_direction_in_{seconds}_second_interval"
+    return MetricPart(
+        MetricRow(DIRECTION_NAME, score, regress, "meters", compliance, violation),
+        (
+            Statistic(DIRECTION_NAME, f"{DIRECTION_NAME}_score", "value", "VALUE", score),
+            Statistic(DIRECTION_NAME, lowest_name, "meters", "MIN", -regress),
+        ),
+        Series(f"progress_along_driving_direction_in_last_{seconds}_seconds_[m]", sums),
+    )
+
+
+@lean_kernel
+def _project_end(lines: Polylines, line: int, other: int) -> float:
+    """Arc length on a line of the end of another one [m]."""
+    last = lines.ptr[other + 1] - 1
+    return project_on_line(lines, line, lines.xy[last, 0], lines.xy[last, 1])
+
+
+@lean_kernel
+def _progress_along(
+    blocks: Polygons,
+    lines: Polylines,
+    chain_blocks: IntArray,
+    chain_edges: IntArray,
+    poses: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the progress of each point over the one before it, along a chain of roadblocks.
+
+    Args:
+        blocks: Areas of the roadblocks and roadblock connectors.
+        lines: Baselines of the edges.
+        chain_blocks: (L,) blocks in order, L >= 1.
+        chain_edges: (L,) edge of each block whose baseline measures progress.
+        poses: (K, 3) points x [m], y [m]; the third column is not read.
+        out: (K,) progress [m]; 0 at the first point.
+    """
+    at, last = 0, len(chain_blocks) - 1
+    previous = project_on_line(lines, chain_edges[0], poses[0, 0], poses[0, 1])
+    out[0] = 0.0
+    for i in range(1, len(poses)):
+        x, y = poses[i, 0], poses[i, 1]
+        out[i] = 0.0
+        if contains(blocks, chain_blocks[at], x, y):
+            along = project_on_line(lines, chain_edges[at], x, y)
+            out[i] = along - previous
+            previous = along
+            continue
+        # nuPlan rule 72: the search goes forward only, and where nothing is found the memory stays
+        extra, skipped = 0.0, at
+        ahead = at + 1
+        while ahead <= last:
+            edge = chain_edges[ahead]
+            if contains(blocks, chain_blocks[ahead], x, y):
+                current = chain_edges[at]
+                length = lines.arc[lines.ptr[current + 1] - 1]
+                along = project_on_line(lines, edge, x, y)
+                out[i] = (length - previous) + (along - _project_end(lines, edge, current)) + extra
+                at, previous = ahead, along
+                break
+            if ahead < last:
+                after = lines.ptr[chain_edges[ahead + 1]]
+                start = project_on_line(lines, edge, lines.xy[after, 0], lines.xy[after, 1])
+                extra += start - _project_end(lines, edge, chain_edges[skipped])
+            skipped = ahead
+            ahead += 1
+
+
+@lean_kernel
+def _progress_in_lane(
+    lines: Polylines, route: EdgeLists, poses: FloatArray, out: FloatArray
+) -> None:
+    """Write the progress of the ego along the baseline of the edge it is in.
+
+    Args:
+        lines: Baselines of the edges.
+        route: (K, C) edges of the ego centre.
+        poses: (K, 3) ego centres.
+        out: (K,) progress since the sample before [m].
+    """
+    lists, counts = route.edges, route.counts
+    edge = lists[0, 0] if counts[0] > 0 else -1
+    known, previous = False, 0.0
+    for i in range(len(counts)):
+        out[i] = 0.0
+        if counts[i] == 0:
+            continue  # nuPlan rule 74: the memory survives
+        if lists[i, 0] != edge:
+            edge, known = lists[i, 0], False
+            continue
+        along = project_on_line(lines, edge, poses[i, 0], poses[i, 1])
+        if known and along != 0.0:  # nuPlan rule 75: an arc length of 0 reads as unknown
+            out[i] = along - previous
+        previous, known = along, True

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from shiftsim.arrays import FloatArray
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 
 
 class Violation(NamedTuple):
@@ -20,6 +22,14 @@ class Violation(NamedTuple):
     time_us: int
     partner: str | None
     value: float
+
+
+def first_violation(broken: BoolArray, values: FloatArray, time_us: IntArray) -> Violation | None:
+    """The first of the samples (K,) at which a bound is broken, with its value; None without."""
+    if not broken.any():
+        return None
+    at = int(np.argmax(broken))
+    return Violation(at, int(time_us[at]), None, float(values[at]))
 
 
 class MetricRow(NamedTuple):
@@ -43,7 +53,7 @@ class MetricRow(NamedTuple):
 
 
 class Statistic(NamedTuple):
-    """One named statistic of nuPlan (nuplan-metrics.md §14); booleans are 0 or 1."""
+    """One statistic with the name nuPlan gives it; booleans are 0 or 1."""
 
     metric: str
     name: str

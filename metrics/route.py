@@ -1,20 +1,26 @@
-"""Where the ego is on the road: driven route, corner routes, lane changes, leaving the road.
+"""Which lanes the ego is in: the driven route of its centre, and the routes of its corners.
 
-Everything later metrics ask of the map rests on these lists (nuplan-metrics.md §3, §4).
+Everything later metrics ask of the map rests on these lists. Every sample has a short list of
+edges, stored as a row of a (…, C) index array with its length; C is the largest number of edges
+that can hold one point. Lanes come before connectors.
+
+A length handed on starts as np.int64(0): for a literal the callee would be compiled once more.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import MapError
-from shiftsim.metrics import kernels_route
+from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
 from shiftsim.world.map import VectorMap
 
+_KEEP_DISTANCE = 5.0  # m, how far a connector is kept for inside an intersection
+_OVERLAP = -1  # several lanes hold the point
 
-@dataclass(frozen=True, slots=True)
-class EdgeLists:
+
+class EdgeLists(NamedTuple):
     """Edges that hold a point, for an array of points.
 
     Attributes:
@@ -30,39 +36,43 @@ class EdgeLists:
         found: list[int] = self.edges[index][: self.counts[index]].tolist()
         return found
 
-    def ids(self, road: VectorMap, *index: int) -> list[str]:
+    def ids(self, map: VectorMap, *index: int) -> list[str]:
         """Ids of the edges of one point."""
-        return [road.edges.ids[edge] for edge in self.at(*index)]
+        return [map.edges.ids[edge] for edge in self.at(*index)]
 
 
-@dataclass(frozen=True, slots=True)
-class LaneChanges:
-    """Lane changes of one rollout.
+class Lanes(NamedTuple):
+    """What kernels read of the lanes and connectors of a map. E edges.
 
     Attributes:
-        states: (K,) number of edges that hold all corners, connected ones included; 0 when the
-            ego is entirely outside lanes, -1 when its corners have none in common.
-        start: (L,) opening sample of each change.
-        end: (L,) closing sample.
-        failed: (L,) whether the ego came back, left the road, or did not finish.
+        polygons: Their areas.
+        num_lanes: How many of them are lanes; the others are connectors.
+        incoming: Edges that lead into an edge.
+        outgoing: Edges an edge leads to.
     """
 
-    states: IntArray
-    start: IntArray
-    end: IntArray
-    failed: BoolArray
-
-    @property
-    def is_common(self) -> BoolArray:
-        """(K,) whether all corners are in the same or in connected lanes."""
-        return self.states > 0
+    polygons: Polygons
+    num_lanes: int
+    incoming: Lists
+    outgoing: Lists
 
 
-def driven_route(road: VectorMap, centers: FloatArray) -> EdgeLists:
+def lanes_of(map: VectorMap) -> Lanes:
+    """The lanes and connectors of a map."""
+    return Lanes(map.edges.polygons, map.num_lanes, map.incoming, map.outgoing)
+
+
+def empty_lists(map: VectorMap, *shape: int) -> EdgeLists:
+    """Lists of a given shape with nothing in them, long enough for any point of a map."""
+    capacity = max(2, int(np.diff(map.edges.polygons.cell_ptr).max(initial=0)))
+    return EdgeLists(np.zeros((*shape, capacity), np.int64), np.zeros(shape, np.int64))
+
+
+def driven_route(map: VectorMap, centers: FloatArray) -> EdgeLists:
     """Edges of a sequence of points, disambiguated over time.
 
     Args:
-        road: The map.
+        map: The map.
         centers: (K, 3) box centres x [m], y [m], heading [rad].
 
     Returns:
@@ -71,28 +81,18 @@ def driven_route(road: VectorMap, centers: FloatArray) -> EdgeLists:
     Raises:
         MapError: Several lanes hold one of the points, where nuPlan's own code stops too.
     """
-    room = list_room(road)
-    lists = EdgeLists(np.zeros((len(centers), room), np.int64), np.zeros(len(centers), np.int64))
-    failed = kernels_route.driven_route(
-        road.edges.polygons,
-        road.num_lanes,
-        road.incoming,
-        road.outgoing,
-        road.intersections.polygons,
-        centers,
-        lists.edges,
-        lists.counts,
-    )
+    lists = empty_lists(map, len(centers))
+    failed = _driven_route(lanes_of(map), map.intersections.polygons, centers, lists)
     if failed >= 0:
-        _raise_overlap(road, centers[failed, :2])
+        _raise_overlap(map, centers[failed, :2])
     return lists
 
 
-def corner_routes(road: VectorMap, corners: FloatArray) -> EdgeLists:
+def corner_routes(map: VectorMap, corners: FloatArray) -> EdgeLists:
     """Edges of the four corners of the ego over time.
 
     Args:
-        road: The map.
+        map: The map.
         corners: (K, 4, 2) front-left, rear-left, rear-right, front-right [m].
 
     Returns:
@@ -101,49 +101,152 @@ def corner_routes(road: VectorMap, corners: FloatArray) -> EdgeLists:
     Raises:
         MapError: Several lanes hold one of the corners.
     """
-    room = list_room(road)
-    lists = EdgeLists(
-        np.zeros((len(corners), 4, room), np.int64), np.zeros((len(corners), 4), np.int64)
-    )
-    failed = kernels_route.corner_routes(
-        road.edges.polygons, road.num_lanes, road.outgoing, corners, lists.edges, lists.counts
-    )
+    lists = empty_lists(map, len(corners), 4)
+    failed = _corner_routes(lanes_of(map), corners, lists)
     if failed >= 0:
-        _raise_overlap(road, *corners[failed])
+        _raise_overlap(map, *corners[failed])
     return lists
 
 
-def lane_changes(road: VectorMap, corners: EdgeLists) -> LaneChanges:
-    """The lane-change helper on the (K, 4, C) lists of the corners."""
-    num_samples, _, room = corners.edges.shape
-    widest = int(np.diff(road.outgoing.ptr).max(initial=0))
-    states = np.empty(num_samples, np.int64)
-    changes = np.empty((num_samples, 3), np.int64)
-    count = kernels_route.lane_states(
-        corners.edges,
-        corners.counts,
-        road.incoming,
-        road.outgoing,
-        room * (1 + widest),
-        states,
-        changes,
-    )
-    start, end, failed = changes[:count].T
-    return LaneChanges(states, start, end, failed > 0)
-
-
-def list_room(road: VectorMap) -> int:
-    """Upper bound on the number of edges that hold one point."""
-    return max(2, int(np.diff(road.edges.polygons.cell_ptr).max(initial=0)))
-
-
-def _raise_overlap(road: VectorMap, *points: FloatArray) -> None:
+def _raise_overlap(map: VectorMap, *points: FloatArray) -> None:
     for x, y in points:
-        lanes = road.lanes_at(x, y)
+        lanes = map.lanes_at(x, y)
         if len(lanes) > 1:
-            names = " and ".join(repr(road.edges.ids[lane]) for lane in lanes)
+            names = " and ".join(repr(map.edges.ids[lane]) for lane in lanes)
             raise MapError(
-                f"map {road.name!r}: lanes {names} overlap at ({x:.2f}, {y:.2f}), so the ego "
+                f"map {map.name!r}: lanes {names} overlap at ({x:.2f}, {y:.2f}), so the ego "
                 "cannot be assigned to one",
-                "mend the polygons of these lanes; nuPlan cannot score the scenario either",
+                "repair the polygons of these lanes; nuPlan cannot score the scenario either",
             )
+
+
+@lean_kernel
+def has(items: IntArray, count: int, value: int) -> bool:
+    """Whether `value` is among the first `count` items."""
+    for index in range(count):
+        if items[index] == value:
+            return True
+    return False
+
+
+@lean_kernel
+def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
+    """Write the lane that holds a point, else the connectors; how many, or _OVERLAP."""
+    found = containing(lanes.polygons, x, y, out)
+    if found > 1 and out[1] < lanes.num_lanes:
+        return _OVERLAP
+    if found > 0 and out[0] < lanes.num_lanes:
+        return 1
+    return found
+
+
+@lean_kernel
+def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: IntArray) -> int:
+    """Write which of the first `count` known edges, or the successors of one, hold a point."""
+    polygons, outgoing = lanes.polygons, lanes.outgoing
+    found = 0
+    for index in range(count):
+        if contains(polygons, known[index], x, y):
+            out[found] = known[index]
+            found += 1
+    if found == 0 and count == 1:
+        edge = known[0]
+        for item in range(outgoing.ptr[edge], outgoing.ptr[edge + 1]):
+            after = outgoing.items[item]
+            if not has(out, found, after) and contains(polygons, after, x, y):
+                out[found] = after
+                found += 1
+    return found
+
+
+@lean_kernel
+def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out: EdgeLists) -> int:
+    """Write the edges that hold each point (K, 3); -1, or the first sample in several lanes."""
+    lists, counts = out.edges, out.counts
+    for i in range(len(poses)):
+        x, y = poses[i, 0], poses[i, 1]
+        count = 0
+        if i > 0 and counts[i - 1] > 0:
+            count = _narrow(lanes, x, y, lists[i - 1], counts[i - 1], lists[i])
+        if count == 0:
+            count = _search(lanes, x, y, lists[i])
+            if count == _OVERLAP:
+                return i
+            if i > 1 and counts[i - 1] > 0 and lists[i - 1, 0] >= lanes.num_lanes:
+                in_crossing = count > 0 and lists[i, 0] >= lanes.num_lanes
+                if in_crossing or (count == 0 and in_any(intersections, x, y)):
+                    kept = 0
+                    for index in range(counts[i - 1]):
+                        edge = lists[i - 1, index]
+                        if distance_to(lanes.polygons, edge, x, y) < _KEEP_DISTANCE:
+                            lists[i, kept] = edge
+                            kept += 1
+                    # nuPlan rule 69: an empty selection leaves the list as it was found
+                    count = kept if kept > 0 else count
+        counts[i] = count
+    _clean_up(lanes, lists, counts)
+    return -1
+
+
+@kernel
+def _clean_up(lanes: Lanes, lists: IntArray, counts: IntArray) -> None:
+    """Narrow the list of each sample down by that of the next one, from the end on."""
+    for i in range(len(counts) - 2, -1, -1):
+        if counts[i] < 2:
+            continue
+        after, size = lists[i + 1], counts[i + 1]
+        count = counts[i]
+        original = np.empty(count, np.int64)
+        for index in range(count):
+            original[index] = lists[i, index]
+        subset = count > size
+        for index in range(size):
+            subset = subset and has(original, count, after[index])
+        if subset:
+            # nuPlan rule 68: also when the next list is empty
+            for index in range(size):
+                lists[i, index] = after[index]
+            counts[i] = size
+        if size > 0 and after[0] < lanes.num_lanes:
+            incoming = lanes.incoming
+            leading = incoming.items[incoming.ptr[after[0]] : incoming.ptr[after[0] + 1]]
+            kept = 0
+            for index in range(count):
+                if has(leading, len(leading), original[index]):
+                    lists[i, kept] = original[index]
+                    kept += 1
+            counts[i] = kept if kept > 0 else counts[i]
+
+
+@kernel
+def _corner_routes(lanes: Lanes, corners: FloatArray, out: EdgeLists) -> int:
+    """Write the edges that hold each corner (K, 4, 2); -1, or the first sample in several lanes."""
+    lists, counts = out.edges, out.counts
+    known = np.empty(8 * lists.shape[2], np.int64)
+    for i in range(len(corners)):
+        size = np.int64(0)
+        if i > 0:
+            for corner in range(4):
+                size = _add(known, size, lists[i - 1, corner], counts[i - 1, corner])
+        for corner in range(4):
+            x, y = corners[i, corner, 0], corners[i, corner, 1]
+            found = lists[i, corner]
+            count = _narrow(lanes, x, y, known, size, found)
+            if count == 0:
+                count = _search(lanes, x, y, found)
+                if count == _OVERLAP:
+                    return i
+                if i == 1:  # nuPlan rule 70: only here
+                    size = _add(known, size, found, count)
+            counts[i, corner] = count
+    return -1
+
+
+@lean_kernel
+def _add(items: IntArray, size: int, more: IntArray, count: int) -> int:
+    """Append what is not among the first `size` items yet; returns how many there are then."""
+    for index in range(count):
+        if not has(items, size, more[index]):
+            items[size] = more[index]
+            size += 1
+    return size

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
-from shiftsim.metrics import kernels_progress
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, Violation
-from shiftsim.metrics.route import EdgeLists
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
+from shiftsim.metrics.route import EdgeLists, Lanes, lanes_of
 from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.map import VectorMap
 
@@ -14,25 +13,17 @@ NAME = "speed_limit_compliance"
 _MIN_OVERSPEED = 1e-3  # m/s, nuPlan: floor of the threshold
 
 
-def overspeed(road: VectorMap, route: EdgeLists, speed: FloatArray) -> FloatArray:
+def overspeed(map: VectorMap, route: EdgeLists, speed: FloatArray) -> FloatArray:
     """(K,) speed above the limit of the edges the ego is in, 0 where there is none [m/s].
 
     Raises:
         MapError: The ego is on a connector without neighbours, where nuPlan's own code stops too.
     """
     limits = np.empty(len(speed))
-    failed = kernels_progress.speed_limits_along(
-        road.num_lanes,
-        road.incoming,
-        road.outgoing,
-        road.speed_limits,
-        route.edges,
-        route.counts,
-        limits,
-    )
+    failed = _speed_limits(lanes_of(map), map.speed_limits, route, limits)
     if failed >= 0:
         raise MapError(
-            f"map {road.name!r}: connector {route.ids(road, failed)[0]!r} leads from and to no "
+            f"map {map.name!r}: connector {route.ids(map, failed)[0]!r} leads from and to no "
             "lane, so no speed limit holds on it",
             "connect it to its lanes; nuPlan cannot score the scenario either",
         )
@@ -42,15 +33,13 @@ def overspeed(road: VectorMap, route: EdgeLists, speed: FloatArray) -> FloatArra
 
 def judge(over: FloatArray, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Score by the over-speed integrated over the rollout."""
-    score, violation = 1.0, None
-    if (over > 0.0).any():
-        at = int(np.argmax(over > 0.0))
-        violation = Violation(at, int(time_us[at]), None, float(over[at]))
+    score, violation = 1.0, first_violation(over > 0.0, over, time_us)
+    if violation is not None:
         seconds = time_us * 1e-6
         duration = float(seconds[-1] - seconds[0])
         worst = max(thresholds.max_overspeed, _MIN_OVERSPEED) * duration
         if duration > 0.0:
-            # nuPlan: K terms in the sum, K - 1 intervals in the duration (§13 Q13)
+            # nuPlan rule 76: K terms in the sum, K - 1 intervals in the duration
             loss = float(np.sum(over)) * float(np.mean(np.diff(seconds)))
             score = max(0.0, 1.0 - loss / worst)
     highest = float(over.max())
@@ -73,7 +62,7 @@ def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
         means.append(float(np.mean(over[start:stop])))
         durations.append(int(time_us[min(stop, last)] - time_us[start]))
     total = sum(durations)
-    # a single violation at the last sample lasts no time: 0 / 0 (nuplan-metrics.md §14)
+    # nuPlan rule 77: a single violation at the last sample lasts no time: 0 / 0
     weighted = sum(m * d for m, d in zip(means, durations, strict=True))
     mean = weighted / total if total > 0 else float("nan")
     unit = "meters_per_second"
@@ -83,3 +72,42 @@ def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
         Statistic(NAME, f"min_violation_of_{NAME}", unit, "MIN", min(peaks)),
         Statistic(NAME, f"mean_violation_of_{NAME}", unit, "MEAN", mean),
     ]
+
+
+@lean_kernel
+def _speed_limits(lanes: Lanes, limits: FloatArray, route: EdgeLists, out: FloatArray) -> int:
+    """Write the speed limit that holds at each sample; NaN where there is none.
+
+    Args:
+        lanes: The lanes.
+        limits: (E,) limits of the edges, NaN where missing [m/s].
+        route: (K, C) edges of the ego centre.
+        out: (K,) [m/s].
+
+    Returns:
+        -1, or the first sample on connectors that have no neighbour at all.
+    """
+    lists, counts = route.edges, route.counts
+    for i in range(len(counts)):
+        out[i] = np.nan
+        if counts[i] == 0:
+            continue
+        if lists[i, 0] < lanes.num_lanes:
+            limit = limits[lists[i, 0]]
+            out[i] = limit if limit != 0.0 else np.nan
+            continue
+        # nuPlan rule 78: a connector has the highest limit of its neighbours, not its own
+        highest, found, missing = -np.inf, 0, False
+        for index in range(counts[i]):
+            edge = lists[i, index]
+            for side in range(2):
+                lists_of = lanes.incoming if side == 0 else lanes.outgoing
+                for item in range(lists_of.ptr[edge], lists_of.ptr[edge + 1]):
+                    limit = limits[lists_of.items[item]]
+                    missing = missing or np.isnan(limit) or limit == 0.0
+                    highest = max(highest, limit)
+                    found += 1
+        if found == 0:
+            return i
+        out[i] = np.nan if missing else highest
+    return -1

@@ -1,12 +1,11 @@
 """Threshold profiles as plain data: `nuplan` (the devkit's defaults) and `deepplan`.
 
-The names follow the devkit's configuration keys (nuplan-metrics.md §2).
+The names follow the devkit's configuration keys.
 """
 
-import difflib
 from dataclasses import dataclass, replace
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import one_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ class Thresholds:
 
 
 NUPLAN = Thresholds("nuplan")
-# least_min_ttc is taken literally from the paper's table, nuplan-metrics.md §2
+# least_min_ttc is taken literally from the paper's table
 DEEPPLAN = replace(
     NUPLAN,
     name="deepplan",
@@ -82,10 +81,4 @@ def thresholds_of(profile: str | Thresholds) -> Thresholds:
     """
     if isinstance(profile, Thresholds):
         return profile
-    if profile not in PROFILES:
-        near = difflib.get_close_matches(profile, PROFILES, n=1)
-        raise ConfigError(
-            f"unknown threshold profile {profile!r}; valid are {', '.join(PROFILES)}",
-            f"did you mean {near[0]!r}" if near else "",
-        )
-    return PROFILES[profile]
+    return PROFILES[one_of("threshold profile", profile, PROFILES)]

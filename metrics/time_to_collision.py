@@ -1,29 +1,43 @@
 """Time to collision: everything projected straight ahead for three seconds, and the bound on it."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.metrics import kernels_collision
-from shiftsim.metrics.collision import Contacts, Ego, FlatTracks
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
+from shiftsim.metrics.collision import (
+    BOX_SIZE,
+    Contacts,
+    Ego,
+    FlatTracks,
+    collide,
+    set_box,
+    set_size,
+)
 from shiftsim.metrics.result import (
     Collision,
     MetricPart,
     MetricRow,
     Series,
     Statistic,
-    Violation,
+    first_violation,
 )
 from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks
 
 NAME = "time_to_collision_within_bound"
+STEP = 0.1  # s
+HORIZON = 3.0  # s
+# nuPlan rule 63: the horizon itself is not tested
+_NUM_TESTS = 29
+# nuPlan rule 64: the ego stands below a tenth of the speed that counts for collisions
+_STOPPED_SPEED = 5e-3  # m/s
 
 
-@dataclass(frozen=True, slots=True)
-class TimeToCollision:
+class TimeToCollision(NamedTuple):
     """Time to collision of one rollout.
 
     Attributes:
@@ -43,7 +57,7 @@ def time_to_collision(
     contacts: Contacts,
     collisions: tuple[Collision, ...],
     is_common: BoolArray,
-    road: VectorMap,
+    map: VectorMap,
     named: Tracks,
 ) -> TimeToCollision:
     """Smallest time to collision at every sample.
@@ -54,47 +68,139 @@ def time_to_collision(
         contacts: First contact with each of them.
         collisions: The same contacts with the verdict.
         is_common: (K,) whether all corners are in the same or in connected lanes.
-        road: The map.
+        map: The map.
         named: The tracks, for their tokens.
     """
     num_samples = len(ego.speeds)
-    at_fault = np.full(num_samples, -1, np.int64)
+    partners = np.full(num_samples, -1)
     for collision in reversed(collisions):
         if collision.at_fault:
-            at_fault[collision.iteration] = named.tokens.index(collision.token)
-    out = TimeToCollision(np.empty(num_samples), np.empty(num_samples, np.int64), named.tokens)
-    kernels_collision.time_to_collision(
-        ego.states,
-        ego.speeds,
-        ego.centers,
-        ego.size,
-        *tracks,
-        contacts.first,
-        at_fault,
-        is_common,
-        road.intersections.polygons,
-        out.values,
-        out.partners,
-    )
-    return out
+            partners[collision.iteration] = named.tokens.index(collision.token)
+    values, areas = np.empty(num_samples), map.intersections.polygons
+    _time_to_collision(ego, tracks, contacts.first, is_common, areas, values, partners)
+    return TimeToCollision(values, partners, named.tokens)
 
 
 def judge(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Score 1 where the bound is exceeded at every sample."""
     bound = thresholds.least_min_ttc
     lowest = float(ttc.values.min())
-    within = bool((bound < ttc.values).all())
-    violation = None
-    if not within:
-        at = int(np.argmin(bound < ttc.values))
-        token = ttc.tokens[ttc.partners[at]] if ttc.partners[at] >= 0 else None
-        violation = Violation(at, int(time_us[at]), token, float(ttc.values[at]))
-    horizon = kernels_collision.TTC_HORIZON
+    violation = first_violation(~(bound < ttc.values), ttc.values, time_us)
+    within = float(violation is None)
+    if violation is not None and (partner := ttc.partners[violation.iteration]) >= 0:
+        violation = violation._replace(partner=ttc.tokens[partner])
     return MetricPart(
-        MetricRow(NAME, float(within), lowest, "seconds", bound, violation),
+        MetricRow(NAME, within, lowest, "seconds", bound, violation),
         (
             Statistic(NAME, "min_time_to_collision", "seconds", "MIN", lowest),
-            Statistic(NAME, NAME, "boolean", "BOOLEAN", float(within)),
+            Statistic(NAME, NAME, "boolean", "BOOLEAN", within),
         ),
-        Series(f"time_to_collision_under_{horizon}_seconds [s]", ttc.values),
+        Series(f"time_to_collision_under_{HORIZON}_seconds [s]", ttc.values),
     )
+
+
+@kernel
+def _time_to_collision(
+    ego: Ego,
+    tracks: FlatTracks,
+    first: IntArray,
+    is_common: BoolArray,
+    intersections: Polygons,
+    ttc: FloatArray,
+    partners: IntArray,
+) -> None:
+    """Write the time to collision of every sample.
+
+    Args:
+        ego: The driven states.
+        tracks: The others.
+        first: (N,) sample of the first contact with each track, K where there is none.
+        is_common: (K,) whether all corners are in the same or connected lanes.
+        intersections: The layer.
+        ttc: (K,) written: [s], inf where nothing is hit.
+        partners: (K,) track of an at-fault collision at this sample, else -1; the track that is
+            hit is written.
+    """
+    speeds, poses, sizes = ego.speeds, tracks.poses, tracks.sizes
+    num_samples, num_tracks = tracks.valid.shape
+    boxes, steps = np.empty((num_tracks + 1, BOX_SIZE)), np.empty((num_tracks + 1, 2))
+    kept, swept = np.empty(num_tracks, np.int64), np.empty((2, BOX_SIZE))
+    scratch = np.empty((2, 4, 2))
+    for i in range(num_samples):
+        ttc[i] = np.inf
+        if partners[i] >= 0:
+            ttc[i] = 0.0
+            continue
+        if speeds[i] <= _STOPPED_SPEED:
+            continue
+        num, beside = 0, 0  # beside: 0 not asked yet, 1 tracks beside count, -1 they do not
+        set_box(boxes[0], ego.centers[i], ego.size[0], ego.size[1])
+        _set_step(boxes[0], speeds[i], steps[0])
+        for j in range(num_tracks):
+            if not tracks.valid[i, j] or first[j] <= i:
+                continue
+            vx = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 0]
+            vy = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 1]
+            dx, dy = poses[i, j, 0] - boxes[0, 0], poses[i, j, 1] - boxes[0, 1]
+            # generous: elongated boxes further apart than this cannot touch
+            reach = boxes[0, 8] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
+            reach += HORIZON * (speeds[i] + abs(vx) + abs(vy))
+            if dx * dx + dy * dy > reach * reach:
+                continue
+            angle = bearing(ego.states[i], poses[i, j, 0], poses[i, j, 1])
+            if not angle < AHEAD:
+                if angle > BEHIND:
+                    continue
+                if beside == 0:
+                    # nuPlan rule 65: tracks beside the ego count between lanes and in intersections
+                    x, y = ego.states[i, 0], ego.states[i, 1]
+                    beside = 1 if not is_common[i] or in_any(intersections, x, y) else -1
+                if beside < 0:
+                    continue
+            box = boxes[num + 1]
+            set_box(box, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])
+            speed = np.hypot(vx, vy)
+            _stretch(boxes[0], speeds[i], swept[0])
+            _stretch(box, speed, swept[1])
+            if collide(swept[0], swept[1], scratch):
+                _set_step(box, speed, steps[num + 1])
+                kept[num] = j
+                num += 1
+        hit = _first_hit(boxes[: num + 1], steps, scratch)
+        if hit[0] > 0:
+            # nuPlan rule 63: times are numpy's arange, whose values are multiples of the step
+            ttc[i], partners[i] = STEP * hit[0], kept[hit[1]]
+
+
+@lean_kernel
+def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
+    # nuPlan rule 66: along the heading, whatever the direction of the velocity
+    step[0] = box[2] * speed * STEP
+    step[1] = box[3] * speed * STEP
+
+
+@lean_kernel
+def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
+    """Write the box (9,) that holds another one while it moves through the horizon."""
+    distance = speed * HORIZON
+    for index in range(BOX_SIZE):  # a slice assignment takes numba seconds to compile
+        out[index] = box[index]
+    out[0] += 0.5 * distance * box[2]
+    out[1] += 0.5 * distance * box[3]
+    set_size(out, 2.0 * box[6] + distance, 2.0 * box[7])
+
+
+@lean_kernel
+def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tuple[int, int]:
+    """First step at which box 0 meets another, and which; 0 when none does. Moves the boxes."""
+    if len(boxes) < 2:
+        return 0, 0
+    for k in range(1, _NUM_TESTS + 1):
+        for index in range(len(boxes)):
+            # nuPlan rule 67: positions accumulate rounding step by step
+            boxes[index, 0] += steps[index, 0]
+            boxes[index, 1] += steps[index, 1]
+        for index in range(1, len(boxes)):
+            if collide(boxes[0], boxes[index], scratch):
+                return k, index - 1
+    return 0, 0

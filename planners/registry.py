@@ -1,165 +1,48 @@
-"""Planners by name, and users' own ones by `package.module:Class`.
+"""Makes planners: by name, by `package.module:Class`, from a class or an instance.
 
-`nuplan:package.module:Class` is a planner written against nuPlan's interface.
-
-Nothing is imported before it is asked for.
+`nuplan:package.module:Class` is a planner written against nuPlan's interface. Nothing is imported
+before it is asked for.
 """
 
+import copy
 import hashlib
 import importlib
-import importlib.util
 import inspect
+import pickle
 import sys
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError, one_of
-from shiftsim.files import checkpoint_folder
-from shiftsim.sim.planner import Planner
-
-
-@dataclass(frozen=True, slots=True)
-class Published:
-    """A checkpoint as its authors publish it.
-
-    Attributes:
-        file: What is published.
-        project: Name of the project that publishes it.
-        name: File or folder in the folder of checkpoints, where it is found by itself.
-    """
-
-    file: str
-    project: str
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class PlannerEntry:
-    """One registered planner.
-
-    Attributes:
-        name: Its name everywhere.
-        kind: `rule-based`, `oracle` (looks at the recording), `replay` or `learned`.
-        target: `package.module:Class`.
-        description: One line.
-        arguments: Names of the arguments it takes.
-        checkpoint: What a learned planner loads; it also needs the extra `learned`.
-    """
-
-    name: str
-    kind: str
-    target: str
-    description: str
-    arguments: tuple[str, ...] = ()
-    checkpoint: Published | None = None
-
-
-_ENTRIES = (
-    PlannerEntry(
-        "carl",
-        "learned",
-        "shiftsim.planners.learned.carl.planner:Carl",
-        "a policy trained by reinforcement learning on a raster of the surroundings",
-        ("checkpoint", "device"),
-        Published(
-            "nuPlan/checkpoints/nuplan_51892_1B/model_best.pth",
-            "autonomousvision/CaRL",
-            "nuplan_51892_1B",
-        ),
-    ),
-    PlannerEntry(
-        "constant-velocity",
-        "rule-based",
-        "shiftsim.planners.basic.constant_velocity:ConstantVelocity",
-        "keeps heading and speed",
-    ),
-    PlannerEntry(
-        "diffusion-planner",
-        "learned",
-        "shiftsim.planners.learned.diffusion.planner:DiffusionPlanner",
-        "samples the future of ego and neighbours with a diffusion transformer",
-        ("checkpoint", "device"),
-        Published(
-            "model.pth and args.json", "ZhengYinan-AIR/Diffusion-Planner", "diffusion-planner"
-        ),
-    ),
-    PlannerEntry(
-        "idm",
-        "rule-based",
-        "shiftsim.planners.idm.planner:Idm",
-        "nuPlan's IDM planner: follows the route's lanes behind the nearest object",
-        ("target_velocity", "min_gap", "headway", "accel_max", "decel_max"),
-    ),
-    PlannerEntry(
-        "log-future",
-        "oracle",
-        "shiftsim.planners.basic.log_future:LogFuture",
-        "drives the recorded future",
-    ),
-    PlannerEntry(
-        "pdm-closed",
-        "rule-based",
-        "shiftsim.planners.pdm.planner:PdmClosed",
-        "drives 15 proposals along the route in its head and takes the best one",
-        (
-            "speed_fractions",
-            "lateral_offsets",
-            "fallback_velocity",
-            "min_gap",
-            "headway",
-            "accel_max",
-            "decel_max",
-            "map_radius",
-        ),
-    ),
-    PlannerEntry(
-        "plantf",
-        "learned",
-        "shiftsim.planners.learned.plantf.planner:PlanTF",
-        "imitation with a transformer over agents and map",
-        ("checkpoint", "device"),
-        Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt"),
-    ),
-    PlannerEntry(
-        "pluto",
-        "learned",
-        "shiftsim.planners.learned.pluto.planner:Pluto",
-        "imitation with contrastive learning, and a choice among its plans by rules",
-        ("checkpoint", "device"),
-        Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt"),
-    ),
-    PlannerEntry(
-        "scripted",
-        "replay",
-        "shiftsim.planners.basic.scripted:Scripted",
-        "replays pose sequences from a Parquet or CSV file",
-        ("file", "name"),
-    ),
-    PlannerEntry(
-        "simple",
-        "rule-based",
-        "shiftsim.planners.basic.simple:Simple",
-        "nuPlan's SimplePlanner: straight on, slows down to a limit",
-        ("max_velocity",),
-    ),
-)
-PLANNERS = types.MappingProxyType({entry.name: entry for entry in _ENTRIES})
+from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of
+from shiftsim.planners.table import PLANNERS as PLANNERS
+from shiftsim.planners.table import readiness as readiness
+from shiftsim.sim.planner import BatchPlanner, Planner
 
 # planners of another interface: prefix -> module with install() and factory(class)
 _ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
-
 _WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+# what constructors of users' planners are likely to raise
+_CANNOT_MAKE = (
+    TypeError,
+    ValueError,
+    AttributeError,
+    LookupError,
+    RuntimeError,
+    OSError,
+    ImportError,
+)
+_NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedError, RuntimeError)
 
 
 def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Planner:
     """A new planner.
 
     Args:
-        spec: Registered name, or `package.module:Class` of an own planner, which may lie in the
+        spec: Registered name, or `package.module:Class` of a custom planner, which may lie in the
             current directory; with `nuplan:` before it where it is written for nuPlan.
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
@@ -172,10 +55,9 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
         MissingExtraError: A learned planner needs PyTorch.
     """
     factory = planner_factory(spec)
-    values = _bind(spec, factory, _completed(spec, arguments or {}))
-    planner = factory(**values)
+    planner = factory(**_bind(spec, factory, arguments or {}))
     _require_methods(spec, planner)
-    return planner
+    return cast(Planner, planner)
 
 
 def planner_factory(spec: str) -> Any:
@@ -228,9 +110,9 @@ def planner_factory(spec: str) -> Any:
 def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """All that tells one planner from another, as JSON values.
 
-    Own planners carry the hash of their module's source, file arguments that of the file, learned
-    planners that of their checkpoint and the kind of their device; what else they depend on is not
-    seen.
+    Custom planners carry the hash of their module's source, file arguments that of the file,
+    learned planners that of their checkpoint and the kind of their device; what else they depend on
+    is not seen.
 
     Raises:
         ConfigError: The planner or an argument is wrong.
@@ -239,14 +121,11 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
     """
     entry = PLANNERS.get(spec)
     factory = planner_factory(spec)
-    values = _bind(spec, factory, _completed(spec, arguments or {}))
-    learned = {}
+    values = _bind(spec, factory, arguments or {})
+    learned: dict[str, Any] = {}
     if entry is not None and entry.checkpoint is not None:
-        from shiftsim.planners.learned.checkpoint import checkpoint_fingerprint
-        from shiftsim.planners.learned.device import resolve_device
-
-        learned["checkpoint"] = checkpoint_fingerprint(values.pop("checkpoint"), spec)
-        values["device"] = resolve_device(values.get("device", "cpu")).partition(":")[0]
+        learned["checkpoint"], values["device"] = factory.fingerprint(**values)
+        values.pop("checkpoint", None)
     out: dict[str, Any] = {
         "planner": spec,
         "target": spec if entry is None else entry.target,
@@ -265,31 +144,123 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
     return out
 
 
-def readiness(entry: PlannerEntry) -> str:
-    """What is missing to run a planner without further ado, in one line; empty where nothing."""
-    if entry.checkpoint is None:
-        return ""
-    if importlib.util.find_spec("torch") is None:
-        return "needs PyTorch: pip install 'shiftsim[learned]'"
-    path = checkpoint_folder() / entry.checkpoint.name
-    return "" if path.exists() else f"no checkpoint: give one, or put it at {path}"
+@dataclass(frozen=True, slots=True)
+class RunPlanner:
+    """A planner of a run: how to make it, and what identifies it.
+
+    Attributes:
+        name: As in tables.
+        source: A name, `package.module:Class`, a class, or an instance.
+        arguments: Passed to the constructor of a name or class.
+        fingerprint: All that tells it from another planner, as JSON values.
+        in_batches: Whether it answers for several scenarios at once.
+    """
+
+    name: str
+    source: Any
+    arguments: Mapping[str, Any]
+    fingerprint: Mapping[str, Any]
+    in_batches: bool = False
+
+    def make(self) -> Planner:
+        """An instance of its own for one worker."""
+        if isinstance(self.source, str):
+            return load_planner(self.source, self.arguments)
+        if inspect.isclass(self.source):
+            return cast(Planner, self.source(**self.arguments))
+        return cast(Planner, copy.deepcopy(self.source))
+
+    @property
+    def can_travel(self) -> bool:
+        """Whether it can be sent to a worker process.
+
+        A class defined in the main script cannot: workers do not import that script.
+        """
+        if isinstance(self.source, str):
+            return True
+        if _class_of(self.source).__module__ == "__main__":
+            return False
+        try:
+            pickle.dumps(self.source)
+        except _NO_PICKLE:
+            return False
+        return True
 
 
-def _completed(spec: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Arguments with the published checkpoint where a learned planner is given none."""
-    entry = PLANNERS.get(spec)
-    if entry is None or entry.checkpoint is None:
-        return arguments
-    from shiftsim.planners.learned.checkpoint import how_to_get
-    from shiftsim.planners.learned.device import require_torch
+def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
+    """A planner given by name, class or instance; it is made once to see that it works.
 
-    require_torch(f"planner {spec!r}")
-    if arguments.get("checkpoint"):
-        return arguments
-    path = checkpoint_folder() / entry.checkpoint.name
-    if not path.exists():
-        raise CheckpointError(f"planner {spec!r} needs a checkpoint", hint=how_to_get(spec))
-    return {**arguments, "checkpoint": str(path)}
+    Raises:
+        ShiftsimError: It does not exist, or cannot be made.
+    """
+    name = planner_name(source)
+    if isinstance(source, str):
+        fingerprint = planner_fingerprint(source, arguments)
+    else:
+        fingerprint = _object_fingerprint(source, arguments)
+    found = RunPlanner(name, source, arguments, fingerprint)
+    try:
+        planner = found.make()
+    except ShiftsimError:
+        raise
+    except _CANNOT_MAKE as error:
+        raise ConfigError(
+            f"planner {name!r} cannot be made: {type(error).__name__}: {error}",
+            hint="check its arguments with --planner-arg key=value",
+        ) from error
+    _require_methods(name, planner)
+    close_planner(planner)
+    return replace(found, in_batches=isinstance(planner, BatchPlanner))
+
+
+def planner_name(source: Any) -> str:
+    """How a planner given by name, class or instance is called in tables."""
+    if isinstance(source, str):
+        return source
+    kind = _class_of(source)
+    return str(getattr(source, "name", "") or kind.__name__)
+
+
+def takes_argument(source: Any, name: str) -> bool:
+    """Whether the constructor of a planner given by name or class has a parameter of that name."""
+    if isinstance(source, str):
+        source = planner_factory(source)
+    elif not inspect.isclass(source):
+        return False
+    try:
+        return name in inspect.signature(source).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def close_planner(planner: object) -> None:
+    """Let a planner release what it holds."""
+    close = getattr(planner, "close", None)
+    if callable(close):
+        close()
+
+
+def _class_of(source: Any) -> Any:
+    return source if inspect.isclass(source) else type(source)
+
+
+def _object_fingerprint(source: object, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """A class's code and an instance's state, as far as they can be seen."""
+    kind, digest = _class_of(source), hashlib.sha256()
+    try:
+        digest.update(inspect.getsource(kind).encode())
+    except (OSError, TypeError):
+        digest.update(repr(sorted(vars(kind))).encode())
+    if source is not kind:
+        try:
+            digest.update(pickle.dumps(getattr(source, "__dict__", None)))
+        except _NO_PICKLE as error:  # then its state merely has no digest
+            digest.update(type(error).__name__.encode())
+    return {
+        "planner": f"{kind.__module__}:{kind.__qualname__}",
+        "arguments": dict(sorted(arguments.items())),
+        "source": digest.hexdigest(),
+    }
 
 
 def _hash_file(path: Path, spec: str, argument: str) -> str:
@@ -301,11 +272,11 @@ def _hash_file(path: Path, spec: str, argument: str) -> str:
         ) from error
 
 
-def _require_methods(spec: str, planner: object) -> None:
+def _require_methods(name: str, planner: object) -> None:
     for method in ("reset", "plan"):
         if not callable(getattr(planner, method, None)):
             raise ConfigError(
-                f"planner {spec!r}: {type(planner).__name__} has no method {method}()",
+                f"planner {name!r}: {type(planner).__name__} has no method {method}()",
                 hint="a planner has reset(self, scene) and plan(self, observation)",
             )
 
@@ -342,7 +313,9 @@ def _convert(spec: str, name: str, value: Any, parameter: inspect.Parameter) -> 
         if kind is bool:
             return value if isinstance(value, bool) else _WORDS[str(value).lower()]
         if kind in (int, float):
-            return _number(value, kind)
+            if isinstance(value, bool) or (kind is int and isinstance(value, float)):
+                raise TypeError
+            return kind(value)
         return kind(value) if kind in (str, Path) else value
     except (KeyError, TypeError, ValueError):
         raise ConfigError(
@@ -351,13 +324,7 @@ def _convert(spec: str, name: str, value: Any, parameter: inspect.Parameter) -> 
         ) from None
 
 
-def _number(value: Any, kind: type) -> Any:
-    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
-        raise TypeError
-    return kind(value)
-
-
-def _kind_of(parameter: inspect.Parameter) -> type:
+def _kind_of(parameter: inspect.Parameter) -> Any:
     """What an argument is to be converted to; `object` where nothing is known."""
     annotation = parameter.annotation
     options = [a for a in typing.get_args(annotation) if a is not types.NoneType]

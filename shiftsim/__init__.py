@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from shiftsim.errors import ShiftsimError as ShiftsimError
     from shiftsim.metrics import compute_metrics as score
     from shiftsim.planners.contract import check_planner as check_planner
-    from shiftsim.runs.prepare import open_named_store as open_store
+    from shiftsim.runs.scenarios import open_named_store as open_store
     from shiftsim.sim.log import SimulationLog as SimulationLog
     from shiftsim.sim.loop import simulate as simulate
     from shiftsim.sim.noise import NoiseModel as NoiseModel
@@ -44,7 +44,7 @@ _PUBLIC = {
     "Trajectory": "shiftsim.world.state:Trajectory",
     "check_planner": "shiftsim.planners.contract:check_planner",
     "open_run": "shiftsim.api:open_run",
-    "open_store": "shiftsim.runs.prepare:open_named_store",
+    "open_store": "shiftsim.runs.scenarios:open_named_store",
     "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
     "show": "shiftsim.view.page:show",

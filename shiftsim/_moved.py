@@ -31,7 +31,7 @@ MODULES = {
 NAMES = {
     "shiftsim.data.opendrive": {"read_opendrive": "shiftsim.data.opendrive.reading"},
     "shiftsim.data.store": {
-        "StoreWriter": "shiftsim.data.store.reading",
+        "StoreWriter": "shiftsim.data.store.writing",
         "open_store": "shiftsim.data.store.reading",
     },
     "shiftsim.planners": {"load_planner": "shiftsim.planners.registry"},

@@ -8,7 +8,7 @@ from typing import Any
 
 from shiftsim.report.scores import score_table, worst_rollouts
 from shiftsim.runs import execute, results
-from shiftsim.runs.bundle import open_run_store
+from shiftsim.runs.scenarios import open_run_store
 from shiftsim.view.build import Gallery
 from shiftsim.view.page import Page
 

@@ -7,12 +7,13 @@ made of, so that caches and runs notice when it changes.
 
 import os
 import re
+import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from shiftsim.errors import ConfigError
 
@@ -56,6 +57,28 @@ def whole_file(path: Path) -> Iterator[Path]:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def locked(path: Path) -> BinaryIO:
+    """A file, made if needed, that one process at a time has open here; closing it lets others in.
+
+    Where the system or the file system has no locks, nobody is kept out.
+
+    Raises:
+        BlockingIOError: Another process has it.
+    """
+    file = path.open("a+b", buffering=0)
+    if sys.platform != "win32":
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise
+        except OSError:
+            pass  # a file system without locks
+    return file
 
 
 def read_toml(path: Path) -> dict[str, Any]:

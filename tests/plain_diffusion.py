@@ -1,7 +1,7 @@
 """Diffusion Planner's network without any reuse: what the adapter's speed is measured against.
 
-Written straight from planner-diffusion.md with torch's own attention: the encoder runs once, over
-all rows, used or not; every call of the sampler computes the whole decoder.
+Written with torch's own attention: the encoder runs once, over all rows, used or not; every call of
+the sampler computes the whole decoder.
 """
 
 import copy
@@ -73,8 +73,8 @@ def _attend(net: Any, query: Tensor, keys: Tensor, unseen: Tensor | None) -> Ten
         query,
         keys,
         keys,
-        net.channels,
-        net.heads,
+        net.out_proj.in_features,
+        net.num_heads,
         net.in_proj_weight,
         net.in_proj_bias,
         None,

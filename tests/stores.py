@@ -6,7 +6,7 @@ import numpy as np
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store.reading import StoreWriter
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.world.state import AgentKind
 
 ITERATIONS = 25

@@ -111,10 +111,10 @@ def test_no_module_needs_itself():
 def test_the_core_works_without_torch():
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "import shiftsim.runs.execute, shiftsim.runs.rescore, shiftsim.report.explain\n"
+        "import shiftsim.runs.execute, shiftsim.runs.derive, shiftsim.report.explain\n"
         "import shiftsim.planners.registry, shiftsim.data.store.reading, shiftsim.verify\n"
-        "import shiftsim.cli.diagnosis\n"
-        "print(shiftsim.cli.diagnosis._torch())\n"
+        "import shiftsim.cli.doctor\n"
+        "print(shiftsim.cli.doctor._torch())\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "not installed" in done.stdout

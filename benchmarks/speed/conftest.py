@@ -1,4 +1,8 @@
-"""Speed figures, each in µs and as a ratio to one fixed calculation in the same session."""
+"""Speed figures, each in µs and as a ratio to one fixed calculation in the same session.
+
+With `--benchmark-disable` (`make bench-smoke`) every benchmark runs once, on little: it shows that
+it works, and its figures mean nothing.
+"""
 
 from collections.abc import Callable
 from time import perf_counter
@@ -21,24 +25,28 @@ def calibration(steps: int) -> float:
     return value
 
 
-def median_seconds(
-    function: Callable[[], object], *, rounds: int = ROUNDS, calls: int = 1
-) -> float:
-    """Median time of one call [s], over rounds of several calls each; warm."""
+def median_seconds(function: Callable[[], object], rounds: int) -> float:
+    """Median time of a call [s], warm."""
     function()
     times = []
     for _ in range(rounds):
         began = perf_counter()
-        for _ in range(calls):
-            function()
-        times.append((perf_counter() - began) / calls)
+        function()
+        times.append(perf_counter() - began)
     return float(np.median(times))
 
 
 @pytest.fixture(scope="session")
-def calibration_seconds() -> float:
+def size(pytestconfig: pytest.Config) -> Callable[[int, int], int]:
+    """How much of something: the first number, or the second where every benchmark runs once."""
+    smoke = pytestconfig.getoption("benchmark_disable")
+    return lambda usual, once=1: once if smoke else usual
+
+
+@pytest.fixture(scope="session")
+def calibration_seconds(size) -> float:
     """Median time of the calibration kernel [s]."""
-    return median_seconds(lambda: calibration(CALIBRATION_STEPS))
+    return median_seconds(lambda: calibration(CALIBRATION_STEPS), size(ROUNDS))
 
 
 @pytest.fixture
@@ -53,10 +61,12 @@ def measure(benchmark, calibration_seconds):
         *arguments: object,
         calls: int = 100,
         target: float | None = None,
-    ) -> float:
+    ) -> None:
         benchmark.pedantic(
             function, args=arguments, rounds=ROUNDS, iterations=calls, warmup_rounds=3
         )
+        if benchmark.disabled:
+            return
         median = benchmark.stats.stats.median
         ratio = median / calibration_seconds
         benchmark.extra_info["median_us"] = round(median * 1e6, 3)
@@ -66,6 +76,16 @@ def measure(benchmark, calibration_seconds):
         if target is not None:
             verdict = "met" if median <= target else "NOT MET"
             print(f", target {target * 1e6:g} µs {verdict}", end="")
-        return median
 
     return run
+
+
+@pytest.fixture
+def note(benchmark):
+    """Hand figures that were timed otherwise to `compare.py`: by name [s]."""
+
+    def take(**seconds: float) -> None:
+        benchmark.pedantic(lambda: None)
+        benchmark.extra_info["seconds"] = seconds
+
+    return take

@@ -88,7 +88,7 @@ def loaded():
     return get
 
 
-def drive(planner, scenario, steps=STEPS):
+def drive(planner, scenario, steps):
     """CPU seconds (steps, 3) of features, network and the rest, along a rollout."""
     rollout = Rollout(scenario, planner.fork())
     seconds = []
@@ -121,11 +121,13 @@ def lanes_near(scenario, radius=100.0):
 
 @pytest.mark.parametrize("scene", NAMES)
 @pytest.mark.parametrize("name", LEARNED)
-def test_stages_of_a_step(scenes, loaded, calibration_seconds, name, scene):
+def test_stages_of_a_step(scenes, loaded, size, calibration_seconds, note, name, scene):
     """Medians along a rollout, caches of map and scenario warm."""
     planner, scenario = loaded(name), scenes[scene]
     drive(planner, scenario, 2)  # kernels
-    features, network, rest = np.median(drive(planner, scenario)[WARM:], axis=0)
+    features, network, rest = np.median(
+        drive(planner, scenario, size(STEPS, WARM + 1))[WARM:], axis=0
+    )
     ratio = features / calibration_seconds
     print(
         f"\n{name} {scene}, {lanes_near(scenario)} lanes: "
@@ -134,6 +136,7 @@ def test_stages_of_a_step(scenes, loaded, calibration_seconds, name, scene):
         f"rest {rest * 1e3:.2f} ms{verdict(rest, CHOICE_TARGETS.get(name))}",
         end="",
     )
+    note(features=features, rest=rest)
     assert np.isfinite([features, network, rest]).all()
 
 
@@ -167,12 +170,12 @@ def started(planner, scenarios, count):
 
 
 @pytest.mark.parametrize("name", LEARNED)
-def test_batch_against_one_alone(scenes, loaded, name):
+def test_batch_against_one_alone(scenes, loaded, size, name):
     """CPU time per scenario of a batch of 16 over that of one alone, in turns."""
     planner = loaded(name)
     forks, observations = started(planner, [scenes[n] for n in NAMES if n in scenes], BATCH)
     ratios, together_ms = [], []
-    for _ in range(5):
+    for _ in range(size(5, 2)):
         began = process_time()
         for fork, observation in zip(forks, observations, strict=True):
             fork.plan(observation)
@@ -190,27 +193,24 @@ def test_batch_against_one_alone(scenes, loaded, name):
     )
 
 
-def test_diffusion_planner_against_the_plain_sampler(scenes, loaded):
+def test_diffusion_planner_against_the_plain_sampler(scenes, loaded, size):
     """CPU time of the network over that of the official way of calling it."""
     import torch
     from plain_diffusion import plain_network, plain_sample
 
-    from shiftsim.planners.learned.diffusion.planner import INPUTS
-
     planner = loaded("diffusion-planner")
-    plain = plain_network(planner._network)
+    plain = plain_network(planner.network)
     for scene in ("bench_scene_100", "s04_left_turn", "s13_empty_road"):
         forks, observations = started(planner, [scenes[scene]], 1)
         features = [forks[0].features(observations[0])]
-        inputs = {name: planner._batch(features, name) for name in INPUTS}
-        noise = planner._batch(features, "noise")
+        inputs, noise = planner.batch(features)
         ratios = []
         with torch.inference_mode():
-            for _ in range(40):  # times vary more than what they differ by
+            for _ in range(size(40, 3)):  # times vary more than what they differ by
                 began = process_time()
                 plain_sample(plain, inputs, noise)
                 middle = process_time()
-                planner._network(inputs, noise)
+                planner.network(inputs, noise)
                 ratios.append((process_time() - middle) / (middle - began))
         ratio = statistics.median(ratios[2:])
         print(
@@ -252,20 +252,21 @@ for number in range(int(sys.argv[3])):
     rollout = Rollout(store.read(store.tokens[number % len(store.tokens)]), planner)
     for _ in range(2):
         rollout.advance(planner.plan(rollout.observe()))
-    if number == 99:
+    if number == int(sys.argv[3]) // 5 - 1:
         early = memory("VmRSS")
 print(memory("VmHWM"), memory("VmRSS") - early)
 """
 
 
 @pytest.mark.parametrize("name", LEARNED)
-def test_memory_of_a_worker_over_many_scenarios(store, name):
-    """Peak, and what is more at the end than after 100 scenarios."""
-    command = [sys.executable, "-c", MEMORY, str(store), name, str(SCENARIOS)]
+def test_memory_of_a_worker_over_many_scenarios(store, size, name):
+    """Peak, and what is more at the end than after a fifth of the scenarios."""
+    count = size(SCENARIOS, 5)
+    command = [sys.executable, "-c", MEMORY, str(store), name, str(count)]
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     peak, growth = map(float, out.split())
     print(
-        f"\n{name}: peak {peak:.0f} MB{verdict(peak, MEMORY_TARGET)}, from scenario 100 to "
-        f"{SCENARIOS} {growth:+.0f} MB{verdict(growth, GROWTH_TARGET)}",
+        f"\n{name}: peak {peak:.0f} MB{verdict(peak, MEMORY_TARGET)}, from scenario "
+        f"{count // 5} to {count} {growth:+.0f} MB{verdict(growth, GROWTH_TARGET)}",
         end="",
     )

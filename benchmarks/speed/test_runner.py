@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.execute import open_named_store
+from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION, TaskResult
-from shiftsim.runs.rollouts import Task, encode_rollout
+from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
+from shiftsim.runs.scenarios import open_named_store
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
@@ -63,19 +64,25 @@ def store():
 
 
 @pytest.fixture(scope="module")
-def runs(store, tmp_path_factory):
+def seeds(size):
+    """How many seeds a short and a long run have."""
+    return size(FEW), size(MANY, 2)
+
+
+@pytest.fixture(scope="module")
+def runs(store, seeds, tmp_path_factory):
     """Short and long runs with one and with two worker processes."""
     folder = tmp_path_factory.mktemp("runs")
     measured_run(folder, num_seeds=1, workers=2)  # warm
     return {
-        (workers, seeds): measured_run(folder, num_seeds=seeds, workers=workers, timeout=600.0)
+        (workers, count): measured_run(folder, num_seeds=count, workers=workers, timeout=600.0)
         for workers in (1, 2)
-        for seeds in (FEW, MANY)
+        for count in seeds
     }
 
 
 def per_task(runs, workers, quantity):
-    few, many = runs[workers, FEW], runs[workers, MANY]
+    few, many = (run for (count, _), run in sorted(runs.items()) if count == workers)
     return (many[quantity] - few[quantity]) / (many["tasks"] - few["tasks"])
 
 
@@ -93,10 +100,10 @@ class Answer:
         return [self.result]
 
 
-def median_seconds(function: Callable[[], object]) -> float:
+def median_seconds(function: Callable[[], object], rounds: int) -> float:
     """CPU time of one call [s]."""
     times = []
-    for _ in range(200):
+    for _ in range(rounds):
         began = process_time()
         function()
         times.append(process_time() - began)
@@ -129,19 +136,24 @@ def ending(folder: Path, result: TaskResult, count: int) -> float:
     return process_time() - began
 
 
-def test_overhead_per_scenario(store, tmp_path):
+def test_overhead_per_scenario(store, size, tmp_path):
     scenario = store.read(store.tokens[0])
     task = Task(PLANNER, NOISE, 0, scenario.token)
     log = simulate(scenario, load_planner(PLANNER), noise=NOISE)
-    scores, metrics = score_rollout(scenario, log, thresholds="nuplan", traffic="nonreactive")
-    encode = partial(encode_rollout, log, with_tracks=False)
+    scores, metrics = score_rollout(scenario, log, make_config({"planners": [PLANNER]}))
+
+    def encode() -> bytes:
+        return encode_rows(rollout_rows(log, with_tracks=False))
+
     result = TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode())
     writer = RunWriter(tmp_path / "run", {})
+    few, more = size(200, 10), size(2000, 20)
     parts = {
-        "encode the rollout": median_seconds(encode),
-        "put the result on disk": median_seconds(partial(writer.add, result)),
-        "hand over task and result": (handing_over(result, 2200) - handing_over(result, 200)) / 2e3,
-        "tables and files at the end": ending(tmp_path / "ended", result, 2000) / 2000,
+        "encode the rollout": median_seconds(encode, size(200)),
+        "put the result on disk": median_seconds(partial(writer.add, result), size(200)),
+        "hand over task and result": (handing_over(result, few + more) - handing_over(result, few))
+        / more,
+        "tables and files at the end": ending(tmp_path / "ended", result, more) / more,
     }
     writer.close()
     over = sum(parts.values())
@@ -161,8 +173,9 @@ def test_efficiency_of_two_workers(runs):
     )
 
 
-def test_memory_of_ten_thousand_scenarios(store, tmp_path):
-    counts = [ALL // 10 // len(store.tokens) + 1, ALL // len(store.tokens) + 1]
+def test_memory_of_ten_thousand_scenarios(store, size, tmp_path):
+    scenarios = size(ALL, 20)
+    counts = [scenarios // 10 // len(store.tokens) + 1, scenarios // len(store.tokens) + 1]
     short, long = (measured_run(tmp_path, num_seeds=count, workers=2) for count in counts)
     text = ", ".join(f"{run['memory'] / 1e6:.0f} MB after {run['tasks']}" for run in (short, long))
     print(

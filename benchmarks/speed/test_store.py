@@ -8,7 +8,9 @@ import pytest
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.reading import ScenarioStore, StoreWriter, map_file, open_store
+from shiftsim.data.store.reading import ScenarioStore, open_store
+from shiftsim.data.store.tables import map_file
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.world.state import Tracks, TrafficLights
 
 ROWS, TRACKS = 520, 100  # 26 s at 20 Hz

@@ -3,7 +3,7 @@
 Run with `pytest benchmarks/speed/test_traffic.py -s`. Target on one core: 400 µs with 100 agents.
 """
 
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -16,22 +16,23 @@ ROLLOUTS = 5
 
 
 @pytest.mark.parametrize("agents", [100, 500])
-def test_reactive_rollout(agents, calibration_seconds):
+def test_reactive_rollout(agents, size, calibration_seconds, note):
     scenario = bench_scene(agents, 0)
     traffic = IdmTraffic()
 
     starts, steps = [], []
-    for _ in range(ROLLOUTS + 1):
+    rollouts = size(ROLLOUTS)
+    for _ in range(rollouts + 1):
         tracks = scenario.tracks.rows(scenario.iteration_rows)
-        began = perf_counter()
+        began = process_time()
         traffic.start(scenario, tracks, 0)
-        starts.append(perf_counter() - began)
+        starts.append(process_time() - began)
         for iteration in range(scenario.num_iterations - 2):
-            began = perf_counter()
+            began = process_time()
             traffic.step(iteration, scenario.expert[iteration], tracks, iteration + 1)
-            steps.append(perf_counter() - began)
+            steps.append(process_time() - began)
 
-    first = len(steps) // (ROLLOUTS + 1)  # the first rollout is not warm
+    first = len(steps) // (rollouts + 1)  # the first rollout is not warm
     median, most = np.median(steps[first:]), np.max(steps[first:])
     print(
         f"\nreactive, {agents} agents: start {1e3 * np.median(starts[1:]):.1f} ms, "
@@ -41,4 +42,5 @@ def test_reactive_rollout(agents, calibration_seconds):
     )
     if agents == 100:
         print(f", target {1e6 * TARGET:g} µs {'met' if median <= TARGET else 'NOT MET'}", end="")
+    note(start=np.median(starts[1:]), step=median)
     assert np.isfinite(tracks.poses[0]).any()

@@ -26,8 +26,9 @@ def report(name, value, target, unit):
     print(f"  {name:34} {value:9.1f} {unit:5} target {target:g}: {verdict}")
 
 
-def test_a_set_of_replays(tmp_path):
-    run = shiftsim.run(PLANNERS, all_scenarios=True, limit=SCENARIOS, out=str(tmp_path / "run"))
+def test_a_set_of_replays(tmp_path, size):
+    scenarios = size(SCENARIOS, 2)
+    run = shiftsim.run(PLANNERS, all_scenarios=True, limit=scenarios, out=str(tmp_path / "run"))
     store = open_store(run.manifest["store"])
     write_site(tmp_path / "warm", [Gallery([run], store)], title="warm", limit=2)
 
@@ -39,7 +40,7 @@ def test_a_set_of_replays(tmp_path):
     print(f"\nreplays of {pages} scenarios x {len(PLANNERS)} planners")
     report("made in", seconds, 15, "s")
     report("size in all", size, 30, "MB")
-    assert pages == SCENARIOS
+    assert pages == scenarios
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def browser(tmp_path):
     started.quit()
 
 
-def test_a_page_with_300_agents(tmp_path, browser):
+def test_a_page_with_300_agents(tmp_path, size, browser):
     scene = bench_scene(300, 0)
     scene = replace(scene, token="300agents")
     planner = load_planner("constant-velocity")
@@ -72,7 +73,7 @@ def test_a_page_with_300_agents(tmp_path, browser):
     file.write_text(replay_page(scene, shown), "utf-8")
 
     firsts = []
-    for _ in range(5):
+    for _ in range(size(5)):
         browser.get("about:blank")
         browser.get(file.as_uri())
         while not browser.execute_script("return document.documentElement.dataset.ready"):
@@ -91,7 +92,7 @@ def test_a_page_with_300_agents(tmp_path, browser):
           out.push(performance.now() - began);
         }
         done(out);""",
-        SEEKS,
+        size(SEEKS, 3),
     )
 
     agents = len(scene.tracks.tokens)

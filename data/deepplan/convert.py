@@ -1,18 +1,18 @@
-"""A DSC3D download and its OpenDRIVE map to scenarios of a store (deepplan-conversion.md).
+"""A DSC3D download and its OpenDRIVE map to scenarios of a store.
 
 Every recording is read twice: for the place of the map, which the whole site decides, and to be
 converted. Each is converted by itself into a folder below `.partial` that appears in one step and
 moves into the store at the end. So recordings may be spread over processes, a conversion that was
-killed goes on with those that it lacks, and the bytes are the same each time.
+killed goes on with those that are missing, and the bytes are the same each time.
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyproj
@@ -30,13 +30,14 @@ from shiftsim.data.deepplan.parts import (
 from shiftsim.data.deepplan.recording import RecordingSummary
 from shiftsim.data.deepplan.route import place_on_map
 from shiftsim.data.deepplan.windows import ConversionConfig
-from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site
+from shiftsim.data.dsc3d.recording import Site, find_map, open_site
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.opendrive.records import OpenDrive
-from shiftsim.data.store.files import digest, file_name
 from shiftsim.data.store.map import write_map
-from shiftsim.data.store.reading import PARTIAL, StoreWriter, read_report
+from shiftsim.data.store.reading import read_report
+from shiftsim.data.store.tables import PARTIAL, digest, file_name
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
@@ -48,41 +49,20 @@ _MAX_POINTS = 20_000  # of a recording that tell where the map lies
 Progress = Callable[[int, int, str], None]
 
 
-class Finished(Protocol):
-    """What became of one task."""
-
-    @property
-    def task(self) -> Any:
-        """The task."""
-
-    @property
-    def result(self) -> Any:
-        """What the function returned."""
-
-    @property
-    def death(self) -> str:
-        """Empty where it did return."""
+# What a process runs for each recording; made once per process.
+Make = Callable[[], Callable[[str], Any]]
+# Applies that to names in any order, as `shiftsim.runs.workers.map_unordered` does, and gives the
+# `task`, the `result`, and the `death` of the process (empty where it lived) of each.
+Spread = Callable[[Make, Sequence[str]], Iterable[Any]]
 
 
-class Spread(Protocol):
-    """Applies a function to tasks in any order, as `shiftsim.runs.workers.map_unordered` does."""
-
-    def __call__(
-        self, make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any], /
-    ) -> Iterator[Finished]:
-        """Yield one outcome per task; `make` is called once per process and gives the function."""
-
-
-@dataclass
-class _Done:
-    task: Any
+class _Done(NamedTuple):
+    task: str
     result: Any
     death: str = ""
 
 
-def _one_by_one(
-    make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any]
-) -> Iterator[Finished]:
+def _one_by_one(make: Make, tasks: Sequence[str]) -> Iterator[_Done]:
     function = make()
     yield from (_Done(task, function(task)) for task in tasks)
 
@@ -98,7 +78,7 @@ class ConversionReport:
         recordings: Summary of every recording that was converted.
         skipped: Why, by name of a recording that cannot be converted.
         kept: How many recordings were converted before, by an interrupted or an earlier call.
-        map_warnings: Count by kind of what was mended in the map.
+        map_warnings: Count by kind of what was repaired in the map.
     """
 
     site: str
@@ -149,12 +129,12 @@ def convert_dsc3d(
     show = progress or (lambda done, total, name: None)
     show(0, len(names), "")
     last = LastRead()
-    look = partial(_moving_vehicles, source, config, last)
+    look = partial(partial, _moving_vehicles, source, config, last)
     read = _collect(spread, look, names, lambda name: None)
     skipped = {name: str(found) for name, found in read.items() if isinstance(found, Broken)}
     if len(skipped) == len(names):
         _refuse_all(source, read)
-    share = check_placement(road, source, [p for p in read.values() if not _is_broken(p)], config)
+    share = _check_placement(road, source, [read[n] for n in names if n not in skipped], config)
     with alone_in(store):
         writer = StoreWriter(store)
         work = store / PARTIAL / file_name(road.name)
@@ -178,8 +158,16 @@ def convert_dsc3d(
         for name in good:
             if name not in kept and name not in skipped:
                 kept[name] = job.merge(name, writer)
-        content = _report_content(source, job, road, share, warnings, kept, skipped)
-        writer.add_report(road.name, content)
+        report = {
+            "city": road.name,
+            "config": asdict(config),
+            "lanes": len(road.edges),
+            "drivable_share": share,
+            "map_warnings": warnings,
+            "recordings": {name: kept[name] for name in names if name in kept},
+            "skipped": skipped,
+        }
+        writer.add_report(road.name, report)
         writer.close()
         shutil.rmtree(work, ignore_errors=True)
         with suppress(OSError):  # another site was interrupted
@@ -200,10 +188,14 @@ def _build_map(
 ) -> tuple[VectorMap, dict[str, int]]:
     drive = read_opendrive(find_map(source, map_path))
     _check_georeference(drive, source)
+    x, y, *_ = drive.offset or (0.0, 0.0)
     road, report = build_road_map(
         drive,
         name=city,
-        offset=_map_offset(drive, source),
+        offset=(
+            float(source.offset[0]) - x,
+            float(source.offset[1]) - y,
+        ),  # the header's is applied
         epsg=source.epsg,
         country=config.country,
     )
@@ -214,7 +206,7 @@ def _build_map(
 
 def _collect(
     spread: Spread,
-    make: Callable[[], Callable[[str], Any]],
+    make: Make,
     names: Sequence[str],
     seen: Callable[[str], None],
 ) -> dict[str, Any]:
@@ -224,10 +216,6 @@ def _collect(
         found[outcome.task] = Broken(outcome.death) if outcome.death else outcome.result
         seen(outcome.task)
     return {name: found[name] for name in names}
-
-
-def _is_broken(result: object) -> bool:
-    return isinstance(result, Broken)
 
 
 def _refuse_all(source: Site, read: dict[str, Broken]) -> None:
@@ -242,43 +230,24 @@ def _refuse_all(source: Site, read: dict[str, Broken]) -> None:
 
 
 def _moving_vehicles(
-    source: Site, config: ConversionConfig, last: LastRead
-) -> Callable[[str], Any]:
-    return partial(_moving_in, source, config, last)
-
-
-def _moving_in(
     source: Site, config: ConversionConfig, last: LastRead, name: str
 ) -> FloatArray | Broken:
+    """(n, 2) local places of moving vehicles, enough of them to tell where the map lies [m]."""
     last.found = None  # before the next one is read: two would not fit
     recording = try_read(source, name, config)
-    if not isinstance(recording, Broken):
-        last.found = name, recording
-    return recording if isinstance(recording, Broken) else moving_vehicles(recording)
-
-
-def moving_vehicles(recording: Annotations) -> FloatArray:
-    """(n, 2) local places of moving vehicles, enough of them to tell where the map lies [m]."""
+    if isinstance(recording, Broken):
+        return recording
+    last.found = name, recording
     is_vehicle = (recording.kinds == AgentKind.VEHICLE)[recording.track]
     moves = np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]) > _MOVING
     points = recording.centers[is_vehicle & moves, :2]
     return points[:: max(1, len(points) // _MAX_POINTS)]
 
 
-def check_placement(
+def _check_placement(
     road: VectorMap, site: Site, places: list[FloatArray], config: ConversionConfig
 ) -> float:
-    """Share of moving vehicles on drivable area.
-
-    Args:
-        road: The map, in UTM.
-        site: The site.
-        places: `moving_vehicles` of every recording.
-        config: Thresholds.
-
-    Raises:
-        ConversionError: It is too small: map and tracks do not lie on each other.
-    """
+    """Share of moving vehicles on drivable area; an error where map and tracks do not fit."""
     points = np.concatenate(places) + site.offset[:2]
     found = place_on_map(road, points, config.min_drivable_share)
     if found.share < config.min_drivable_share:
@@ -290,33 +259,6 @@ def check_placement(
             f" ({x:+.1f}, {y:+.1f}) m: check that map and reference_utm.offset belong together",
         )
     return found.share
-
-
-def _report_content(
-    source: Site,
-    job: Job,
-    road: VectorMap,
-    share: float,
-    warnings: dict[str, int],
-    kept: dict[str, dict[str, Any]],
-    skipped: dict[str, str],
-) -> dict[str, Any]:
-    """What the store keeps about the conversion of a site."""
-    return {
-        "city": road.name,
-        "config": asdict(job.config),
-        "lanes": len(road.edges),
-        "drivable_share": share,
-        "map_warnings": warnings,
-        "recordings": {name: kept[name] for name in source.recordings if name in kept},
-        "skipped": skipped,
-    }
-
-
-def _map_offset(drive: OpenDrive, site: Site) -> tuple[float, float]:
-    """What brings the map, whose header offset the reader applies, to UTM."""
-    x, y, *_ = drive.offset or (0.0, 0.0)
-    return float(site.offset[0]) - x, float(site.offset[1]) - y
 
 
 def _check_georeference(drive: OpenDrive, site: Site) -> None:
@@ -332,7 +274,7 @@ def _check_georeference(drive: OpenDrive, site: Site) -> None:
             to_utm = pyproj.Transformer.from_crs(crs, site.epsg, always_xy=True)
             own = to_utm.transform(offset[0], offset[1])
         except pyproj.exceptions.ProjError:
-            return  # not a projection (opendrive.md §5): the map counts as local
+            return  # not a projection: the map counts as local
     if not np.hypot(own[0] - site.offset[0], own[1] - site.offset[1]) <= _MAX_FRAME_SHIFT:
         raise ConversionError(
             f"{drive.source} places its origin at UTM ({own[0]:.2f}, {own[1]:.2f}),"

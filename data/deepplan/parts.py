@@ -21,10 +21,10 @@ from shiftsim.data.deepplan.recording import convert_recording
 from shiftsim.data.deepplan.windows import ConversionConfig
 from shiftsim.data.dsc3d.recording import Annotations, Site, read_recording
 from shiftsim.data.store import schema
-from shiftsim.data.store.files import digest, file_name
 from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.reading import StoreWriter, window_row
+from shiftsim.data.store.tables import digest, file_name
 from shiftsim.data.store.tracks import write_ego, write_recording
+from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import DataError
 
 MAP_FILE = "map.parquet"

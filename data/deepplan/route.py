@@ -1,7 +1,7 @@
 """Routes of recorded egos through a map, and whether map and tracks lie on each other.
 
-Route: nuPlan's rule over the ego's path, then gaps are closed and the road ahead is appended
-(deepplan-conversion.md §8). Blocks are indices of `VectorMap.blocks` here, ids only at the end.
+Route: nuPlan's rule over the ego's path, then gaps are closed and the road ahead is appended.
+Blocks are indices of `VectorMap.blocks` here, ids only at the end.
 """
 
 from dataclasses import dataclass
@@ -24,30 +24,19 @@ _MAX_CELLS = 1_000_000  # of the raster that finds a better placement
 
 @dataclass(frozen=True)
 class Route:
-    """A route.
+    """A route."""
 
-    Attributes:
-        ids: Roadblock and roadblock connector ids, in order.
-        num_driven: How many of them the ego drives on; the others were appended.
-    """
-
-    ids: tuple[str, ...]
-    num_driven: int
+    ids: tuple[str, ...]  # roadblock and roadblock connector ids, in order
+    num_driven: int  # how many of them the ego drives on; the others were appended
 
 
 @dataclass(frozen=True)
 class Placement:
-    """How well moving vehicles and drivable area lie on each other.
+    """How well moving vehicles and drivable area lie on each other."""
 
-    Attributes:
-        share: Share of the points on drivable area.
-        shift: (2,) what to add to the points for the best fit [m].
-        best_share: Share of the points on drivable area then, as far as a raster tells.
-    """
-
-    share: float
-    shift: FloatArray
-    best_share: float
+    share: float  # share of the points on drivable area
+    shift: FloatArray  # (2,) what to add to the points for the best fit [m]
+    best_share: float  # share of the points on drivable area then, as far as a raster tells
 
 
 def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> Route | None:
@@ -67,7 +56,7 @@ def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> 
 
 
 def follow_blocks(road: VectorMap, points: FloatArray) -> list[int]:
-    """Blocks along points (R, 2), by nuPlan's rule; neighbours may be unlinked."""
+    """Blocks along points (R, 2), by nuPlan rule 455; neighbours may be unlinked."""
     at = np.full((len(points), _MAX_AT_POINT), -1, np.int64)
     _containing_points(road.blocks.polygons, np.ascontiguousarray(points), at)
     # Only the first two of equal rows matter: the second may settle what the first left open.
@@ -141,7 +130,7 @@ def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placemen
 
 
 def _narrow(road: VectorMap, route: list[int], open_ends: list[int], here: list[int]) -> list[int]:
-    """Candidates that remain after a point; where it settles them, `route` grows."""
+    """Connectors that remain after a point; where it settles them, `route` grows."""
     still = [block for block in open_ends if block in here]
     blocks = [b for b in here if b < road.num_roadblocks]
     if still and not blocks:
@@ -173,7 +162,7 @@ def _path_between(road: VectorMap, start: int, goal: int) -> list[int]:
 def _extend(
     road: VectorMap, driven: list[int], last_pose: FloatArray, config: ConversionConfig
 ) -> list[int]:
-    """Blocks ahead along the straightest way."""
+    """Blocks ahead along the straightest way (nuPlan rule 456)."""
     edge = _edge_on(road, driven[-1], last_pose)
     ahead = road.baselines.length(edge) - road.progress_on(edge, last_pose[0], last_pose[1])
     added: list[int] = []

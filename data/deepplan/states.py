@@ -1,7 +1,7 @@
-"""A recording at 20 Hz, and the states of its egos (deepplan-conversion.md §5, §6).
+"""A recording at 20 Hz, and the states of its egos.
 
 Rows are 0.05 s apart, counted from the first frame; poses are linear between frames, angles by the
-shorter way round. Nothing is stretched: time is `frame_id / frame_rate`.
+shorter way round. Nothing is stretched (nuPlan rule 454): time is `frame_id / frame_rate`.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,11 @@ _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second ord
 
 @dataclass(frozen=True)
 class Samples:
-    """Boxes of runs at given times. G samples, local frame.
+    """Boxes of runs at given times. G samples, local frame."""
 
-    Attributes:
-        poses: (G, 3) box centre x [m], y [m], heading [rad].
-        velocities: (G, 2) [m/s].
-        heights: (G,) z of the box centre [m].
-    """
-
-    poses: FloatArray
-    velocities: FloatArray
-    heights: FloatArray
+    poses: FloatArray  # (G, 3) box centre x [m], y [m], heading [rad]
+    velocities: FloatArray  # (G, 2) [m/s]
+    heights: FloatArray  # (G,) z of the box centre [m]
 
 
 def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatArray) -> Samples:
@@ -192,11 +186,11 @@ def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:
         velocities: (R, 2) of the box centre in the map frame [m/s].
 
     Returns:
-        (R, 11) states. Steering and yaw rates stay 0: nuPlan reads none from a log
-        (nuplan-formats.md §2), so that an exported scenario is the same one.
+        (R, 11) states. Steering and yaw rates stay 0 (nuPlan rule 415), so that an exported
+        scenario is the same one.
     """
     states = np.zeros((len(centers), state.NUM_STATE))
-    states[:, :3] = state.rear_poses(centers)
+    states[:, :3] = state.rear_poses(centers)  # nuPlan rule 453: box centre on box centre
     cos, sin = np.cos(centers[:, 2]), np.sin(centers[:, 2])
     yaw_rate = slope(np.unwrap(centers[:, 2]), ROW_S)
     states[:, state.VX] = velocities[:, 0] * cos + velocities[:, 1] * sin

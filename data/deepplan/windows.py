@@ -1,7 +1,8 @@
-"""Windows of a recording, and which tracks may serve as ego (deepplan-conversion.md §3, §4).
+"""Windows of a recording, and which tracks may serve as ego.
 
-A window is a span of time, whatever the frame rate. Each track seen in it gets a verdict: `ego`, or
-the first rule it fails: category, presence, speed, overlap (later stages add lane and route).
+A window is a span of time, whatever the frame rate (nuPlan rule 450). Each track seen in it gets a
+verdict: `ego`, or the first rule it fails: category, presence, speed, overlap (later stages add
+lane and route).
 """
 
 from collections.abc import Mapping
@@ -23,43 +24,28 @@ _EPS = 1e-9  # s
 
 @dataclass(frozen=True)
 class ConversionConfig:
-    """Every threshold of the conversion, with the names of deepplan-conversion.md.
+    """Every threshold of the conversion."""
 
-    Attributes:
-        window_s: Length of a window [s].
-        overlap_s: Overlap of consecutive windows [s].
-        history_s: Part of a window before iteration 0 [s].
-        padding_s: History made up before the first frame of a recording, by constant velocity, for
-            recordings too short to spare any [s].
-        ego_categories: Categories that may serve as ego.
-        min_peak_speed: An ego must be faster than this at some frame [m/s].
-        max_overlap: Boxes may share this much area [m^2].
-        max_hole_s: Longest hole of a track that is filled [s].
-        max_lane_distance: Farthest lane an ego may start from [m].
-        max_lane_angle: Largest angle between the ego and that lane at the start [rad].
-        route_extension: How far the route reaches beyond the last ego position [m].
-        route_extension_blocks: How many blocks that may add.
-        min_drivable_share: Share of moving vehicles that must be on drivable area.
-        max_per_window: At most so many egos per window, in the order of track ids; None for all.
-        country: Whose default speed limits hold where the map has none.
-        category_map: Known category by category of the data set.
-    """
-
-    window_s: float = 18.0
-    overlap_s: float = 6.0
-    history_s: float = 3.0
+    window_s: float = 18.0  # length of a window [s]
+    overlap_s: float = 6.0  # overlap of consecutive windows [s]
+    history_s: float = 3.0  # part of a window before iteration 0 [s]
+    # history made up before the first frame of a recording, by constant velocity, for recordings
+    # too short to spare any [s]
     padding_s: float = 0.0
-    ego_categories: tuple[str, ...] = ("car", "van", "pickup")
-    min_peak_speed: float = 1.0
-    max_overlap: float = 0.01
-    max_hole_s: float = 0.5
-    max_lane_distance: float = 3.0
+    ego_categories: tuple[str, ...] = ("car", "van", "pickup")  # categories that may serve as ego
+    min_peak_speed: float = 1.0  # an ego must be faster than this at some frame [m/s]
+    max_overlap: float = 0.01  # boxes may share this much area [m^2]
+    max_hole_s: float = 0.5  # longest hole of a track that is filled [s]
+    max_lane_distance: float = 3.0  # farthest lane an ego may start from [m]
+    # largest angle between the ego and that lane at the start [rad]
     max_lane_angle: float = np.pi / 2
-    route_extension: float = 100.0
-    route_extension_blocks: int = 3
-    min_drivable_share: float = 0.95
+    route_extension: float = 100.0  # how far the route reaches beyond the last ego position [m]
+    route_extension_blocks: int = 3  # how many blocks that may add
+    min_drivable_share: float = 0.95  # share of moving vehicles that must be on drivable area
+    # at most so many egos per window, in the order of track ids; None for all
     max_per_window: int | None = None
-    country: str = "DE"
+    country: str = "DE"  # whose default speed limits hold where the map has none
+    # known category by category of the data set
     category_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -122,40 +108,24 @@ def _is_text(value: object) -> bool:
 
 @dataclass(frozen=True)
 class Runs:
-    """Stretches of rows in which a track is present without a hole that is too long. U runs.
+    """Stretches of rows in which a track is present without a hole that is too long. U runs."""
 
-    Attributes:
-        first: (U,) first row.
-        last: (U,) last row.
-        track: (U,) track.
-        number: (U,) how many runs of the same track came before.
-        row_key: (A,) run of a row times the number of frames, plus its frame: increasing.
-    """
-
-    first: IntArray
-    last: IntArray
-    track: IntArray
-    number: IntArray
-    row_key: IntArray
+    first: IntArray  # (U,) first row
+    last: IntArray  # (U,) last row
+    track: IntArray  # (U,) track
+    number: IntArray  # (U,) how many runs of the same track came before
+    row_key: IntArray  # (A,) run of a row times the number of frames, plus its frame: increasing
 
 
 @dataclass(frozen=True)
 class WindowVerdicts:
-    """What became of every track seen in one window. n tracks.
+    """What became of every track seen in one window. n tracks."""
 
-    Attributes:
-        start_s: Start of the window since the first frame [s].
-        tracks: (n,) tracks, ascending.
-        runs: (n,) run that covers the whole window, -1 where none does.
-        verdicts: n names of a rule, or `ego`.
-        partners: (n,) track whose box it overlapped, -1 where the verdict is another one.
-    """
-
-    start_s: float
-    tracks: IntArray
-    runs: IntArray
-    verdicts: tuple[str, ...]
-    partners: IntArray
+    start_s: float  # start of the window since the first frame [s]
+    tracks: IntArray  # (n,) tracks, ascending
+    runs: IntArray  # (n,) run that covers the whole window, -1 where none does
+    verdicts: tuple[str, ...]  # n names of a rule, or `ego`
+    partners: IntArray  # (n,) track whose box it overlapped, -1 where the verdict is another one
 
 
 def rows_of(seconds: float) -> int:
@@ -164,7 +134,7 @@ def rows_of(seconds: float) -> int:
 
 
 def find_runs(recording: Annotations, max_hole_s: float) -> Runs:
-    """Split the tracks where they are absent for longer than `max_hole_s`."""
+    """Split the tracks where they are absent for longer than `max_hole_s` (nuPlan rule 458)."""
     time = recording.time
     gap = np.r_[np.inf, np.diff(time)]
     new_track = np.r_[True, np.diff(recording.track) != 0]
@@ -189,7 +159,7 @@ def judge_windows(
 ) -> list[WindowVerdicts]:
     """The verdict on every track in every window, rules of category to overlap."""
     allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
-    speed = _median_of_three(
+    speed = _median_of_three(  # nuPlan rule 452
         np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]), recording.track
     )
     partner = overlap_partners(recording, allowed, config.max_overlap)
@@ -201,6 +171,8 @@ def judge_windows(
 
 def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap: float) -> IntArray:
     """(A,) a track whose box overlaps the row's at its frame, -1 where none does.
+
+    nuPlan rule 451: with the recorded sizes, and tracks of all categories.
 
     Args:
         recording: The recording.

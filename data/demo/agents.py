@@ -22,34 +22,20 @@ SIZES = {
 
 @dataclass(eq=False)
 class Driver:
-    """One vehicle or bicycle under way.
+    """One vehicle or bicycle under way."""
 
-    Attributes:
-        category: DSC3D category.
-        path: What it follows.
-        s: Arc length of its box centre [m].
-        v: Speed [m/s].
-        eager: Factor on the desired speed.
-        start: When it appears [s].
-        a: Acceleration [m/s^2].
-        held: Zones of its path it has been admitted to.
-        waiting: Places it has begun to brake for.
-        patience: How long it will stand before others let it in [s].
-        token: Number of its track.
-        place: x [m], y [m], heading [rad] of its box centre.
-    """
-
-    category: str
-    path: Path
-    s: float
-    v: float
-    eager: float = 1.0
-    start: float = 0.0
-    a: float = 0.0
-    held: set[int] = field(default_factory=set)
-    waiting: set[str] = field(default_factory=set)
-    patience: float = 6.0
-    token: int = 0
+    category: str  # DSC3D category
+    path: Path  # what it follows
+    s: float  # arc length of its box centre [m]
+    v: float  # speed [m/s]
+    eager: float = 1.0  # factor on the desired speed
+    start: float = 0.0  # when it appears [s]
+    a: float = 0.0  # acceleration [m/s^2]
+    held: set[int] = field(default_factory=set)  # zones of its path it has been admitted to
+    waiting: set[str] = field(default_factory=set)  # places it has begun to brake for
+    patience: float = 6.0  # how long it will stand before others let it in [s]
+    token: int = 0  # number of its track
+    # x [m], y [m], heading [rad] of its box centre
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -115,23 +101,14 @@ class Driver:
 
 @dataclass(eq=False)
 class Walker:
-    """One pedestrian.
+    """One pedestrian."""
 
-    Attributes:
-        walk: The way.
-        start: When the pedestrian appears [s].
-        s: Arc length [m].
-        v: Speed [m/s].
-        crossing: Whether the road has been entered.
-        token: Number of the track.
-    """
-
-    walk: Walk
-    start: float = 0.0
-    s: float = 0.0
-    v: float = WALKING
-    crossing: bool = False
-    token: int = 0
+    walk: Walk  # the way
+    start: float = 0.0  # when the pedestrian appears [s]
+    s: float = 0.0  # arc length [m]
+    v: float = WALKING  # speed [m/s]
+    crossing: bool = False  # whether the road has been entered
+    token: int = 0  # number of the track
 
     @property
     def is_under_way(self) -> bool:

@@ -4,8 +4,11 @@ Streets form a grid: two lanes per direction, a junction at every crossing with 
 right connectors. Coordinates are UTM-like.
 """
 
-from dataclasses import dataclass
+from collections import defaultdict
+from dataclasses import dataclass, field
 from functools import cache
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -28,6 +31,7 @@ _SPAN = (3.0, 15.0, 8.0)  # s of history, scenario and future
 _RADIUS = 50.0  # m around the ego in which agents start
 _ROUTE = ("right", "straight", "left", "right", "straight")
 _TURNS = {"right": -1, "straight": 0, "left": 1}
+_LANES_OF = {"straight": (0, 1), "left": (0,), "right": (1,)}  # lanes that turn, left first
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,9 @@ class _Shape:
         return shapely.Polygon(np.concatenate([self.left, self.right[::-1]]) + middle)
 
 
+Place = tuple[tuple[int, int], int]  # the node that a street leaves, and its direction
+
+
 @dataclass(frozen=True)
 class _Street:
     """One direction of one street: node it leaves, direction, ids of its lanes, roadblock."""
@@ -52,6 +59,29 @@ class _Street:
     lanes: tuple[str, str]
     block: str
 
+    @property
+    def end(self) -> tuple[int, int]:
+        """The node it leads to."""
+        dx, dy = _HEADINGS[self.direction].tolist()
+        return self.node[0] + dx, self.node[1] + dy
+
+    def after(self, turn: str) -> Place:
+        """The street behind a turn at its end."""
+        return self.end, (self.direction + _TURNS[turn]) % 4
+
+
+@dataclass
+class _City:
+    """Streets, the turns from one to another, and the baseline of every lane and connector."""
+
+    streets: dict[Place, _Street]
+    turns: list[tuple[_Street, str]]
+    lines: dict[str, FloatArray] = field(default_factory=dict)
+
+    def block_between(self, source: _Street, turn: str) -> str:
+        """The roadblock connector of a turn."""
+        return str(20_000 + self.turns.index((source, turn)))
+
 
 def bench_scene(num_agents: int, seed: int) -> Scenario:
     """A 15 s scenario in a city of 5200 lanes, with 3 s of history and 8 s of future.
@@ -60,9 +90,9 @@ def bench_scene(num_agents: int, seed: int) -> Scenario:
         num_agents: Vehicles, pedestrians, bicycles and objects that start within 50 m of the ego.
         seed: Of the agents; the city and the ego are always the same.
     """
-    streets = _streets()
-    road, lines = _city(streets)
-    path, route = _ego_path(streets, lines)
+    city = _city()
+    road = _map(city)
+    path, route = _ego_path(city)
     rows = round(sum(_SPAN) / ROW_S) + 1
     ego = _drive(path, rows)
     start = round(_SPAN[0] / ROW_S)
@@ -76,7 +106,7 @@ def bench_scene(num_agents: int, seed: int) -> Scenario:
         map=road,
         time_us=1_700_000_000_000_000 + np.arange(rows) * 50_000,
         ego=ego,
-        tracks=_agents(num_agents, rng, ego, start, lines),
+        tracks=_agents(num_agents, rng, ego, start, list(city.lines.values())),
         traffic_lights=TrafficLights.empty(rows),
         iteration_rows=iterations,
         row_step=2,
@@ -86,98 +116,81 @@ def bench_scene(num_agents: int, seed: int) -> Scenario:
     )
 
 
-def _streets() -> dict[tuple[tuple[int, int], int], _Street]:
-    """Streets by the node they leave and their direction."""
-    out: dict[tuple[tuple[int, int], int], _Street] = {}
-    for x in range(_NODES):
-        for y in range(_NODES):
-            for direction, (dx, dy) in enumerate(_HEADINGS.tolist()):
-                if 0 <= x + dx < _NODES and 0 <= y + dy < _NODES:
-                    number = len(out)
-                    lanes = (str(100_000 + 2 * number), str(100_001 + 2 * number))
-                    out[(x, y), direction] = _Street((x, y), direction, lanes, str(10_000 + number))
-    return out
+def _city() -> _City:
+    streets: dict[Place, _Street] = {}
+    for x, y in product(range(_NODES), repeat=2):
+        for direction, (dx, dy) in enumerate(_HEADINGS.tolist()):
+            if 0 <= x + dx < _NODES and 0 <= y + dy < _NODES:
+                number = len(streets)
+                lanes = (str(100_000 + 2 * number), str(100_001 + 2 * number))
+                streets[(x, y), direction] = _Street((x, y), direction, lanes, str(10_000 + number))
+    turns = [(s, turn) for s in streets.values() for turn in _TURNS if s.after(turn) in streets]
+    return _City(streets, turns)
 
 
-def _city(
-    streets: dict[tuple[tuple[int, int], int], _Street],
-) -> tuple[VectorMap, dict[str, FloatArray]]:
-    """The map, and the baseline of every lane and connector."""
-    lines: dict[str, FloatArray] = {}
-    into: dict[str, list[str]] = {}
-    out_of: dict[str, list[str]] = {}
+def _map(city: _City) -> VectorMap:
+    """The map; fills the baselines of the city."""
+    links = _Links(defaultdict(list), defaultdict(list))
     edges: list[EdgeSpec] = []
     blocks: list[BlockSpec] = []
-    junctions: list[AreaSpec] = []
-    for street in streets.values():
+    for street in city.streets.values():
         for index, lane in enumerate(street.lanes):
-            lines[lane] = _lane_shape(street.direction, index).line + _middle(street.node)
-    turns = [
-        (street, turn)
-        for street in streets.values()
-        for turn in _TURNS
-        if (_end_node(street), (street.direction + _TURNS[turn]) % 4) in streets
-    ]
-    for number, (street, turn) in enumerate(turns):
-        target = streets[_end_node(street), (street.direction + _TURNS[turn]) % 4]
-        indices = {"straight": (0, 1), "left": (0,), "right": (1,)}[turn]
-        names = [f"{200_000 + 2 * number + index}" for index in indices]
-        block = str(20_000 + number)
-        node = _end_node(street)
-        junction = str(1_000 + node[0] * _NODES + node[1])
-        middle = _middle(node)
-        for name, index in zip(names, indices, strict=True):
+            city.lines[lane] = _lane_shape(street.direction, index).line + _middle(street.node)
+    for number, (street, turn) in enumerate(city.turns):
+        target, middle = city.streets[street.after(turn)], _middle(street.end)
+        block, junction = str(20_000 + number), _junction(street.end)
+        for index in _LANES_OF[turn]:
+            name = f"{200_000 + 2 * number + index}"
             source, goal = street.lanes[index], target.lanes[index]
             shape = _turn_shape(street.direction, turn, index)
-            lines[name] = shape.line + middle
-            into.setdefault(goal, []).append(name)
-            out_of.setdefault(source, []).append(name)
+            city.lines[name] = shape.line + middle
+            links.add(source, name, goal)
             edges.append(
-                EdgeSpec(
-                    id=name,
+                _edge(
+                    name,
+                    block,
+                    shape,
+                    middle,
                     is_connector=True,
-                    polygon=shape.area(middle),
-                    baseline=lines[name],
-                    block_id=block,
+                    baseline=city.lines[name],
                     incoming=[source],
                     outgoing=[goal],
-                    left=shape.left + middle,
-                    right=shape.right + middle,
-                    speed_limit=_LIMIT,
                     intersection_id=junction,
                     turn_type={"straight": 0, "left": 1, "right": 2}[turn],
                 )
             )
-        blocks.append(
-            BlockSpec(
-                block,
-                True,
-                _block_shape(street.direction, turn).area(middle),
-                [street.block],
-                [target.block],
-                junction,
+        area = _block_shape(street.direction, turn).area(middle)
+        blocks.append(BlockSpec(block, True, area, [street.block], [target.block], junction))
+        links.add(street.block, block, target.block)
+    for street in city.streets.values():
+        name, middle = street.block, _middle(street.node)
+        left, right = street.lanes
+        edges += [
+            _edge(
+                lane,
+                name,
+                _lane_shape(street.direction, index),
+                middle,
+                is_connector=False,
+                baseline=city.lines[lane],
+                incoming=links.into[lane],
+                outgoing=links.out_of[lane],
+                lane_index=index,
+                left_lane=left if index else None,
+                right_lane=None if index else right,
             )
+            for index, lane in enumerate(street.lanes)
+        ]
+        area = _lane_shape(street.direction, None).area(middle)
+        blocks.append(BlockSpec(name, False, area, links.into[name], links.out_of[name]))
+    junctions = []
+    for node in product(range(_NODES), repeat=2):
+        (cx, cy), half = _middle(node), _HALF
+        junctions.append(
+            AreaSpec(_junction(node), shapely.box(cx - half, cy - half, cx + half, cy + half))
         )
-        into.setdefault(target.block, []).append(block)
-        out_of.setdefault(street.block, []).append(block)
-    for street in streets.values():
-        edges += _lane_specs(street, lines, into, out_of)
-        blocks.append(
-            BlockSpec(
-                street.block,
-                False,
-                _lane_shape(street.direction, None).area(_middle(street.node)),
-                into.get(street.block, []),
-                out_of.get(street.block, []),
-            )
-        )
-    for x in range(_NODES):
-        for y in range(_NODES):
-            cx, cy = _ORIGIN + _SPACING * np.array([x, y])
-            square = shapely.box(cx - _HALF, cy - _HALF, cx + _HALF, cy + _HALF)
-            junctions.append(AreaSpec(str(1_000 + x * _NODES + y), square))
     areas = [AreaSpec(f"d{b.id}", b.polygon) for b in blocks if not b.is_connector]
-    road = build_map(
+    return build_map(
         "bench-city",
         edges=edges,
         blocks=blocks,
@@ -186,44 +199,37 @@ def _city(
         crosswalks=[AreaSpec(f"c{j.id}", _crosswalk(j.polygon)) for j in junctions],
         drivable_areas=[*areas, *(AreaSpec(f"d{j.id}", j.polygon) for j in junctions)],
     )
-    return road, lines
 
 
-def _lane_specs(
-    street: _Street,
-    lines: dict[str, FloatArray],
-    into: dict[str, list[str]],
-    out_of: dict[str, list[str]],
-) -> list[EdgeSpec]:
-    left, right = street.lanes
-    middle = _middle(street.node)
-    shapes = [_lane_shape(street.direction, index) for index in (0, 1)]
-    return [
-        EdgeSpec(
-            id=lane,
-            is_connector=False,
-            polygon=shapes[index].area(middle),
-            baseline=lines[lane],
-            block_id=street.block,
-            incoming=into.get(lane, []),
-            outgoing=out_of.get(lane, []),
-            left=shapes[index].left + middle,
-            right=shapes[index].right + middle,
-            speed_limit=_LIMIT,
-            lane_index=index,
-            left_lane=left if index else None,
-            right_lane=None if index else right,
-        )
-        for index, lane in enumerate(street.lanes)
-    ]
+class _Links(NamedTuple):
+    """What leads into an edge or block, and out of it, by its id."""
+
+    into: dict[str, list[str]]
+    out_of: dict[str, list[str]]
+
+    def add(self, source: str, name: str, goal: str) -> None:
+        """A connector from one to another."""
+        self.into[goal].append(name)
+        self.out_of[source].append(name)
 
 
-def _end_node(street: _Street) -> tuple[int, int]:
-    dx, dy = _HEADINGS[street.direction].tolist()
-    return street.node[0] + dx, street.node[1] + dy
+def _edge(name: str, block: str, shape: _Shape, middle: FloatArray, **rest: Any) -> EdgeSpec:
+    return EdgeSpec(
+        id=name,
+        polygon=shape.area(middle),
+        block_id=block,
+        left=shape.left + middle,
+        right=shape.right + middle,
+        speed_limit=_LIMIT,
+        **rest,
+    )
 
 
-def _middle(node: tuple[int, int]) -> FloatArray:
+def _junction(node: tuple[int, ...]) -> str:
+    return str(1_000 + node[0] * _NODES + node[1])
+
+
+def _middle(node: tuple[int, ...]) -> FloatArray:
     return _ORIGIN + _SPACING * np.array(node, np.float64)
 
 
@@ -277,36 +283,18 @@ def _crosswalk(junction: shapely.Polygon) -> shapely.Polygon:
     return shapely.box(x, y, x + 3.0, high)
 
 
-def _ego_path(
-    streets: dict[tuple[tuple[int, int], int], _Street], lines: dict[str, FloatArray]
-) -> tuple[FloatArray, tuple[str, ...]]:
+def _ego_path(city: _City) -> tuple[FloatArray, tuple[str, ...]]:
     """Centre line of the ego's way from the middle of the city, and its route."""
-    street = streets[(_NODES // 2, _NODES // 2), 0]
-    parts, route = [lines[street.lanes[1]]], [street.block]
+    street = city.streets[(_NODES // 2, _NODES // 2), 0]
+    parts, route = [city.lines[street.lanes[1]]], [street.block]
     for turn in _ROUTE:
-        index = 0 if turn == "left" else 1
-        direction = (street.direction + _TURNS[turn]) % 4
-        following = streets[_end_node(street), direction]
+        index = _LANES_OF[turn][-1]
+        following = city.streets[street.after(turn)]
         shape = _turn_shape(street.direction, turn, index)
-        parts += [shape.line + _middle(_end_node(street)), lines[following.lanes[index]]]
-        route += [_block_between(streets, street, following), following.block]
+        parts += [shape.line + _middle(street.end), city.lines[following.lanes[index]]]
+        route += [city.block_between(street, turn), following.block]
         street = following
     return np.concatenate(parts), tuple(route)
-
-
-def _block_between(
-    streets: dict[tuple[tuple[int, int], int], _Street], source: _Street, goal: _Street
-) -> str:
-    number = 0
-    for street in streets.values():
-        for turn in _TURNS:
-            end = _end_node(street), (street.direction + _TURNS[turn]) % 4
-            if end not in streets:
-                continue
-            if street is source and streets[end] is goal:
-                return str(20_000 + number)
-            number += 1
-    raise AssertionError("streets that do not meet")
 
 
 def _drive(path: FloatArray, rows: int) -> FloatArray:
@@ -340,12 +328,21 @@ def _drive(path: FloatArray, rows: int) -> FloatArray:
     return ego_states(poses, velocity)
 
 
-_SIZES = {
-    AgentKind.VEHICLE: (4.6, 1.9),
-    AgentKind.PEDESTRIAN: (0.7, 0.7),
-    AgentKind.BICYCLE: (1.8, 0.6),
-    AgentKind.TRAFFIC_CONE: (0.4, 0.4),
-    AgentKind.BARRIER: (2.0, 0.5),
+class _Sort(NamedTuple):
+    """Agents of one kind."""
+
+    size: tuple[float, float]  # m
+    share: float  # of all agents
+    top: float = 0.0  # m/s
+    aside: float = 3.2  # m to the right of the middle of a lane
+
+
+_SORTS = {
+    AgentKind.VEHICLE: _Sort((4.6, 1.9), 0.5, 9.0, 0.0),
+    AgentKind.PEDESTRIAN: _Sort((0.7, 0.7), 0.25, 1.5),
+    AgentKind.BICYCLE: _Sort((1.8, 0.6), 0.15, 5.0, 1.3),
+    AgentKind.TRAFFIC_CONE: _Sort((0.4, 0.4), 0.06),
+    AgentKind.BARRIER: _Sort((2.0, 0.5), 0.04),
 }
 
 
@@ -354,18 +351,15 @@ def _agents(
     rng: np.random.Generator,
     ego: FloatArray,
     start: int,
-    lines: dict[str, FloatArray],
+    lines: list[FloatArray],
 ) -> Tracks:
     """Agents that start near the ego and keep clear of its recorded way."""
     here = ego[start, :2]
     near = [
-        line
-        for line in lines.values()
-        if np.abs(line[len(line) // 2] - here).max() < _RADIUS + _SPACING
+        line for line in lines if np.abs(line[len(line) // 2] - here).max() < _RADIUS + _SPACING
     ]
-    kinds = rng.choice(
-        np.array([int(kind) for kind in _SIZES]), count, p=[0.5, 0.25, 0.15, 0.06, 0.04]
-    ).astype(np.int64)
+    shares = [sort.share for sort in _SORTS.values()]
+    kinds = rng.choice(np.array([*map(int, _SORTS)]), count, p=shares).astype(np.int64)
     rows = len(ego)
     poses = np.zeros((rows, count, 3))
     velocities = np.full((rows, count, 2), np.nan)
@@ -379,7 +373,7 @@ def _agents(
         poses[:, index, 2] = pose[2]
         if kind <= AgentKind.BICYCLE:
             velocities[:, index] = along
-    sizes = np.array([_SIZES[AgentKind(kind)] for kind in kinds.tolist()]).reshape(-1, 2)
+    sizes = np.array([_SORTS[AgentKind(kind)].size for kind in kinds.tolist()]).reshape(-1, 2)
     return Tracks(
         np.ones((rows, count), np.bool_),
         poses,
@@ -401,18 +395,15 @@ def _place(
     """A pose at the start and a speed, such that nobody is hit; less choosy after many tries."""
     time = (np.arange(len(ego)) - start) * ROW_S
     taken = np.array(placed).reshape(-1, 2)
-    aside = {AgentKind.VEHICLE: 0.0, AgentKind.BICYCLE: 1.3}.get(AgentKind(kind), 3.2)
-    top = {AgentKind.VEHICLE: 9.0, AgentKind.PEDESTRIAN: 1.5, AgentKind.BICYCLE: 5.0}.get(
-        AgentKind(kind), 0.0
-    )
+    sort = _SORTS[AgentKind(kind)]
     for attempt in range(2000):
         line = near[rng.integers(len(near))]
         at = int(rng.integers(len(line) - 1))
         step = line[at + 1] - line[at]
         heading = float(np.arctan2(step[1], step[0]))
         normal = np.array([np.sin(heading), -np.cos(heading)])
-        xy = line[at] + aside * normal + rng.uniform(-0.3, 0.3, 2)
-        speed = float(top * rng.random()) if rng.random() < 0.6 else 0.0
+        xy = line[at] + sort.aside * normal + rng.uniform(-0.3, 0.3, 2)
+        speed = float(sort.top * rng.random()) if rng.random() < 0.6 else 0.0
         room = max(6.0 * 0.97**attempt, 1.0) if kind == AgentKind.VEHICLE else 1.0
         path = xy + (time * speed)[:, None] * np.array([np.cos(heading), np.sin(heading)])
         clear = np.hypot(*(path - ego[:, :2]).T).min() > (6.5 if kind == 0 else 4.0)

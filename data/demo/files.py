@@ -1,4 +1,4 @@
-"""Generated recordings as files in the layout of DSC3D (dsc3d-format.md §2)."""
+"""Generated recordings as files in the layout of DSC3D."""
 
 import json
 from datetime import datetime
@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES
-from shiftsim.data.demo.scenes import SITES, DemoSite, Scene, traffic_of
+from shiftsim.data.demo.scenes import DemoSite, Scene, demo_sites, traffic_of
 from shiftsim.data.demo.traffic import DT, Box
 from shiftsim.geometry.frames import wrap_angles
 
@@ -21,7 +21,7 @@ _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleratio
 
 def write_sites(folder: Path) -> None:
     """Write every demo site into a folder of its own below `folder`."""
-    for site in SITES:
+    for site in demo_sites():
         _write_site(folder / site.name, site)
 
 
@@ -39,7 +39,7 @@ def _write_site(folder: Path, site: DemoSite) -> None:
         "dataset_name": f"shiftsim demo {site.name}",
         "dataset_version": "1",
         "interface_version": "1.0",
-        "reference_utm": {"zone": [site.zone, "N"], "offset": list(site.offset)},
+        "reference_utm": {"zone": [site.zone, "N"], "offset": site.offset},
         "frame_rate": _FRAME_RATE,
         "frame_distance": _FRAME_DISTANCE,
         "categories": sorted(categories),

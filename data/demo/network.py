@@ -11,17 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.demo.paths import (
-    STEP,
-    Path,
-    Walk,
-    Zone,
-    arc_at,
-    brake_in_time,
-    for_bicycles,
-    make_path,
-    shifted,
-)
+from shiftsim.data.demo import paths
 from shiftsim.data.demo.roads import (
     CrosswalkSpec,
     LaneSpec,
@@ -40,48 +30,29 @@ BAY_ANGLE = np.pi / 3  # of diagonal parking spaces
 
 @dataclass(frozen=True)
 class Street:
-    """A road between junctions.
+    """A road between junctions."""
 
-    Attributes:
-        name: Without digits at the end.
-        id: From 1 to 9.
-        start: x [m], y [m], heading [rad].
-        pieces: Geometry.
-        width: Of every lane [m].
-        limit: Speed limit [km/h].
-        lanes: Per direction.
-        is_one_way: Whether there are only the lanes along the reference line.
-        is_main: Whether it has priority.
-        junctions: At its begin and its end, 0 for none.
-        stop: How far before a junction vehicles wait [m].
-        crossings: First and last s of the places where pedestrians cross [m].
-        is_marked: Whether these are crosswalks of the map.
-        parking: Width of the strip for parking on both sides, diagonal above 3 m [m].
-        stalls: First and last s of stretches with parked cars [m].
-        empty: Numbers of the parking spaces that are free.
-        sidewalk: Width, 0 for none [m].
-        has_stop_sign: At its begin.
-        narrow: First and last s of a place where vehicles cannot meet [m].
-    """
-
-    name: str
-    id: int
-    start: tuple[float, float, float]
-    pieces: tuple[Piece, ...]
-    width: float
-    limit: float
-    lanes: int = 1
-    is_one_way: bool = False
-    is_main: bool = True
-    junctions: tuple[int, int] = (0, 0)
-    stop: float = 9.0
+    name: str  # without digits at the end
+    id: int  # from 1 to 9
+    start: tuple[float, float, float]  # x [m], y [m], heading [rad]
+    pieces: tuple[Piece, ...]  # geometry
+    width: float  # of every lane [m]
+    limit: float  # speed limit [km/h]
+    lanes: int = 1  # per direction
+    is_one_way: bool = False  # whether there are only the lanes along the reference line
+    is_main: bool = True  # whether it has priority
+    junctions: tuple[int, int] = (0, 0)  # at its begin and its end, 0 for none
+    stop: float = 9.0  # how far before a junction vehicles wait [m]
+    # first and last s of the places where pedestrians cross [m]
     crossings: tuple[tuple[float, float], ...] = ()
-    is_marked: bool = True
-    parking: float = 0.0
+    is_marked: bool = True  # whether these are crosswalks of the map
+    parking: float = 0.0  # width of the strip for parking on both sides, diagonal above 3 m [m]
+    # first and last s of stretches with parked cars [m]
     stalls: tuple[tuple[float, float], ...] = ()
-    empty: tuple[int, ...] = ()
-    sidewalk: float = 3.0
-    has_stop_sign: bool = False
+    empty: tuple[int, ...] = ()  # numbers of the parking spaces that are free
+    sidewalk: float = 3.0  # width, 0 for none [m]
+    has_stop_sign: bool = False  # at its begin
+    # first and last s of a place where vehicles cannot meet [m]
     narrow: tuple[float, float] | None = None
 
     @property
@@ -147,33 +118,26 @@ class Leg:
 
     def lane(self, road: RoadSpec, lane: int) -> FloatArray:
         """(n, 2) centre of a lane, in its direction."""
-        s = np.arange(0.0, road.length, STEP)
+        s = np.arange(0.0, road.length, paths.STEP)
         center = road.center_of(-lane if self.is_forward else lane, s)[:, :2]
         return center if self.is_forward else center[::-1]
 
 
 @dataclass
 class Town:
-    """A generated town.
+    """A generated town."""
 
-    Attributes:
-        name: Of the town.
-        streets: By name.
-        network: All roads.
-        connectors: Connecting road and lane behind it by junction, street, lane, next street.
-        zones: Connecting roads and narrow places that cannot be used at once.
-        walks: By name.
-        bays: (n, 3) poses of parking spaces by street.
-    """
-
-    name: str
-    streets: dict[str, Street] = field(default_factory=dict)
-    network: RoadNetwork = field(default_factory=lambda: RoadNetwork(""))
+    name: str  # of the town
+    streets: dict[str, Street] = field(default_factory=dict)  # by name
+    network: RoadNetwork = field(default_factory=lambda: RoadNetwork(""))  # all roads
+    # connecting road and lane behind it by junction, street, lane, next street
     connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
+    # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
-    walks: dict[str, Walk] = field(default_factory=dict)
+    walks: dict[str, paths.Walk] = field(default_factory=dict)  # by name
+    # (n, 3) poses of parking spaces by street
     bays: dict[str, FloatArray] = field(default_factory=dict)
-    _paths: dict[str, Path] = field(default_factory=dict)
+    _paths: dict[str, paths.Path] = field(default_factory=dict)
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -183,7 +147,7 @@ class Town:
         ]
         return np.concatenate([np.zeros((0, 3)), *poses])
 
-    def path(self, way: str) -> Path:
+    def path(self, way: str) -> paths.Path:
         """The path of a way."""
         if way not in self._paths:
             self._paths[way] = _make_way(self, way)
@@ -243,7 +207,7 @@ def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray])
         roads[number] = road
         town.network.links.append(Link(a.id, number, incoming))
         town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
-        lines[number] = road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
+        lines[number] = road.center_of(-1, np.arange(0.0, road.length, paths.STEP))[:, :2]
 
 
 def _turn(town: Town, source: Leg, target: Leg) -> float:
@@ -253,10 +217,10 @@ def _turn(town: Town, source: Leg, target: Leg) -> float:
     return float((b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _make_way(town: Town, way: str) -> Path:
+def _make_way(town: Town, way: str) -> paths.Path:
     names = way.split("-")
     if names[-1] == "bicycle":
-        return for_bicycles(town.path(way.removesuffix("-bicycle")))
+        return paths.for_bicycles(town.path(way.removesuffix("-bicycle")))
     steps = [re.fullmatch(r"([a-z]+)(\d*)(?:>(\d+))?(?:@(\d+))?", name) for name in names]
     parts, limits, zones, crossings = [], [], [], []
     lane, is_forward = 1, False
@@ -291,33 +255,33 @@ def _make_way(town: Town, way: str) -> Path:
             rank = 0 if street.is_main else 2
             if _turn(town, leg, target) > 0.5 and not street.is_one_way:
                 rank += 1
-            points = inner.center_of(-1, np.arange(0.0, inner.length, STEP))[:, :2]
+            points = inner.center_of(-1, np.arange(0.0, inner.length, paths.STEP))[:, :2]
             parts.append(points)
             limits.append(min(street.limit, target.street.limit))
-            zone = Zone(connector, 0.0, 0.0, 0.0, rank, origin)
+            zone = paths.Zone(connector, 0.0, 0.0, 0.0, rank, origin)
             zones.append((zone, points[0], points[-1], street.stop))
             lane, is_forward = to_lane, target.is_forward
-    path = make_path(parts, limits)
+    path = paths.make_path(parts, limits)
     return _with_places(path, zones, crossings, is_parking=bool(steps[-1] and steps[-1][4]))
 
 
 def _with_places(
-    path: Path,
-    zones: list[tuple[Zone, FloatArray, FloatArray, float]],
+    path: paths.Path,
+    zones: list[tuple[paths.Zone, FloatArray, FloatArray, float]],
     crossings: list[tuple[str, FloatArray, FloatArray]],
     *,
     is_parking: bool,
-) -> Path:
+) -> paths.Path:
     """A path with its zones and crossings, narrow places driven past with care."""
-    arc = STEP * np.arange(len(path.points))
+    arc = paths.STEP * np.arange(len(path.points))
     aside, speed = np.zeros(len(arc)), path.speed
     places = []
     for name, *ends in crossings:
-        first, last = sorted(arc_at(path.points, end) for end in ends)
+        first, last = sorted(paths.arc_at(path.points, end) for end in ends)
         places.append((name, first, last))
     made = []
     for zone, begin, end, stop in zones:
-        entry, leave = arc_at(path.points, begin), arc_at(path.points, end)
+        entry, leave = paths.arc_at(path.points, begin), paths.arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
         made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
@@ -326,15 +290,15 @@ def _with_places(
             share = np.clip(1.0 - outside, 0.0, 1.0)
             aside += _NARROW_ASIDE * share * share * (3.0 - 2.0 * share)
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
-    path = shifted(replace(path, speed=brake_in_time(speed)), aside)
+    path = paths.shifted(replace(path, speed=paths.brake_in_time(speed)), aside)
     order = tuple(sorted(made, key=lambda zone: zone.entry))
     return replace(path, zones=order, crossings=tuple(places), is_parking=is_parking)
 
 
-def _narrow_zone(leg: Leg) -> Zone:
+def _narrow_zone(leg: Leg) -> paths.Zone:
     number = -2 * leg.street.id - int(leg.is_forward)
     name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
-    return Zone(number, 0.0, 0.0, 0.0, 1 - int(leg.is_forward), name)
+    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - int(leg.is_forward), name)
 
 
 def _ends(
@@ -348,7 +312,7 @@ def _ends(
 def _change_lanes(first: FloatArray, second: FloatArray) -> FloatArray:
     """(n, 2) a line that goes over from one lane to another, halfway."""
     count = min(len(first), len(second))
-    along = (STEP * (np.arange(count) - 0.5 * count)) / _LANE_CHANGE + 0.5
+    along = (paths.STEP * (np.arange(count) - 0.5 * count)) / _LANE_CHANGE + 0.5
     share = np.clip(along, 0.0, 1.0)[:, None]
     share = share * share * (3.0 - 2.0 * share)
     return (1.0 - share) * first[:count] + share * second[:count]
@@ -362,7 +326,7 @@ def _into_bay(line: FloatArray, bay: FloatArray) -> FloatArray:
     near = np.hypot(*offset.T) < 15.0
     corner = int(np.argmin(np.where(near, np.abs(beside), np.inf)))
     reach = float(np.hypot(*offset[corner]))
-    into = line[corner] + np.arange(STEP, reach, STEP)[:, None] * along
+    into = line[corner] + np.arange(paths.STEP, reach, paths.STEP)[:, None] * along
     return np.concatenate([line[:corner], into, bay[None, :2]])
 
 

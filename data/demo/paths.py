@@ -42,61 +42,37 @@ class _Line:
 
 @dataclass(frozen=True)
 class Zone:
-    """A stretch of a path that must be entered one after the other: a junction, a narrow place.
+    """A stretch of a path that must be entered one after the other: a junction, a narrow place."""
 
-    Attributes:
-        id: Of the connecting road; negative for narrow places.
-        entry: Where it begins [m].
-        exit: Where it ends [m].
-        stop: Where a vehicle that must wait stops [m].
-        rank: Order of priority, 0 first.
-        origin: Lane it is entered from.
-        crosswalk: Name of the crosswalk between stop and entry, empty without one.
-    """
-
-    id: int
-    entry: float
-    exit: float
-    stop: float
-    rank: int
-    origin: str
-    crosswalk: str = ""
+    id: int  # of the connecting road; negative for narrow places
+    entry: float  # where it begins [m]
+    exit: float  # where it ends [m]
+    stop: float  # where a vehicle that must wait stops [m]
+    rank: int  # order of priority, 0 first
+    origin: str  # lane it is entered from
+    crosswalk: str = ""  # name of the crosswalk between stop and entry, empty without one
 
 
 @dataclass(frozen=True)
 class Path(_Line):
-    """What one vehicle can follow. n points, `STEP` apart.
+    """What one vehicle can follow. n points, `STEP` apart."""
 
-    Attributes:
-        points: (n, 3) x [m], y [m], heading, unwrapped [rad].
-        speed: (n,) desired speed of an ordinary driver [m/s].
-        zones: On the way, in order.
-        crossings: Name, first and last arc length of the places where pedestrians cross [m].
-        is_parking: Whether vehicles stay at its end.
-    """
-
-    points: FloatArray
-    speed: FloatArray
-    zones: tuple[Zone, ...] = ()
+    points: FloatArray  # (n, 3) x [m], y [m], heading, unwrapped [rad]
+    speed: FloatArray  # (n,) desired speed of an ordinary driver [m/s]
+    zones: tuple[Zone, ...] = ()  # on the way, in order
+    # name, first and last arc length of the places where pedestrians cross [m]
     crossings: tuple[tuple[str, float, float], ...] = ()
-    is_parking: bool = False
+    is_parking: bool = False  # whether vehicles stay at its end
 
 
 @dataclass(frozen=True)
 class Walk(_Line):
-    """A way of a pedestrian. n points, `STEP` apart.
+    """A way of a pedestrian. n points, `STEP` apart."""
 
-    Attributes:
-        points: (n, 3) x [m], y [m], heading [rad].
-        crossing: Name of the place where it crosses a road, empty for none.
-        kerb: Where the pedestrian waits to cross [m].
-        across: Where the other side is reached [m].
-    """
-
-    points: FloatArray
-    crossing: str = ""
-    kerb: float = np.inf
-    across: float = np.inf
+    points: FloatArray  # (n, 3) x [m], y [m], heading [rad]
+    crossing: str = ""  # name of the place where it crosses a road, empty for none
+    kerb: float = np.inf  # where the pedestrian waits to cross [m]
+    across: float = np.inf  # where the other side is reached [m]
 
 
 def make_path(parts: Sequence[FloatArray], limits_kmh: Sequence[float]) -> Path:

@@ -16,18 +16,12 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 @dataclass(frozen=True)
 class Piece:
-    """One geometry record: a clothoid from `start` to `end` curvature, or a cubic.
+    """One geometry record: a clothoid from `start` to `end` curvature, or a cubic."""
 
-    Attributes:
-        length: [m].
-        start: Curvature at the start [1/m].
-        end: Curvature at the end [1/m].
-        cubic: (8,) aU bU cU dU aV bV cV dV over p in [0, 1]; empty for the others.
-    """
-
-    length: float
-    start: float = 0.0
-    end: float = 0.0
+    length: float  # [m]
+    start: float = 0.0  # curvature at the start [1/m]
+    end: float = 0.0  # curvature at the end [1/m]
+    # (8,) aU bU cU dU aV bV cV dV over p in [0, 1]; empty for the others
     cubic: tuple[float, ...] = ()
 
     def xml(self) -> str:
@@ -88,31 +82,19 @@ class CrosswalkSpec:
 
 @dataclass(frozen=True)
 class RoadSpec:
-    """One road.
+    """One road."""
 
-    Attributes:
-        id: Road id.
-        start: x [m], y [m], heading [rad].
-        pieces: Geometry.
-        lanes: All lanes except the centre one.
-        limit_kmh: Speed limit [km/h].
-        junction: Junction id, -1 for none.
-        predecessor: Element type and id, contact point; None for none.
-        successor: Likewise.
-        crosswalks: On this road.
-        stop_sign: s of a stop sign for traffic against s; None for none [m].
-    """
-
-    id: int
-    start: tuple[float, float, float]
-    pieces: tuple[Piece, ...]
-    lanes: tuple[LaneSpec, ...]
-    limit_kmh: float
-    junction: int = -1
+    id: int  # road id
+    start: tuple[float, float, float]  # x [m], y [m], heading [rad]
+    pieces: tuple[Piece, ...]  # geometry
+    lanes: tuple[LaneSpec, ...]  # all lanes except the centre one
+    limit_kmh: float  # speed limit [km/h]
+    junction: int = -1  # junction id, -1 for none
+    # element type and id, contact point; None for none
     predecessor: tuple[str, int, str] | None = None
-    successor: tuple[str, int, str] | None = None
-    crosswalks: tuple[CrosswalkSpec, ...] = ()
-    stop_sign: float | None = None
+    successor: tuple[str, int, str] | None = None  # likewise
+    crosswalks: tuple[CrosswalkSpec, ...] = ()  # on this road
+    stop_sign: float | None = None  # s of a stop sign for traffic against s; None for none [m]
 
     @property
     def length(self) -> float:

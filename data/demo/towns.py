@@ -173,6 +173,16 @@ def shared_town() -> Town:
     return _finish("shared", *streets)
 
 
+TOWNS = {
+    "avenue": avenue_town,
+    "junction": junction_town,
+    "parking": parking_town,
+    "roundabout": roundabout_town,
+    "shared": shared_town,
+    "street": street_town,
+}
+
+
 def _finish(name: str, *streets: Street) -> Town:
     town = build_town(name, streets)
     add_walks(town)

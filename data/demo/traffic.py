@@ -39,19 +39,13 @@ Box = tuple[int, int, str, float, float, float, float, float, float]
 
 @dataclass
 class Traffic:
-    """Everybody in a town, and the recording so far.
+    """Everybody in a town, and the recording so far."""
 
-    Attributes:
-        town: Where.
-        drivers: In the order of their tracks.
-        walkers: The tracks after those.
-        boxes: Frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration
-            [m/s^2], yaw rate [rad/s].
-    """
-
-    town: Town
-    drivers: list[Driver]
-    walkers: list[Walker]
+    town: Town  # where
+    drivers: list[Driver]  # in the order of their tracks
+    walkers: list[Walker]  # the tracks after those
+    # frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration [m/s^2], yaw
+    # rate [rad/s]
     boxes: list[Box] = field(default_factory=list)
     _passing: dict[tuple[int, int], float] = field(default_factory=dict)
 

@@ -66,7 +66,7 @@ def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
         raise ConversionError(
             f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]:g} is not a finite number"
             f" ({len(bad)} such values)",
-            "mend or delete the rows; no position can be made up",
+            "repair or delete the rows; no position can be made up",
         )
     largest = _LARGEST.get(key, np.inf)
     bad = np.flatnonzero(np.abs(values) > largest)

@@ -43,7 +43,7 @@ def believed_velocities(
     track: IntArray,
     warnings: dict[str, int],
 ) -> FloatArray:
-    """Stored velocities of the tracks where they fit the positions, else central differences.
+    """Stored velocities of the tracks where they fit the positions (nuPlan rule 459), else derived.
 
     Args:
         stored: (A, 2) as recorded, None where the file has none [m/s].
@@ -90,7 +90,7 @@ def held_headings(
     track: IntArray,
     warnings: dict[str, int],
 ) -> FloatArray:
-    """Headings, where a standing object's spins: the one before, until it moves again."""
+    """Headings; where a standing object's spins, the one before (nuPlan rule 460)."""
     standing = np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDSTILL
     same = np.r_[False, track[1:] == track[:-1]]
     turn = np.r_[0.0, np.abs(wrap_angles(np.diff(yaw)))]

@@ -2,7 +2,7 @@
 
 A recording is a table with one row per object and frame. It is kept flat, sorted by track and frame
 (nothing here grows with tracks x frames), in the local frame of the site; `local + offset` is UTM.
-Position and heading are taken as truth, heading through the rotation matrix (dsc3d-format.md §2).
+Position and heading are taken as truth, heading through the rotation matrix.
 """
 
 import json
@@ -50,7 +50,7 @@ CATEGORIES = {
         ("animal", "bicycle_rack", "movable_object", "static_object", "generic_object"),
         AgentKind.GENERIC_OBJECT,
     ),
-}  # deepplan-conversion.md §7
+}  # nuPlan rule 462: it has no class for motorcycles
 
 _NEEDED = ("frame_id", "track_id", "category", *POSITION, *ROTATION, *DIMENSION, *VELOCITY)
 
@@ -67,27 +67,16 @@ _MAX_OFFSET = 2e7  # m, of UTM coordinates
 
 @dataclass(frozen=True)
 class Site:
-    """One DSC3D folder.
+    """One DSC3D folder."""
 
-    Attributes:
-        folder: Where `data_meta.json` lies.
-        name: Free text of the data set.
-        zone: UTM zone.
-        is_north: Whether the zone is a northern one.
-        offset: (3,) UTM easting, northing and altitude of the local origin [m].
-        frame_rate: Rate of the camera [Hz].
-        frame_distance: Camera frames between two annotated ones.
-        recordings: Names of the recordings.
-    """
-
-    folder: Path
-    name: str
-    zone: int
-    is_north: bool
-    offset: FloatArray
-    frame_rate: float
-    frame_distance: int
-    recordings: tuple[str, ...]
+    folder: Path  # where `data_meta.json` lies
+    name: str  # free text of the data set
+    zone: int  # UTM zone
+    is_north: bool  # whether the zone is a northern one
+    offset: FloatArray  # (3,) UTM easting, northing and altitude of the local origin [m]
+    frame_rate: float  # rate of the camera [Hz]
+    frame_distance: int  # camera frames between two annotated ones
+    recordings: tuple[str, ...]  # names of the recordings
 
     @property
     def epsg(self) -> int:
@@ -105,42 +94,24 @@ class Annotations:
     """One recording. F frames, A rows (one per object and frame), N tracks.
 
     Rows are sorted by track, then frame. Poses are in the local frame.
-
-    Attributes:
-        name: Name of the recording.
-        start_us: UTC time of the first frame [us].
-        period: Nominal time between frames [s].
-        clock: (F,) time of the frames since the first one [s].
-        frame: (A,) frame of the row.
-        track: (A,) track of the row.
-        bottom: (A, 3) centre of the bottom face [m].
-        angles: (A, 3) yaw, pitch, roll [rad].
-        centers: (A, 3) centre of the box [m].
-        headings: (A,) yaw, held where it spins at standstill [rad].
-        velocities: (A, 2) in the local frame [m/s].
-        track_ids: (N,) ids, ascending.
-        categories: N normalised names.
-        kinds: (N,) AgentKind codes.
-        sizes: (N, 3) length, width, height [m].
-        warnings: Count by kind of what was mended.
     """
 
-    name: str
-    start_us: int
-    period: float
-    clock: FloatArray
-    frame: IntArray
-    track: IntArray
-    bottom: FloatArray
-    angles: FloatArray
-    centers: FloatArray
-    headings: FloatArray
-    velocities: FloatArray
-    track_ids: IntArray
-    categories: tuple[str, ...]
-    kinds: IntArray
-    sizes: FloatArray
-    warnings: dict[str, int]
+    name: str  # name of the recording
+    start_us: int  # UTC time of the first frame [us]
+    period: float  # nominal time between frames [s]
+    clock: FloatArray  # (F,) time of the frames since the first one [s]
+    frame: IntArray  # (A,) frame of the row
+    track: IntArray  # (A,) track of the row
+    bottom: FloatArray  # (A, 3) centre of the bottom face [m]
+    angles: FloatArray  # (A, 3) yaw, pitch, roll [rad]
+    centers: FloatArray  # (A, 3) centre of the box [m]
+    headings: FloatArray  # (A,) yaw, held where it spins at standstill [rad]
+    velocities: FloatArray  # (A, 2) in the local frame [m/s]
+    track_ids: IntArray  # (N,) ids, ascending
+    categories: tuple[str, ...]  # N normalised names
+    kinds: IntArray  # (N,) AgentKind codes
+    sizes: FloatArray  # (N, 3) length, width, height [m]
+    warnings: dict[str, int]  # count by kind of what was repaired
 
     @cached_property
     def time(self) -> FloatArray:
@@ -232,7 +203,7 @@ def find_map(site: Site, given: Path | None = None) -> Path:
 def read_recording(
     site: Site, name: str, category_map: dict[str, str] | None = None
 ) -> Annotations:
-    """One recording, checked (dsc3d-format.md §6).
+    """One recording, checked.
 
     Args:
         site: Its site.
@@ -268,7 +239,7 @@ def read_recording(
     names, kinds = _agent_kinds(names, category_map or {}, path)
     bottom, rotation = matrix(POSITION), matrix(ROTATION)
     angles, up = rotation_angles(rotation)
-    centers = bottom + 0.5 * sizes[track, 2:3] * up
+    centers = bottom + 0.5 * sizes[track, 2:3] * up  # nuPlan rule 461
     clock = (frame_ids - frame_ids[0]) / site.frame_rate
     time = clock[frame]
     stored = None

@@ -11,7 +11,7 @@ from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import EGO, cut_window, find_maps, load_map, offered, read_span
 from shiftsim.data.recording import Window
-from shiftsim.data.store.reading import StoreWriter
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
 
@@ -191,7 +191,7 @@ def _write_part(
 ) -> None:
     first, last = windows[0].first_row, max(window.last_row for window in windows)
     name = f"{log.name}@{log.time_us[first]}-{log.time_us[last - 1]}"
-    flaws: dict[str, int] = {}
+    flaws: Counter[str] = Counter()
     try:
         recording, ego = read_span(log, name, first, last, flaws)
     except ConversionError as error:
@@ -203,7 +203,7 @@ def _write_part(
         return
     writer.add_recording(recording)
     writer.add_ego(ego)
-    report.flaws.update({f"log {log.name}: {what}": count for what, count in flaws.items()})
+    report.flaws.update({f"log {log.name}: {what}": count for what, count in (+flaws).items()})
     for window in windows:
         unknown = sum(block not in road.blocks.index for block in window.route)
         report.flaws.update({f"log {log.name}: unknown route ids": unknown} if unknown else {})

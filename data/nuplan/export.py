@@ -1,4 +1,4 @@
-"""A scenario store -> nuPlan's own files, one log per scenario (nuplan-formats.md §6).
+"""A scenario store -> nuPlan's own files, one log per scenario.
 
 OUT/nuplan-v1.1/splits/<store>/<log>.db
 OUT/maps/nuplan-maps-v1.0.json, OUT/maps/<map>/<version>/map.gpkg
@@ -16,12 +16,12 @@ from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
 from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.recording import Window
-from shiftsim.data.store.files import write_json
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.tables import write_json
 from shiftsim.errors import ConversionError
 
 MAP_VERSION = "1.0.0"
-# Maps that nuPlan's own code opens whatever map is asked for, nuplan-formats.md §1.
+# nuPlan rule 426: maps that its own code opens whatever map is asked for
 ALWAYS_OPENED = (
     "sg-one-north",
     "us-ma-boston",

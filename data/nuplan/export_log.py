@@ -1,4 +1,4 @@
-"""Scenario -> one nuPlan log (.db) of its own (nuplan-formats.md §2, §6)."""
+"""Scenario -> one nuPlan log (.db) of its own."""
 
 import hashlib
 import pickle
@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 
 from shiftsim.arrays import IntArray
-from shiftsim.data.nuplan.geopackage_writer import Value, write_database
 from shiftsim.data.nuplan.log import LIDAR_CHANNEL
 from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.data.nuplan.sqlite import Value, write_database
 from shiftsim.errors import ConversionError
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, LightStatus
@@ -31,13 +31,7 @@ _HEIGHTS = {
     AgentKind.CZONE_SIGN: 1.2,
     AgentKind.GENERIC_OBJECT: 1.0,
 }  # m
-_STATUS = {
-    LightStatus.GREEN: "green",
-    LightStatus.YELLOW: "yellow",
-    LightStatus.RED: "red",
-    LightStatus.UNKNOWN: "unknown",
-}
-_SCENES = 5  # nuPlan ignores the first two and the last two, nuplan-formats.md §2
+_SCENES = 5  # nuPlan rule 411: the first two and the last two are ignored
 _PICKLE = 2  # protocol
 
 _TABLES = {
@@ -106,7 +100,7 @@ def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
 
 
 def _iterations(time: IntArray, anchor_us: int, mapping: Mapping) -> IntArray:
-    """Rows of the iterations as nuPlan cuts them, nuplan-formats.md §2."""
+    """Rows of the iterations as they are cut, nuPlan rule 417."""
     duration, offset, ratio = mapping
     start = int(anchor_us + offset * 1e6)
     first = int(np.searchsorted(time, start))
@@ -269,7 +263,12 @@ class _Log:
         codes = lights.status[row, connector].tolist()
         names = [self._integer(name) for name in lights.connector_ids]
         return [
-            (self.make(f"light {at} {which}"), self.samples[at], names[which], _STATUS[code])
+            (
+                self.make(f"light {at} {which}"),
+                self.samples[at],
+                names[which],
+                LightStatus(code).name.lower(),
+            )
             for at, which, code in zip(row.tolist(), connector.tolist(), codes, strict=True)
         ]
 

@@ -1,35 +1,36 @@
-"""VectorMap -> nuPlan's map.gpkg (nuplan-formats.md §3)."""
+"""VectorMap -> nuPlan's map.gpkg."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 import shapely
 
-from shiftsim.data.nuplan.geopackage_writer import FeatureLayer, Value, write_geopackage
+from shiftsim.data.nuplan.geopackage import FeatureLayer, write_geopackage
+from shiftsim.data.nuplan.sqlite import Value
 from shiftsim.errors import ConversionError
 from shiftsim.world.layers import Layer, Polylines
 from shiftsim.world.map import NONE, VectorMap
 
 # A map in a local frame goes to the origin of this zone: only metres matter, and they stay.
 LOCAL_EPSG = 32632
-_SOLID = 2  # boundary type
 _HINT = "nuPlan's format has integer ids, and lane - connector - lane, always"
 
 _POLYGON, _LINE = "POLYGON", "LINESTRING"
-# Layers with their columns; `name` is text, `name:i` an integer, `name:r` a real.
+# Layers with their columns; `name` is text, `name:i` an integer, `name:r` a real; `=` and what is
+# written everywhere; else it is NULL.
 _LAYERS: dict[str, tuple[str, str]] = {
     "baseline_paths": (
         _LINE,
-        "path_type_fid:i creator_id lane_fid:i lane_connector_fid:i dubins_node_fids",
+        "path_type_fid:i=0 creator_id lane_fid:i lane_connector_fid:i dubins_node_fids",
     ),
     "boundaries": (
         _LINE,
-        "boundary_segment_fids has_reflectors:i boundary_type_fid:i creator_id",
+        "boundary_segment_fids= has_reflectors:i=0 boundary_type_fid:i=2 creator_id",
     ),
-    "carpark_areas": (_POLYGON, "heading:r creator_id"),
-    "crosswalks": (_POLYGON, "intersection_fids lane_fids creator_id is_marked:i"),
+    "carpark_areas": (_POLYGON, "heading:r=0.0 creator_id"),
+    "crosswalks": (_POLYGON, "intersection_fids= lane_fids= creator_id is_marked:i=1"),
     "dubins_nodes": ("POINT", "radius:r heading:r creator_id"),
     "gen_lane_connectors_scaled_width_polygons": (
         _POLYGON,
@@ -37,13 +38,13 @@ _LAYERS: dict[str, tuple[str, str]] = {
         " left_boundary_fid:i right_boundary_fid:i",
     ),
     "generic_drivable_areas": (_POLYGON, "creator_id"),
-    "intersections": (_POLYGON, "creator_id intersection_type_fid:i is_mini:i"),
+    "intersections": (_POLYGON, "creator_id intersection_type_fid:i is_mini:i=0"),
     "lane_connectors": (
         _LINE,
         "exit_lane_group_fid:i exit_lane_fid:i entry_lane_group_fid:i lane_group_connector_fid:i"
-        " entry_lane_fid:i intersection_fid:i turn_type_fid:i bulb_fids"
-        " traffic_light_stop_line_fids overlap:i creator_id left_has_reflectors:i"
-        " right_has_reflectors:i speed_limit_mps:r",
+        " entry_lane_fid:i intersection_fid:i turn_type_fid:i bulb_fids="
+        " traffic_light_stop_line_fids overlap:i=0 creator_id left_has_reflectors:i=0"
+        " right_has_reflectors:i=0 speed_limit_mps:r",
     ),
     "lane_group_connectors": (
         _POLYGON,
@@ -56,16 +57,16 @@ _LAYERS: dict[str, tuple[str, str]] = {
     ),
     "lanes_polygons": (
         _POLYGON,
-        "lane_group_fid:i lane_fid:i lane_index:i creator_id name road_type_fid:i lane_type_fid:i"
+        "lane_group_fid:i lane_fid:i lane_index:i creator_id name road_type_fid:i=1 lane_type_fid:i"
         " width:i left_offset:r right_offset:r min_speed:r max_speed:r stops:i"
-        " left_boundary_fid:i right_boundary_fid:i speed_limit_mps:r left_has_reflectors:i"
-        " right_has_reflectors:i from_edge_fid:i to_edge_fid:i",
+        " left_boundary_fid:i right_boundary_fid:i speed_limit_mps:r left_has_reflectors:i=0"
+        " right_has_reflectors:i=0 from_edge_fid:i to_edge_fid:i",
     ),
-    "road_segments": (_POLYGON, "lane_group_fids"),
+    "road_segments": (_POLYGON, "lane_group_fids="),
     "stop_polygons": (
         _POLYGON,
-        "stop_polygon_type_fid:i lane_group_fid:i lane_fids lane_connector_fids"
-        " traffic_light_fids crosswalk_fids precedence_area_fids creator_id",
+        "stop_polygon_type_fid:i lane_group_fid:i lane_fids= lane_connector_fids"
+        " traffic_light_fids= crosswalk_fids= precedence_area_fids creator_id",
     ),
     "traffic_lights": (
         "POINT",
@@ -73,7 +74,7 @@ _LAYERS: dict[str, tuple[str, str]] = {
     ),
     "walkways": (_POLYGON, "creator_id"),
 }
-_TYPES = {"": "TEXT", "i": "INTEGER", "r": "REAL"}
+_TYPES = {"": ("TEXT", str), "i": ("INTEGER", int), "r": ("REAL", float)}
 
 
 def epsg_of(road: VectorMap) -> int:
@@ -92,14 +93,7 @@ def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
     Raises:
         ConversionError: The map has something that nuPlan's format has no place for.
     """
-    layers = {
-        name: FeatureLayer(
-            name,
-            kind,
-            {c.partition(":")[0]: _TYPES[c.partition(":")[2]] for c in columns.split()},
-        )
-        for name, (kind, columns) in _LAYERS.items()
-    }
+    layers = {name: _layer(name, kind, columns) for name, (kind, columns) in _LAYERS.items()}
     _Writer(road, layers).write()
     meta = {
         "map_version": version,
@@ -107,6 +101,17 @@ def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
         "projectedCoordSystem": f"epsg:{epsg_of(road)}",
     }
     write_geopackage(path, list(layers.values()), epsg=epsg_of(road), meta=meta)
+
+
+def _layer(name: str, kind: str, columns: str) -> FeatureLayer:
+    layer = FeatureLayer(name, kind, {}, {})
+    for text in columns.split():
+        head, has_default, default = text.partition("=")
+        column, _, letter = head.partition(":")
+        layer.columns[column], number = _TYPES[letter]
+        if has_default:
+            layer.defaults[column] = number(default)
+    return layer
 
 
 class _Writer:
@@ -146,7 +151,7 @@ class _Writer:
             self._block(block)
         for fid, shape, at in self._areas(road.intersections):
             kind = int(road.intersection_kinds[at])
-            self._add("intersections", fid, shape, intersection_type_fid=kind, is_mini=0)
+            self._add("intersections", fid, shape, intersection_type_fid=kind)
         governed: dict[int, list[str]] = {}
         for edge, name in enumerate(road.edges.ids):
             for stop in road.stop_lines.at(edge).tolist():
@@ -157,23 +162,21 @@ class _Writer:
                 fid,
                 shape,
                 stop_polygon_type_fid=int(road.stop_kinds[at]),
-                lane_fids="",
                 lane_connector_fids=",".join(governed.get(at, [])),
-                traffic_light_fids="",
-                crosswalk_fids="",
             )
-        for fid, shape, _ in self._areas(road.crosswalks):
-            self._add("crosswalks", fid, shape, intersection_fids="", lane_fids="", is_marked=1)
-        for fid, shape, _ in self._areas(road.walkways):
-            self._add("walkways", fid, shape)
-        for fid, shape, _ in self._areas(road.car_parks):
-            self._add("carpark_areas", fid, shape, heading=0.0)
+        for name, layer in (
+            ("crosswalks", road.crosswalks),
+            ("walkways", road.walkways),
+            ("carpark_areas", road.car_parks),
+        ):
+            for fid, shape, _ in self._areas(layer):
+                self._add(name, fid, shape)
         self._drivable()
 
     def _lane(self, edge: int) -> None:
         road, fid = self.road, self.edges[edge]
         for other in (*road.incoming.at(edge), *road.outgoing.at(edge)):
-            if not road.is_connector(int(other)):
+            if not road.is_connector(int(other)):  # nuPlan rule 427
                 raise ConversionError(
                     f"map {road.name!r}: lane {road.edges.ids[edge]!r} is linked to lane"
                     f" {road.edges.ids[int(other)]!r} without a connector",
@@ -189,13 +192,10 @@ class _Writer:
             lane_group_fid=self._block_of(edge),
             lane_fid=fid,
             lane_index=None if index == NONE else index,
-            road_type_fid=1,
             lane_type_fid=int(road.is_bike[edge]),
             left_boundary_fid=left,
             right_boundary_fid=right,
             speed_limit_mps=self._speed(edge),
-            left_has_reflectors=0,
-            right_has_reflectors=0,
         )
 
     def _connector(self, edge: int) -> None:
@@ -206,23 +206,18 @@ class _Writer:
         )
         baseline = self._baseline(edge, "lane_connector_fid")
         left, right = self._boundaries(edge)
-        crossing = int(road.intersection_of[edge])
         self._add(
             "lane_connectors",
             fid,
             _line(road.baselines, edge),
             exit_lane_group_fid=None if start is None else self._block_of(start),
-            exit_lane_fid=None if start is None else self.edges[start],
+            exit_lane_fid=_at(self.edges, start),
             entry_lane_group_fid=None if end is None else self._block_of(end),
             lane_group_connector_fid=self._block_of(edge),
-            entry_lane_fid=None if end is None else self.edges[end],
-            intersection_fid=None if crossing == NONE else self.intersections[crossing],
+            entry_lane_fid=_at(self.edges, end),
+            intersection_fid=_at(self.intersections, int(road.intersection_of[edge])),
             turn_type_fid=int(road.turn_type[edge]),
-            bulb_fids="",
             traffic_light_stop_line_fids=self._lit_stop_lines(edge),
-            overlap=0,
-            left_has_reflectors=0,
-            right_has_reflectors=0,
             speed_limit_mps=self._speed(edge),
         )
         self._add(
@@ -245,7 +240,7 @@ class _Writer:
         return links[0] if links else None
 
     def _lit_stop_lines(self, edge: int) -> str:
-        """Stop lines of lit connectors only: any text there means that lights govern it."""
+        """Stop lines of lit connectors only; nuPlan rule 423: any text there means lights."""
         road = self.road
         if not road.has_traffic_lights[edge]:
             return ""
@@ -257,13 +252,12 @@ class _Writer:
         return None if np.isnan(limit) else limit
 
     def _block_of(self, edge: int) -> int | None:
-        block = int(self.road.block_of[edge])
-        return None if block == NONE else self.blocks[block]
+        return _at(self.blocks, int(self.road.block_of[edge]))
 
     def _baseline(self, edge: int, owner: str) -> int:
         fid = next(self.fresh)
         line = _line(self.road.baselines, edge)
-        self._add("baseline_paths", fid, line, path_type_fid=0, **{owner: self.edges[edge]})
+        self._add("baseline_paths", fid, line, **{owner: self.edges[edge]})
         return fid
 
     def _boundaries(self, edge: int) -> list[int | None]:
@@ -282,14 +276,7 @@ class _Writer:
             fid = next(self.fresh)
         if fid not in self.lines:
             self.lines[fid] = line.wkb
-            self._add(
-                "boundaries",
-                fid,
-                line,
-                boundary_segment_fids="",
-                has_reflectors=0,
-                boundary_type_fid=_SOLID,
-            )
+            self._add("boundaries", fid, line)
         return fid
 
     def _block(self, block: int) -> None:
@@ -306,16 +293,14 @@ class _Writer:
                 hint=_HINT,
             )
         members = road.block_edges.at(block).tolist()
-        crossings = [
-            int(road.intersection_of[e]) for e in members if road.intersection_of[e] != NONE
-        ]
+        crossings = [int(c) for c in road.intersection_of[members] if c != NONE]
         self._add(
             "lane_group_connectors",
             fid,
             shape,
-            intersection_fid=self.intersections[crossings[0]] if crossings else None,
-            from_lane_group_fid=self.blocks[ends[0][0]] if ends[0] else None,
-            to_lane_group_fid=self.blocks[ends[1][0]] if ends[1] else None,
+            intersection_fid=_at(self.intersections, *crossings[:1]),
+            from_lane_group_fid=_at(self.blocks, *ends[0]),
+            to_lane_group_fid=_at(self.blocks, *ends[1]),
         )
 
     def _areas(
@@ -345,13 +330,18 @@ class _Writer:
             for at in range(len(other))
         }
         owners = [known.get((layer.ids[at], layer.shape(at).wkb)) for at in range(len(layer))]
-        # nuPlan lists road segments, intersections, generic areas and car parks, in this order
+        # nuPlan rule 421: road segments, intersections, generic areas and car parks, in this order
         first = next((at for at, owner in enumerate(owners) if owner is not None), len(layer))
         rest = [at for at, owner in enumerate(owners) if owner is None]
         for fid, shape, _ in self._areas(layer, [at for at in rest if at < first]):
-            self._add("road_segments", fid, shape, lane_group_fids="")
+            self._add("road_segments", fid, shape)
         for fid, shape, _ in self._areas(layer, [at for at in rest if at > first]):
             self._add("generic_drivable_areas", fid, shape)
+
+
+def _at(fids: Sequence[int], index: int | None = NONE) -> int | None:
+    """The id at an index, None for no index."""
+    return None if index is None or index == NONE else fids[index]
 
 
 def _line(lines: Polylines, index: int) -> shapely.LineString:

@@ -1,20 +1,16 @@
-"""Which scenarios to take: nuPlan's scenario-filter YAML, or a plain list of tokens.
-
-Only the flat YAML that these files use is read: one level of keys, scalars and lists of scalars.
-"""
+"""Which scenarios to take: nuPlan's scenario-filter YAML, or a plain list of tokens."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
 
 from shiftsim.errors import ConfigError
 
 _TOKEN = re.compile(r"[0-9a-f]{16}\Z")
-_KEY = re.compile(r"([A-Za-z_]\w*)\s*:(?:\s+(.*))?\Z")
-_WORDS: dict[str, "Scalar"] = {"null": None, "~": None, "": None, "true": True, "false": False}
-
-Scalar = str | int | float | bool | None
 
 # Keys that choose among scenarios in ways of their own: they must be off, unless tokens are given.
 _SAMPLING = ("num_scenarios_per_type", "limit_total_scenarios", "timestamp_threshold_s")
@@ -31,21 +27,13 @@ _USED = ("scenario_types", "scenario_tokens", "log_names", "map_names", "remove_
 
 @dataclass(frozen=True)
 class ScenarioFilter:
-    """A choice of scenarios; None means no restriction.
+    """A choice of scenarios; None means no restriction."""
 
-    Attributes:
-        tokens: Scenario tokens.
-        types: Scenario types.
-        logs: Log names.
-        maps: Map names.
-        remove_invalid_goals: Whether scenes without a goal are left out.
-    """
-
-    tokens: frozenset[str] | None = None
-    types: frozenset[str] | None = None
-    logs: frozenset[str] | None = None
-    maps: frozenset[str] | None = None
-    remove_invalid_goals: bool = False
+    tokens: frozenset[str] | None = None  # scenario tokens
+    types: frozenset[str] | None = None  # scenario types
+    logs: frozenset[str] | None = None  # log names
+    maps: frozenset[str] | None = None  # map names
+    remove_invalid_goals: bool = False  # whether scenes without a goal are left out
 
 
 def read_filter(path: Path) -> ScenarioFilter:
@@ -60,7 +48,7 @@ def read_filter(path: Path) -> ScenarioFilter:
         raise ConfigError(f"{path}: not readable: {error}", hint="check the path") from error
     if Path(path).suffix not in (".yaml", ".yml"):
         return ScenarioFilter(tokens=_token_list(path, text))
-    return _from_values(path, read_flat_yaml(path, text))
+    return _from_values(path, _read_yaml(path, text))
 
 
 def _token_list(path: Path, text: str) -> frozenset[str]:
@@ -68,7 +56,7 @@ def _token_list(path: Path, text: str) -> frozenset[str]:
     return _tokens(path, [line for line in lines if line])
 
 
-def _tokens(path: Path, values: list[Scalar]) -> frozenset[str]:
+def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
     for value in values:
         if not isinstance(value, str) or not _TOKEN.match(value):
             raise ConfigError(
@@ -79,7 +67,7 @@ def _tokens(path: Path, values: list[Scalar]) -> frozenset[str]:
     return frozenset(str(value) for value in values)
 
 
-def _from_values(path: Path, values: Mapping[str, Scalar | list[Scalar]]) -> ScenarioFilter:
+def _from_values(path: Path, values: Mapping[str, Any]) -> ScenarioFilter:
     tokens = values.get("scenario_tokens")
     if tokens is not None and not isinstance(tokens, list):
         raise ConfigError(f"{path}: scenario_tokens is not a list", hint="write it as a list")
@@ -103,9 +91,7 @@ def _from_values(path: Path, values: Mapping[str, Scalar | list[Scalar]]) -> Sce
     )
 
 
-def _names(
-    path: Path, values: Mapping[str, Scalar | list[Scalar]], key: str
-) -> frozenset[str] | None:
+def _names(path: Path, values: Mapping[str, Any], key: str) -> frozenset[str] | None:
     value = values.get(key)
     if value is None:
         return None
@@ -116,77 +102,38 @@ def _names(
     return frozenset(str(item) for item in value)
 
 
-def read_flat_yaml(path: Path, text: str) -> dict[str, Scalar | list[Scalar]]:
-    """Keys with scalars or lists of scalars.
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker
+    """Plain values only; sixteen digits without quotes are a token, no key occurs twice."""
 
-    Raises:
-        ConfigError: Anything else is in the file.
-    """
-    out: dict[str, Scalar | list[Scalar]] = {}
-    items: list[Scalar] | None = None  # of the key whose list may follow
-    key = ""
-    for number, raw in enumerate(text.splitlines(), 1):
-        line = _without_comment(raw).rstrip()
-        if not line or line == "---":
-            continue
-        where = f"{path}: line {number}"
-        if line.lstrip().startswith("- ") and items is not None:
-            items.append(_scalar(where, line.lstrip()[2:].strip()))
-            out[key] = items
-            continue
-        match = _KEY.match(line)
-        if match is None:
-            raise _unreadable(where, raw)
-        key, value = match[1], (match[2] or "").strip()
-        if key in out:
-            raise ConfigError(f"{where}: {key!r} occurs twice", hint="keep one of them")
-        out[key] = _value(where, value)
-        items = [] if value == "" else None
-    return out
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+        first: [("tag:yaml.org,2002:str", _TOKEN), *found]
+        for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """A mapping, refused where a key occurs twice."""
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"{key.value!r} occurs twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
-def _unreadable(where: str, line: str) -> ConfigError:
-    return ConfigError(
-        f"{where}: cannot read {line.strip()!r}",
-        hint="only keys with scalars or lists are read, as in nuPlan's scenario filters",
-    )
-
-
-def _without_comment(line: str) -> str:
-    quote = ""
-    for index, char in enumerate(line):
-        if quote:
-            quote = "" if char == quote else quote
-        elif char in "'\"":
-            quote = char
-        elif char == "#" and (index == 0 or line[index - 1].isspace()):
-            return line[:index]
-    return line
-
-
-def _value(where: str, text: str) -> Scalar | list[Scalar]:
-    if text.startswith("["):
-        if not text.endswith("]"):
-            raise _unreadable(where, text)
-        inner = text[1:-1].strip()
-        return [_scalar(where, part.strip()) for part in inner.split(",")] if inner else []
-    return _scalar(where, text)
-
-
-def _scalar(where: str, text: str) -> Scalar:
-    if text[:1] in ("'", '"'):
-        if len(text) < 2 or text[-1] != text[0] or text[0] in text[1:-1]:
-            raise _unreadable(where, text)
-        return text[1:-1]
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    if text[:1] in "[]{}&*!|>%@`," or (": " in text):
-        raise _unreadable(where, text)
-    if _TOKEN.match(text):
-        return text  # sixteen digits without quotes are still a token
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+def _read_yaml(path: Path, text: str) -> dict[str, Any]:
+    try:
+        values = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        line = 0 if error.problem_mark is None else error.problem_mark.line + 1
+        raise ConfigError(
+            f"{path}: line {line}: {error.problem}", hint="repair the YAML there"
+        ) from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML: {error}", hint="check the path") from error
+    if not isinstance(values, dict):
+        raise ConfigError(
+            f"{path}: line 1: no keys with values", hint="give one of nuPlan's scenario filters"
+        )
+    return values

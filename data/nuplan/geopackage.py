@@ -1,24 +1,41 @@
 """Layers of a GeoPackage (.gpkg), without GDAL.
 
 A GeoPackage is an SQLite file whose geometries are a short header followed by WKB. Layers are kept
-in longitude and latitude and projected to the metric system that the table `meta` names
-(nuplan-formats.md §3).
+in longitude and latitude and projected to the metric system that the table `meta` names. The same
+content is written with the same bytes.
 """
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pyproj
 import shapely
 
-from shiftsim.data.nuplan.sqlite import Database
+from shiftsim.data.nuplan.sqlite import Database, Value, write_database
 from shiftsim.errors import DataError
 
-MEND = "the map is damaged or not a nuPlan map; get it again from its source"
+REPAIR = "the map is damaged or not a nuPlan map; get it again from its source"
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)
+_WGS84 = 4326
+_APPLICATION_ID, _VERSION = 0x47504B47, 10200  # "GPKG", version 1.2
+_LAST_CHANGE = "2020-01-01T00:00:00.000Z"  # fixed, so that exports can be compared
+_LITTLE_ENDIAN_WITH_ENVELOPE = 0x03
+_FID = '"fid" INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL'
+_SYSTEM_TABLES = {
+    "gpkg_spatial_ref_sys": "srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY NOT NULL, "
+    "organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL, "
+    "definition TEXT NOT NULL, description TEXT",
+    "gpkg_contents": "table_name TEXT PRIMARY KEY NOT NULL, data_type TEXT NOT NULL, "
+    "identifier TEXT UNIQUE, description TEXT DEFAULT '', last_change DATETIME NOT NULL, "
+    "min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER",
+    "gpkg_geometry_columns": "table_name TEXT NOT NULL, column_name TEXT NOT NULL, "
+    "geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL, "
+    "m TINYINT NOT NULL, CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name)",
+}
 
 
 @dataclass(frozen=True)
@@ -57,7 +74,7 @@ class GeoPackage:
         if name != "epsg" or not code.isdigit():
             raise DataError(
                 f"{self.path}: table 'meta': projectedCoordSystem is {system!r}, not 'epsg:<code>'",
-                hint=MEND,
+                hint=REPAIR,
             )
         return int(code)
 
@@ -77,12 +94,12 @@ class GeoPackage:
             x, y = self._project.transform(xy[:, 0], xy[:, 1])
         except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
             raise DataError(
-                f"{self.path}: layer {name!r}: broken geometry: {error}", hint=MEND
+                f"{self.path}: layer {name!r}: broken geometry: {error}", hint=REPAIR
             ) from error
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             raise DataError(
                 f"{self.path}: layer {name!r}: a coordinate is not finite in epsg:{self.epsg}",
-                hint=MEND,
+                hint=REPAIR,
             )
         projected = shapely.set_coordinates(shapes, np.column_stack([x, y]))
         ids = [_id(v, name, "fid") for v in raw["fid"]]
@@ -91,13 +108,15 @@ class GeoPackage:
     def _wkb(self, blob: object, layer: str, fid: object) -> bytes:
         where = f"{self.path}: layer {layer!r}: geometry of fid {fid!r}"
         if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
-            raise DataError(f"{where} is not a GeoPackage geometry", hint=MEND)
+            raise DataError(f"{where} is not a GeoPackage geometry", hint=REPAIR)
         envelope = (blob[3] >> 1) & 7
         if envelope >= len(_ENVELOPE_BYTES) or blob[3] & 0x30:
-            raise DataError(f"{where} is empty or of an unknown kind", hint=MEND)
+            raise DataError(f"{where} is empty or of an unknown kind", hint=REPAIR)
         (system,) = struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])
-        if system != 4326:
-            raise DataError(f"{where} has the coordinate system {system}, not 4326", hint=MEND)
+        if system != _WGS84:
+            raise DataError(
+                f"{where} has the coordinate system {system}, not {_WGS84}", hint=REPAIR
+            )
         return blob[8 + _ENVELOPE_BYTES[envelope] :]
 
 
@@ -107,11 +126,11 @@ def to_metres(epsg: int) -> pyproj.Transformer:
     try:
         return pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
     except pyproj.exceptions.CRSError as error:
-        raise DataError(f"epsg:{epsg} is not a coordinate system: {error}", hint=MEND) from error
+        raise DataError(f"epsg:{epsg} is not a coordinate system: {error}", hint=REPAIR) from error
 
 
 def _id(value: object, layer: str, column: str) -> str:
-    # nuPlan: reference columns are cast to int as a whole (nuplan-formats.md §3 rule 5).
+    # nuPlan rule 425: columns of references are numbers as a whole
     try:
         number = float(value)  # type: ignore[arg-type]  # anything SQLite can hold
         if number == int(number):
@@ -119,5 +138,87 @@ def _id(value: object, layer: str, column: str) -> str:
     except (TypeError, ValueError, OverflowError):
         pass
     raise DataError(
-        f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", hint=MEND
+        f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", hint=REPAIR
     )
+
+
+@dataclass
+class FeatureLayer:
+    """One layer to be written."""
+
+    name: str  # table name
+    geometry: str  # `POLYGON`, `LINESTRING` or `POINT`
+    columns: dict[str, str]  # SQL type by column name, besides `fid` and `geom`
+    defaults: dict[str, Value]  # values by column where a row has none; else NULL
+    # fid, geometry in metres and values by column
+    rows: list[tuple[int, shapely.Geometry, Mapping[str, Value]]] = field(default_factory=list)
+
+
+def write_geopackage(
+    path: Path, layers: Sequence[FeatureLayer], *, epsg: int, meta: Mapping[str, str]
+) -> None:
+    """Write layers in longitude and latitude.
+
+    Args:
+        path: The file; it is replaced.
+        layers: The layers, geometries in metres.
+        epsg: Code of the metric system of the geometries.
+        meta: Content of the table `meta`.
+    """
+    tables = dict(_SYSTEM_TABLES)
+    wgs84 = pyproj.CRS(_WGS84).to_wkt("WKT1_GDAL")
+    rows: dict[str, list[Sequence[Value]]] = {
+        "gpkg_spatial_ref_sys": [
+            ("Undefined cartesian SRS", -1, "NONE", -1, "undefined", None),
+            ("Undefined geographic SRS", 0, "NONE", 0, "undefined", None),
+            ("WGS 84 geodetic", _WGS84, "EPSG", _WGS84, wgs84, None),
+        ],
+        "gpkg_contents": [],
+        "gpkg_geometry_columns": [],
+    }
+    for layer in layers:
+        shapes, kind = _projected(layer, epsg)
+        bounds = shapely.total_bounds(shapes).tolist() if len(shapes) else [None] * 4
+        contents = (layer.name, "features", layer.name, "", _LAST_CHANGE, *bounds, _WGS84)
+        rows["gpkg_contents"].append(contents)
+        rows["gpkg_geometry_columns"].append((layer.name, "geom", kind, _WGS84, 0, 0))
+        columns = "".join(f', "{name}" {sql}' for name, sql in layer.columns.items())
+        tables[layer.name] = f'{_FID}, "geom" {kind}{columns}'
+        blobs = _blobs(shapes)
+        rows[layer.name] = [
+            (fid, blob, *(values.get(name, layer.defaults.get(name)) for name in layer.columns))
+            for (fid, _, values), blob in zip(layer.rows, blobs, strict=True)
+        ]
+    no_bounds = (None,) * 5
+    rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *no_bounds))
+    tables["meta"] = f'{_FID}, "key" TEXT, "value" TEXT'
+    rows["meta"] = [(i, *item) for i, item in enumerate(meta.items(), 1)]
+    header = (f"PRAGMA application_id = {_APPLICATION_ID}", f"PRAGMA user_version = {_VERSION}")
+    write_database(path, tables, rows, header)
+
+
+def _projected(layer: FeatureLayer, epsg: int) -> tuple[np.ndarray, str]:
+    """Geometries in longitude and latitude; all of them multiple when one is."""
+    shapes = np.empty(len(layer.rows), object)
+    shapes[:] = [shape for _, shape, _ in layer.rows]
+    kind = layer.geometry
+    if any(shape.geom_type.startswith("Multi") for shape in shapes):
+        kind = f"MULTI{kind}"
+        shapes[:] = [shapely.multipolygons(shapely.get_parts(shape)) for shape in shapes]
+    xy = shapely.get_coordinates(shapes)
+    lon, lat = to_metres(epsg).transform(xy[:, 0], xy[:, 1], direction="INVERSE")
+    return shapely.set_coordinates(shapes, np.column_stack([lon, lat])), kind
+
+
+def _blobs(shapes: np.ndarray) -> list[bytes]:
+    bodies = shapely.to_wkb(shapes, byte_order=1)
+    return [
+        b"GP"
+        + struct.pack(
+            "<BBi4d", 0, _LITTLE_ENDIAN_WITH_ENVELOPE, _WGS84, low_x, high_x, low_y, high_y
+        )
+        + body
+        for (low_x, low_y, high_x, high_y), body in zip(
+            shapely.bounds(shapes).tolist(), bodies, strict=True
+        )
+    ]

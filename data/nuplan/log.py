@@ -1,30 +1,24 @@
 """One nuPlan log (.db): its clock, scenes and tags, and the rows of a span of time.
 
-Facts about the tables are in nuplan-formats.md §2. Columns with pickled content are never read.
+Columns with pickled content are never read.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.nuplan.sqlite import Database, open_database
-from shiftsim.data.track_order import order_tracks
 from shiftsim.errors import ConversionError, DataError
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    AgentKind,
-    LightStatus,
-    Tracks,
-    TrafficLights,
-)
+from shiftsim.world.state import NUM_STATE, LightStatus, TrafficLights
 
 LIDAR_CHANNEL = "MergedPointCloud"
-_MEND = "the log is damaged or not a nuPlan log; get it again from its source"
+_REPAIR = "the log is damaged or not a nuPlan log; get it again from its source"
 _TABLES = {
     "log": ("map_version",),
     "lidar": ("token", "channel"),
@@ -48,59 +42,24 @@ _TABLES = {
     "scenario_tag": ("lidar_pc_token", "type"),
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
-_KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
-_LIGHTS = {
-    "green": LightStatus.GREEN,
-    "yellow": LightStatus.YELLOW,
-    "red": LightStatus.RED,
-}
-_UNIT_TOLERANCE = 1e-14  # nuPlan: quaternions closer to length 1 are not normalised
-_IGNORED_SCENES = 2  # nuPlan: at either end of a log, nuplan-formats.md §2
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """Objects of a span of rows, box by box, each frame in the order nuPlan lists it. B boxes.
-
-    Attributes:
-        row: (B,) row of the log.
-        token: B track tokens.
-        kind: (B,) AgentKind codes.
-        values: (B, 8) centre x, y [m], heading [rad], velocity x, y in the map frame [m/s],
-            length, width, height [m].
-    """
-
-    row: IntArray
-    token: list[str]
-    kind: IntArray
-    values: FloatArray
+_LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
+_UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
+_IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
 
 
 @dataclass
 class Log:
-    """An open log. R rows, ordered by time.
+    """An open log. R rows, ordered by time."""
 
-    Attributes:
-        database: The file.
-        name: Log name, the file name without its ending.
-        map_name: Map it was recorded on.
-        tokens: R tokens of the lidar rows, 16 hexadecimal digits.
-        time_us: (R,) time stamps [us].
-        types: R scenario types, `unknown` without a tag.
-        scenes: R tokens of the scenes.
-        is_offered: (R,) whether nuPlan offers the row as a scenario.
-        row_of: Row by token.
-    """
-
-    database: Database
-    name: str
-    map_name: str
-    tokens: list[str]
-    time_us: IntArray
-    types: list[str]
-    scenes: list[bytes]
-    is_offered: BoolArray
-    row_of: dict[str, int] = field(init=False)
+    database: Database  # the file
+    name: str  # log name, the file name without its ending
+    map_name: str  # map it was recorded on
+    tokens: list[str]  # R tokens of the lidar rows, 16 hexadecimal digits
+    time_us: IntArray  # (R,) time stamps [us]
+    types: list[str]  # R scenario types, `unknown` without a tag
+    scenes: list[bytes]  # R tokens of the scenes
+    is_offered: BoolArray  # (R,) whether nuPlan offers the row as a scenario
+    row_of: dict[str, int] = field(init=False)  # row by token
 
     def __post_init__(self) -> None:
         self.row_of = {token: row for row, token in enumerate(self.tokens)}
@@ -128,7 +87,7 @@ def _read_clock(database: Database) -> Log:
     path = database.path
     maps = database.query("SELECT map_version FROM log", "table 'log'")
     if not maps or not isinstance(maps[0][0], str):
-        raise DataError(f"{path}: table 'log' names no map in map_version", hint=_MEND)
+        raise DataError(f"{path}: table 'log' names no map in map_version", hint=_REPAIR)
     lidars = database.query("SELECT token FROM lidar WHERE channel = ?", "lidar", [LIDAR_CHANNEL])
     if not lidars:
         raise DataError(
@@ -142,10 +101,10 @@ def _read_clock(database: Database) -> Log:
         [LIDAR_CHANNEL],
     )
     if not rows:
-        raise DataError(f"{path}: table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}", hint=_MEND)
-    tokens = [_hex(row[0], path, "lidar_pc") for row in rows]
+        raise DataError(f"{path}: table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}", hint=_REPAIR)
+    tokens = [token_text(row[0], path, "lidar_pc") for row in rows]
     time_us = _check_clock(path, tokens, rows)
-    tags = dict(
+    tags = dict(  # nuPlan rule 418: the largest of several tags
         database.query(
             "SELECT lidar_pc_token, MAX(type) FROM scenario_tag GROUP BY lidar_pc_token",
             "table 'scenario_tag'",
@@ -156,7 +115,7 @@ def _read_clock(database: Database) -> Log:
     return Log(
         database=database,
         name=path.stem,
-        map_name=maps[0][0].removesuffix(".gpkg"),
+        map_name=maps[0][0].removesuffix(".gpkg"),  # nuPlan rule 419
         tokens=tokens,
         time_us=time_us,
         types=[str(tags.get(row[0]) or "unknown") for row in rows],
@@ -165,41 +124,43 @@ def _read_clock(database: Database) -> Log:
     )
 
 
-def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple]) -> IntArray:  # type: ignore[type-arg]  # database rows
+def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]]) -> IntArray:
     try:
         time_us = np.array([row[1] for row in rows], np.int64)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{path}: lidar_pc.timestamp is not an integer: {error}", hint=_MEND
+            f"{path}: lidar_pc.timestamp is not an integer: {error}", hint=_REPAIR
         ) from error
     twice = np.flatnonzero(np.diff(time_us) <= 0)
     if len(twice):
         token = tokens[int(twice[0]) + 1]
         raise DataError(
-            f"{path}: lidar_pc {token!r}: time stamp {time_us[twice[0]]} occurs twice", hint=_MEND
+            f"{path}: lidar_pc {token!r}: time stamp {time_us[twice[0]]} occurs twice", hint=_REPAIR
         )
     row_of = {row[0]: index for index, row in enumerate(rows)}
     for index, row in enumerate(rows):
         if row_of.get(row[3], index + 1) <= index:
             raise DataError(
                 f"{path}: lidar_pc {tokens[index]!r}: its next row has an earlier time stamp",
-                hint=_MEND,
+                hint=_REPAIR,
             )
     return time_us
 
 
-def _hex(value: object, path: Path, table: str) -> str:
+def token_text(value: object, path: Path, table: str) -> str:
+    """A token of the file as 16 hexadecimal digits."""
     if not isinstance(value, bytes):
-        raise DataError(f"{path}: table {table!r}: token {value!r} is not a blob", hint=_MEND)
+        raise DataError(f"{path}: table {table!r}: token {value!r} is not a blob", hint=_REPAIR)
     return value.hex()
 
 
-def _numbers(path: Path, what: str, rows: Sequence[Sequence[object]]) -> FloatArray:
+def as_numbers(path: Path, what: str, rows: Sequence[Sequence[object]]) -> FloatArray:
+    """Rows of a query as floats."""
     try:
         return np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{path}: {what} holds something that is no number: {error}", hint=_MEND
+            f"{path}: {what} holds something that is no number: {error}", hint=_REPAIR
         ) from error
 
 
@@ -223,17 +184,17 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
     )
     if not found:
         raise ConversionError(
-            f"{log.path}: lidar_pc {log.tokens[row]!r} belongs to an unknown scene", hint=_MEND
+            f"{log.path}: lidar_pc {log.tokens[row]!r} belongs to an unknown scene", hint=_REPAIR
         )
     text, *goal = found[0]
-    # nuPlan: the reader splits at blanks, whatever the schema's comment says.
+    # nuPlan rule 412: split at blanks
     route = tuple(part for part in str(text or "").split(" ") if part)
     if goal[0] is None:
         return route, None
-    pose = _numbers(log.path, "ego_pose of a goal", [goal])
+    pose = as_numbers(log.path, "ego_pose of a goal", [goal])
     if not np.isfinite(pose).all():
         raise ConversionError(
-            f"{log.path}: the goal of {log.tokens[row]!r} is not finite", hint=_MEND
+            f"{log.path}: the goal of {log.tokens[row]!r} is not finite", hint=_REPAIR
         )
     return route, np.array([pose[0, 0], pose[0, 1], _yaw(pose[:, 2:])[0]])
 
@@ -243,31 +204,29 @@ def _yaw(quaternions: FloatArray) -> FloatArray:
     square = (quaternions * quaternions).sum(axis=1, keepdims=True)
     unit = np.abs(1.0 - square) < _UNIT_TOLERANCE
     w, x, y, z = np.where(unit, quaternions, quaternions / np.sqrt(square)).T
-    # nuPlan: the yaw of its quaternion library has w z - x y in the numerator, not w z + x y; the
-    # two agree only without roll and pitch.
+    # nuPlan rule 413: w z - x y, not w z + x y
     return np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def read_ego(log: Log, first: int, last: int) -> FloatArray:
     """Ego states (R, 11) of the rows first … last - 1.
 
-    nuPlan: steering, yaw rate and their rates are 0, nuplan-simulation.md §3.
+    nuPlan rule 415: steering, yaw rate and their rates are 0.
     """
-    rows = log.database.query(
-        "SELECT pc.timestamp, e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.acceleration_x,"
-        " e.acceleration_y FROM lidar_pc AS pc JOIN lidar AS l ON pc.lidar_token = l.token"
-        " JOIN ego_pose AS e ON pc.ego_pose_token = e.token"
-        " WHERE l.channel = ? AND pc.timestamp BETWEEN ? AND ? ORDER BY pc.timestamp",
-        "table 'ego_pose'",
-        [LIDAR_CHANNEL, *_span(log, first, last)],
+    rows = read_rows(
+        log,
+        first,
+        last,
+        columns="e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.acceleration_x, e.acceleration_y",
+        joins="JOIN ego_pose AS e ON pc.ego_pose_token = e.token",
     )
     if [row[0] for row in rows] != log.time_us[first:last].tolist():
         raise ConversionError(
             f"{log.path}: between {log.tokens[first]!r} and {log.tokens[last - 1]!r} a row of"
             " 'lidar_pc' names an unknown ego_pose",
-            hint=_MEND,
+            hint=_REPAIR,
         )
-    values = _numbers(log.path, "ego_pose", [row[1:] for row in rows])
+    values = as_numbers(log.path, "ego_pose", [row[1:] for row in rows])
     with np.errstate(invalid="ignore"):
         heading = _yaw(values[:, 2:6])
     states = np.zeros((len(values), NUM_STATE))
@@ -281,105 +240,47 @@ def read_ego(log: Log, first: int, last: int) -> FloatArray:
     return states
 
 
-def _span(log: Log, first: int, last: int) -> list[int]:
-    return [int(log.time_us[first]), int(log.time_us[last - 1])]
+def read_rows(
+    log: Log, first: int, last: int, *, columns: str, joins: str, order: str = ""
+) -> list[tuple[Any, ...]]:
+    """Time stamp and columns of what belongs to the rows first … last - 1, ordered by time.
 
-
-def read_boxes(log: Log, first: int, last: int) -> Boxes:
-    """Objects of the rows first … last - 1.
-
-    Raises:
-        ConversionError: A category is unknown, a pose is not finite or a box has no extent.
+    Args:
+        log: The log.
+        first: First row.
+        last: One past the last row.
+        columns: Columns as SQL has them.
+        joins: Tables besides `lidar_pc` (`pc`) and `lidar` (`l`); the first one is named in errors.
+        order: Column that orders what has one time stamp.
     """
-    rows = log.database.query(
-        "SELECT pc.timestamp, t.token, c.name, b.x, b.y, b.yaw, b.vx, b.vy, b.length, b.width,"
-        " b.height FROM lidar_pc AS pc JOIN lidar AS l ON pc.lidar_token = l.token"
-        " JOIN lidar_box AS b ON b.lidar_pc_token = pc.token"
-        " JOIN track AS t ON b.track_token = t.token"
-        " JOIN category AS c ON t.category_token = c.token"
-        " WHERE l.channel = ? AND pc.timestamp BETWEEN ? AND ? ORDER BY pc.timestamp, b.rowid",
-        "table 'lidar_box'",
-        [LIDAR_CHANNEL, *_span(log, first, last)],
+    sql = (
+        f"SELECT pc.timestamp, {columns} FROM lidar_pc AS pc"
+        f" JOIN lidar AS l ON pc.lidar_token = l.token {joins}"
+        " WHERE l.channel = ? AND pc.timestamp BETWEEN ? AND ?"
+        f" ORDER BY pc.timestamp{order and ', '}{order}"
     )
-    unknown = sorted({str(row[2]) for row in rows} - set(_KINDS))
-    if unknown:
-        raise ConversionError(
-            f"{log.path}: table 'category': unknown category {unknown[0]!r}",
-            hint=f"known are {', '.join(_KINDS)}",
-        )
-    row = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64))
-    kind = np.array([_KINDS[r[2]] for r in rows], np.int64)
-    values = _numbers(log.path, "lidar_box", [r[3:] for r in rows]).reshape(-1, 8)
-    order = np.lexsort((np.arange(len(rows)), kind, row))
-    token = [_hex(rows[i][1], log.path, "track") for i in order.tolist()]
-    boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
-    _check_boxes(log, boxes)
-    return boxes
+    ends = int(log.time_us[first]), int(log.time_us[last - 1])
+    return log.database.query(sql, f"table {joins.split()[1]!r}", [LIDAR_CHANNEL, *ends])
 
 
-def _check_boxes(log: Log, boxes: Boxes) -> None:
-    finite = np.isfinite(boxes.values[:, :3]).all(axis=1)
-    extended = (boxes.values[:, 5:7] > 0.0).all(axis=1) & np.isfinite(boxes.values[:, 5:7]).all(
-        axis=1
-    )
-    for good, what in ((finite, "a pose that is not finite"), (extended, "no length or width")):
-        if not good.all():
-            box = int(np.flatnonzero(~good)[0])
-            raise ConversionError(
-                f"{log.path}: lidar_box of track {boxes.token[box]!r} at lidar_pc"
-                f" {log.tokens[int(boxes.row[box])]!r} has {what}",
-                hint="leave this scenario out or repair the log",
-            )
-
-
-def make_tracks(boxes: Boxes, first: int, last: int, flaws: dict[str, int]) -> Tracks:
-    """Dense tracks over the rows first … last - 1 from their boxes."""
-    index: dict[str, int] = {}
-    track = np.array([index.setdefault(token, len(index)) for token in boxes.token], np.int64)
-    frame = boxes.row - first
-    kinds = np.zeros(len(index), np.int64)
-    kinds[track] = boxes.kind
-    order = order_tracks(frame, track, kinds)
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    shape = (last - first, len(index))
-    valid = np.zeros(shape, np.bool_)
-    poses, velocities, sizes = (np.full((*shape, n), np.nan) for n in (3, 2, 2))
-    where = (frame, place[track])
-    valid[where] = True
-    if len(frame) > valid.sum():
-        flaw = "track listed twice in a frame: the last one is kept"
-        flaws[flaw] = flaws.get(flaw, 0) + int(len(frame) - valid.sum())
-    poses[where] = boxes.values[:, :3]
-    poses[..., 2] = np.where(valid, poses[..., 2], np.nan)
-    velocities[where] = boxes.values[:, 3:5]
-    velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan
-    sizes[where] = boxes.values[:, 5:7]
-    tokens = list(index)
-    return Tracks(
-        valid, poses, velocities, sizes, kinds[order], tuple(tokens[i] for i in order.tolist())
-    )
-
-
-def read_lights(log: Log, first: int, last: int, flaws: dict[str, int]) -> TrafficLights:
+def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> TrafficLights:
     """Traffic lights of the rows first … last - 1."""
-    rows = log.database.query(
-        "SELECT pc.timestamp, s.lane_connector_id, s.status FROM lidar_pc AS pc"
-        " JOIN lidar AS l ON pc.lidar_token = l.token"
-        " JOIN traffic_light_status AS s ON s.lidar_pc_token = pc.token"
-        " WHERE l.channel = ? AND pc.timestamp BETWEEN ? AND ? ORDER BY pc.timestamp, s.rowid",
-        "table 'traffic_light_status'",
-        [LIDAR_CHANNEL, *_span(log, first, last)],
+    rows = read_rows(
+        log,
+        first,
+        last,
+        columns="s.lane_connector_id, s.status",
+        joins="JOIN traffic_light_status AS s ON s.lidar_pc_token = pc.token",
+        order="s.rowid",
     )
     index: dict[str, int] = {}
     connector = [index.setdefault(str(row[1]), len(index)) for row in rows]
     frame = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64)) - first
     status = np.full((last - first, len(index)), int(LightStatus.ABSENT), np.int8)
     status[frame, np.array(connector, np.int64)] = [
-        int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows
+        int(_LIGHTS.get(row[2], LightStatus.UNKNOWN))  # nuPlan rule 428
+        for row in rows
     ]
-    listed = int((status != LightStatus.ABSENT).sum())
-    if listed < len(rows):
-        flaw = "traffic light listed twice in a frame: the last one is kept"
-        flaws[flaw] = flaws.get(flaw, 0) + len(rows) - listed
+    twice = len(rows) - int((status != LightStatus.ABSENT).sum())
+    flaws["traffic light listed twice in a frame: the last one is kept"] += twice
     return TrafficLights(tuple(index), status)

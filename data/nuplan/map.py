@@ -1,4 +1,4 @@
-"""nuPlan's map.gpkg -> VectorMap (nuplan-formats.md §3)."""
+"""nuPlan's map.gpkg -> VectorMap."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.nuplan.geopackage import MEND, GeoPackage, LayerTable
+from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
 from shiftsim.data.nuplan.sqlite import open_database
 from shiftsim.errors import DataError, MapError
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
@@ -17,7 +17,7 @@ _MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
 _BIKE_LANE = 1
 _TURN_UNKNOWN = 4
 
-# Drivable area: the rows of these layers one after the other, nuplan-formats.md §3 rule 4.
+# nuPlan rule 421: the drivable area is the rows of these layers, one after the other
 _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", "carpark_areas")
 
 
@@ -38,7 +38,7 @@ def read_map(path: Path, name: str) -> VectorMap:
         try:
             return _assemble(GeoPackage(database), name)
         except MapError as error:
-            raise MapError(f"{path}: {error}", hint=MEND) from error
+            raise MapError(f"{path}: {error}", hint=REPAIR) from error
         except DataError as error:
             if str(error).startswith(str(path)):
                 raise
@@ -97,7 +97,7 @@ def _lines(table: LayerTable) -> dict[str, FloatArray]:
     for fid, shape in zip(table.ids, table.shapes, strict=True):
         if shape.geom_type != "LineString":
             raise DataError(
-                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=MEND
+                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=REPAIR
             )
     return {
         fid: shapely.get_coordinates(shape)
@@ -185,7 +185,7 @@ def _connectors(
     owners = areas.text_ids("lane_connector_fid")
     bare = set(table.ids) - set(owners)
     if bare:
-        raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=MEND)
+        raise DataError(f"lane connector {min(bare)!r} has no polygon", hint=REPAIR)
     left, right = areas.text_ids("left_boundary_fid"), areas.text_ids("right_boundary_fid")
     start, end = table.text_ids("exit_lane_fid"), table.text_ids("entry_lane_fid")
     groups = table.text_ids("lane_group_connector_fid")
@@ -193,7 +193,7 @@ def _connectors(
     turns = table.integers("turn_type_fid", _TURN_UNKNOWN)
     stop_shapes = dict(zip(stops.ids, stops.shapes, strict=True))
     out = []
-    # In the order of the polygons: nuPlan's point queries run over that layer.
+    # nuPlan rule 424: in the order of the polygons
     for area, fid in enumerate(owners):
         if fid is None or fid not in row_of:
             _count(flaws, "polygon of an unknown lane connector", 1)
@@ -215,7 +215,7 @@ def _connectors(
                 left_id=left[area] or "",
                 right_id=right[area] or "",
                 speed_limit=_speed(table, row),
-                has_traffic_lights=listed != "",
+                has_traffic_lights=listed != "",  # nuPlan rule 423
                 stop_lines=_stop_lines(listed, baseline, stop_shapes),
                 intersection_id=crossings[row],
                 turn_type=turns[row],
@@ -259,8 +259,8 @@ def _blocks(gpkg: GeoPackage, flaws: dict[str, int]) -> list[BlockSpec]:
 def _stop_lines(
     listed: str, baseline: FloatArray, polygons: dict[str, shapely.Polygon]
 ) -> list[str]:
-    # nuPlan: the listed polygons that meet the baseline, else the one nearest to its first point
-    # (nuplan-simulation.md §10.6). Unknown ids stay, for `build_map` to count them.
+    # nuPlan rule 422: those that meet the baseline, else the nearest one. Unknown ids stay, for
+    # `build_map` to count them.
     ids = [part.strip() for part in listed.split(",") if part.strip()]
     unknown = [i for i in ids if i not in polygons]
     known = [i for i in ids if i in polygons]
@@ -286,7 +286,7 @@ def _known(fid: str | None) -> list[str]:
 
 def _find(lines: dict[str, FloatArray], fid: str, owner: str, what: str) -> FloatArray:
     if fid not in lines:
-        raise DataError(f"{owner} {fid!r} has no {what}", hint=MEND)
+        raise DataError(f"{owner} {fid!r} has no {what}", hint=REPAIR)
     return lines[fid]
 
 
@@ -305,7 +305,7 @@ def _speed(table: LayerTable, row: int) -> float | None:
     if not isinstance(value, int | float):
         raise DataError(
             f"layer {table.name!r}: speed_limit_mps of fid {table.ids[row]} is {value!r}",
-            hint=MEND,
+            hint=REPAIR,
         )
     return float(value)
 
@@ -323,7 +323,7 @@ def _polygons(table: LayerTable, row: int) -> list[shapely.Polygon]:
         kind = table.shapes[row].geom_type
         raise DataError(
             f"layer {table.name!r}: geometry of fid {table.ids[row]} is a {kind} without area",
-            hint=MEND,
+            hint=REPAIR,
         )
     return parts
 

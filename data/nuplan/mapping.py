@@ -4,7 +4,7 @@ from shiftsim.errors import ConfigError
 
 Mapping = tuple[float, float, float]
 
-_NAMED: Mapping = (15.0, -3.0, 0.5)  # s, s, ratio; nuPlan's table, nuplan-formats.md §2
+_NAMED: Mapping = (15.0, -3.0, 0.5)  # s, s, ratio; nuPlan rule 416
 _OTHER: Mapping = (20.0, 0.0, 0.5)
 
 # The scenario types that nuPlan's table names.

@@ -1,25 +1,18 @@
-"""nuPlan logs and maps -> scenarios (nuplan-formats.md §5).
+"""nuPlan logs and maps -> scenarios.
 
-`read_scenario` gives one scenario straight from a log; `nuplan_convert` writes many to a store.
+`read_scenario` gives one scenario straight from a log; `convert` writes many to a store.
 """
 
 import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from shiftsim.arrays import IntArray
-from shiftsim.data.nuplan.log import (
-    Log,
-    has_goals,
-    make_tracks,
-    open_log,
-    read_boxes,
-    read_ego,
-    read_lights,
-    read_route,
-)
+from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
+from shiftsim.data.nuplan.log import Log, has_goals, open_log, read_ego, read_lights, read_route
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.mapping import Mapping, mapping_of
 from shiftsim.data.recording import EgoTrace, Recording, Window
@@ -29,8 +22,8 @@ from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
 ROW_SECONDS = 0.05  # nominal distance of log rows
-_PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window, nuplan-formats.md §5
-# Rows are counted, not timed, where nuPlan looks back and ahead: keep at least as many.
+_PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window
+# nuPlan rule 417: rows are counted where it looks back and ahead, so keep at least as many
 _PAST_ROWS, _FUTURE_ROWS = 60, 161
 _MIN_ITERATIONS = 3
 EGO = "ego"
@@ -38,21 +31,13 @@ EGO = "ego"
 
 @dataclass(frozen=True)
 class ScenarioEntry:
-    """One scenario that a log offers.
+    """One scenario that a log offers."""
 
-    Attributes:
-        token: Token of its anchor row.
-        scenario_type: Its tag; `unknown` without one.
-        log_name: The log.
-        city: Map name.
-        time_us: Time stamp of the anchor [us].
-    """
-
-    token: str
-    scenario_type: str
-    log_name: str
-    city: str
-    time_us: int
+    token: str  # token of its anchor row
+    scenario_type: str  # its tag; `unknown` without one
+    log_name: str  # the log
+    city: str  # map name
+    time_us: int  # time stamp of the anchor [us]
 
 
 def list_scenarios(
@@ -148,7 +133,7 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
 
 
 def read_span(
-    log: Log, name: str, first: int, last: int, flaws: dict[str, int]
+    log: Log, name: str, first: int, last: int, flaws: Counter[str]
 ) -> tuple[Recording, EgoTrace]:
     """The rows first … last - 1 of a log as a recording of its own, with the ego."""
     recording = Recording(
@@ -166,7 +151,7 @@ def read_scenario(
     token: str,
     road: VectorMap,
     mapping: Mapping | None = None,
-    flaws: dict[str, int] | None = None,
+    flaws: Counter[str] | None = None,
 ) -> Scenario:
     """One scenario of a log.
 
@@ -183,7 +168,7 @@ def read_scenario(
     with open_log(path) as log:
         window = cut_window(log, token, mapping)
         recording, ego = read_span(
-            log, log.name, window.first_row, window.last_row, {} if flaws is None else flaws
+            log, log.name, window.first_row, window.last_row, Counter() if flaws is None else flaws
         )
     return make_scenario(recording, ego, window, road, offset=window.first_row)
 

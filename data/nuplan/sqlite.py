@@ -1,4 +1,4 @@
-"""Reading SQLite files that come from somewhere else: read-only, and nothing in them is executed.
+"""SQLite files: those from somewhere else are read only, and nothing in them is executed.
 
 Only ordinary tables are read. A view or a virtual table under an expected name is refused, so that
 no SQL of the file runs; triggers never fire, since nothing is written.
@@ -6,14 +6,18 @@ no SQL of the file runs; triggers never fire, since nothing is written.
 
 import re
 import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any, TypeAlias
 from urllib.parse import quote
 
 from shiftsim.errors import DataError
+from shiftsim.files import whole_file
 
-_MEND = "the file is damaged or of another format; get it again from its source"
+Value: TypeAlias = int | float | str | bytes | None
+
+_REPAIR = "the file is damaged or of another format; get it again from its source"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
@@ -36,7 +40,9 @@ class Database:
                 info = self.query(f'PRAGMA table_xinfo("{name}")', f"table {name!r}")
                 self._columns[name] = [row[1] for row in info]
 
-    def query(self, sql: str, what: str, parameters: Sequence[object] = ()) -> list[tuple]:  # type: ignore[type-arg]  # rows of any kind
+    def query(
+        self, sql: str, what: str, parameters: Sequence[object] = ()
+    ) -> list[tuple[Any, ...]]:
         """All rows of a query of ours.
 
         Args:
@@ -50,7 +56,7 @@ class Database:
         try:
             return self._connection.execute(sql, tuple(parameters)).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise DataError(f"{self.path}: cannot read {what}: {error}", hint=_MEND) from error
+            raise DataError(f"{self.path}: cannot read {what}: {error}", hint=_REPAIR) from error
 
     def require(self, table: str, columns: Sequence[str]) -> None:
         """Make sure that an ordinary table with these columns exists.
@@ -59,11 +65,11 @@ class Database:
             DataError: It does not.
         """
         if table not in self._columns:
-            raise DataError(f"{self.path}: table {table!r} is missing", hint=_MEND)
+            raise DataError(f"{self.path}: table {table!r} is missing", hint=_REPAIR)
         missing = [name for name in columns if name not in self._columns[table]]
         if missing:
             raise DataError(
-                f"{self.path}: table {table!r} has no column {missing[0]!r}", hint=_MEND
+                f"{self.path}: table {table!r} has no column {missing[0]!r}", hint=_REPAIR
             )
 
     def columns(
@@ -98,7 +104,7 @@ def open_database(path: Path) -> Iterator[Database]:
     try:
         connection = sqlite3.connect(uri, uri=True)
     except sqlite3.Error as error:
-        raise DataError(f"{path}: cannot open the file: {error}", hint=_MEND) from error
+        raise DataError(f"{path}: cannot open the file: {error}", hint=_REPAIR) from error
     try:
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA query_only = ON")
@@ -106,3 +112,40 @@ def open_database(path: Path) -> Iterator[Database]:
         yield Database(path, connection)
     finally:
         connection.close()
+
+
+def write_database(
+    path: Path,
+    tables: Mapping[str, str],
+    rows: Mapping[str, Sequence[Sequence[Value]]],
+    after: Sequence[str] = (),
+) -> None:
+    """Write an SQLite file in one step.
+
+    Args:
+        path: The file; it is replaced.
+        tables: Column definitions by table name.
+        rows: Whole rows by table name.
+        after: Statements that end it, such as indexes.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        whole_file(path) as partial,
+        closing(sqlite3.connect(_absent(partial), isolation_level=None)) as connection,
+    ):
+        connection.execute("PRAGMA journal_mode = OFF")
+        connection.execute("PRAGMA synchronous = OFF")
+        connection.execute("BEGIN")
+        for name, columns in tables.items():
+            connection.execute(f'CREATE TABLE "{name}" ({columns})')
+            if rows.get(name):
+                marks = ", ".join("?" * len(rows[name][0]))
+                connection.executemany(f'INSERT INTO "{name}" VALUES ({marks})', rows[name])
+        for statement in after:
+            connection.execute(statement)
+        connection.execute("COMMIT")
+
+
+def _absent(path: Path) -> Path:
+    path.unlink(missing_ok=True)  # a process that was killed may have left a part
+    return path

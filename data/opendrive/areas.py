@@ -5,18 +5,28 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive.curves import ReferenceLine
-from shiftsim.data.opendrive.graph import DRIVABLE, ConnectorRun
-from shiftsim.data.opendrive.records import OpenDrive, Outline, Repeat, RoadObject, Signal
-from shiftsim.data.opendrive.shapes import Shapes, lane_polygon, largest_part
+from shiftsim.data.opendrive.graph import ConnectorRun
+from shiftsim.data.opendrive.records import (
+    DRIVABLE,
+    PAVED,
+    SEAMS,
+    WALKED,
+    OpenDrive,
+    Outline,
+    Repeat,
+    RoadObject,
+    Signal,
+)
+from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
+from shiftsim.data.polygons import largest_part, touching
 
-PAVED = frozenset(("shoulder", "stop", "parking", "roadWorks", "restricted"))
-WALKED = frozenset(("sidewalk", "walking"))
-SEAMS = frozenset(("border", "curb"))  # merged into a neighbouring walkway where narrow
 _SEAM_WIDTH = 0.5  # m
-_MIN_OVERLAP = 1.0  # m², deepplan-conversion.md §2.7
+_MIN_OVERLAP = 1.0  # m²
 _CLOSING = 0.5  # m
 _SLIVER = 0.05  # m, cracks between lanes that are closed in the drivable area
 _TILE, _TILE_OVERLAP = 50.0, 0.5  # m
@@ -49,33 +59,31 @@ def group_connectors(
         blocks: Their (from, to) roadblocks.
         are_stacked: Whether two of them lie on different levels.
     """
-    parent = list(range(len(connectors)))
-
-    def find(item: int) -> int:
-        while parent[item] != item:
-            parent[item] = parent[parent[item]]
-            item = parent[item]
-        return item
-
     first: dict[object, int] = {}
-    for number, connector in enumerate(connectors):
-        for label in (*sorted(connector.junctions), blocks[number]):
-            parent[find(number)] = find(first.setdefault(label, number))
-    shapes = np.array(polygons, dtype=object)
-    if len(shapes):
-        a, b = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-        for i, j in zip(a.tolist(), b.tolist(), strict=True):
-            one, two = connectors[i], connectors[j]
-            if i >= j or find(i) == find(j):
-                continue
-            if one.source == two.source or one.target == two.target:
-                continue
-            overlap = shapely.intersection(shapes[i], shapes[j]).area
-            if overlap > _MIN_OVERLAP and not are_stacked(i, j):
-                parent[find(i)] = find(j)
-    roots = [find(i) for i in range(len(connectors))]
-    order = {root: n for n, root in enumerate(dict.fromkeys(roots))}
-    return np.array([order[root] for root in roots], np.int64)
+    links = [
+        (number, first.setdefault(label, number))
+        for number, connector in enumerate(connectors)
+        for label in (*sorted(connector.junctions), blocks[number])
+    ]
+    group = linked_groups(links, len(connectors))
+    for i, j in touching(polygons):
+        one, two = connectors[i], connectors[j]
+        if group[i] == group[j] or one.source == two.source or one.target == two.target:
+            continue
+        overlap = shapely.intersection(polygons[i], polygons[j]).area
+        if overlap > _MIN_OVERLAP and not are_stacked(i, j):
+            links.append((i, j))
+    group = linked_groups(links, len(connectors))
+    order = {label: n for n, label in enumerate(dict.fromkeys(group.tolist()))}
+    return np.array([order[label] for label in group.tolist()], np.int64)
+
+
+def linked_groups(links: Sequence[tuple[int, int]], count: int) -> IntArray:
+    """(count,) a label for each item; linked ones share it."""
+    one, two = np.array(links, np.int64).reshape(-1, 2).T
+    matrix = coo_array((np.ones(len(one)), (one, two)), (count, count))
+    labels: IntArray = connected_components(matrix, directed=False)[1]
+    return labels
 
 
 def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.Polygon:
@@ -161,7 +169,7 @@ def _parts(shape: shapely.Geometry) -> list[shapely.Polygon]:
 
 
 def is_crosswalk(thing: RoadObject) -> bool:
-    """Whether an object marks a crosswalk, by type, or by name of a marking."""
+    """Whether an object marks a crosswalk, by type or by name (nuPlan rule 515)."""
     if thing.type == "crosswalk":
         return True
     if thing.type not in ("roadMark", "-1", "none", "") and "crosswalk" not in thing.type.lower():

@@ -1,11 +1,13 @@
-"""Self-checks of a finished map (deepplan-conversion.md §2)."""
+"""Self-checks of a finished map."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive.areas import linked_groups
+from shiftsim.data.polygons import shared_areas
 from shiftsim.world.layers import Layer
 from shiftsim.world.map import VectorMap
 
@@ -14,7 +16,6 @@ END_GAP = 0.3  # m
 JOINT_TURN = 0.2  # rad
 SPACING = (0.2, 0.3)  # m, on baselines of at least SPACED_LENGTH
 SPACED_LENGTH = 0.7  # m
-REACHABLE = 0.9
 
 
 def check_map(
@@ -106,19 +107,9 @@ def _spacing(lines: Sequence[FloatArray]) -> tuple[float, float]:
 def _largest_overlap(
     polygons: Sequence[shapely.Polygon], ids: Sequence[str], stacked: set[tuple[str, str]]
 ) -> float:
-    shapes = np.array(polygons, dtype=object)
-    if len(shapes) == 0:
-        return 0.0
-    a, b = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    kept = [
-        (i, j)
-        for i, j in zip(a.tolist(), b.tolist(), strict=True)
-        if i < j and (ids[i], ids[j]) not in stacked
-    ]
-    if not kept:
-        return 0.0
-    one, two = np.array(kept).T
-    return float(shapely.area(shapely.intersection(shapes[one], shapes[two])).max())
+    shared = shared_areas(polygons)
+    free = [area for (i, j), area in shared.items() if (ids[i], ids[j]) not in stacked]
+    return max(free, default=0.0)
 
 
 def _links_agree(road: VectorMap) -> bool:
@@ -140,18 +131,6 @@ def _links_alternate(road: VectorMap) -> bool:
 
 def _largest_component(road: VectorMap) -> float:
     """Share of the edges in the largest part that hangs together, ignoring direction."""
-    label: IntArray = np.arange(len(road.edges))
-    if len(label) == 0:
-        return 0.0
-
-    def find(edge: int) -> int:
-        while label[edge] != edge:
-            label[edge] = label[label[edge]]
-            edge = int(label[edge])
-        return edge
-
-    for edge in range(len(road.edges)):
-        for onward in road.outgoing.at(edge):
-            label[find(edge)] = find(int(onward))
-    roots = [find(edge) for edge in range(len(road.edges))]
-    return max(roots.count(root) for root in set(roots)) / len(roots)
+    links = [(e, int(onward)) for e in range(len(road.edges)) for onward in road.outgoing.at(e)]
+    labels = linked_groups(links, len(road.edges))
+    return float(np.bincount(labels).max() / len(labels)) if len(labels) else 0.0

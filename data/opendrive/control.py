@@ -1,7 +1,9 @@
-"""What controls traffic at junctions: lights, signs, stop lines (deepplan-conversion.md §2.9)."""
+"""What governs traffic: lights, signs and stop lines at junctions, and speed limits."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -9,9 +11,9 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.areas import is_stop_line, object_rings
 from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, Piece
-from shiftsim.data.opendrive.records import OpenDrive, Road, Signal
-from shiftsim.data.opendrive.shapes import Shapes, largest_part
-from shiftsim.data.opendrive.speed import applies_to
+from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal, Speed
+from shiftsim.data.opendrive.shapes import Shapes
+from shiftsim.data.polygons import largest_part
 
 LIGHT, STOP, YIELD = "light", "stop", "yield"
 STOP_LINE_DEPTH = 1.0  # m
@@ -19,6 +21,16 @@ _APPROACH = 100.0  # m before a junction within which a signal governs it
 _NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
 _STOP_TYPES = frozenset(("206", "R1-1"))
 _YIELD_TYPES = frozenset(("205", "R1-2"))
+_KMH, _MPH = SPEED_UNITS["km/h"], SPEED_UNITS["mph"]
+_TOWN = ("town", "townCollector", "townArterial", "townLocal", "townPrivate")
+_DEFAULTS_DE: dict[str, float | None] = {
+    **dict.fromkeys(_TOWN, 50 * _KMH),
+    "lowSpeed": 30 * _KMH,
+    **dict.fromkeys(("pedestrian", "townPlayStreet"), 10 * _KMH),
+    **dict.fromkeys(("rural", "townExpressway"), 100 * _KMH),
+    "motorway": None,
+}
+_DEFAULTS_US = _DEFAULTS_DE | dict.fromkeys(_TOWN, 25 * _MPH) | {"motorway": 65 * _MPH}
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,7 @@ def stop_lines(
     controls: Sequence[frozenset[str]],
     polygons: Sequence[shapely.Polygon],
 ) -> list[StopLine]:
-    """One stop line per lane that ends at a controlled or marked junction.
+    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506).
 
     Args:
         od: The file.
@@ -158,3 +170,79 @@ def _lies_across(line: shapely.Geometry, lane: shapely.Polygon, box: shapely.Pol
 def is_lit(connector: ConnectorRun, found: frozenset[str]) -> bool:
     """Whether lights govern a connector."""
     return bool(connector.junctions) and LIGHT in found
+
+
+def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:
+    """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]; None for none."""
+    lengths: dict[float, float] = defaultdict(float)
+    for piece in pieces:
+        road = od.roads[piece.key.road]
+        start = road.sections[piece.key.section].s
+        lane = road.sections[piece.key.section].lanes[piece.key.lane]
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        places = [start + r.s for r in lane.speeds] + [t.s for t in road.types]
+        places += [signal.s for signal in road.signals]
+        stops = np.array(sorted({low, high, *(s for s in places if low < s < high)}))
+        for begin, end in pairwise(stops):
+            limit = _limit_at(road, piece, 0.5 * (begin + end), country)
+            lengths[np.inf if limit is None else limit] += end - begin
+    if not lengths:
+        return None
+    best = min(lengths, key=lambda limit: (-round(lengths[limit], 6), limit))
+    return None if np.isinf(best) else best
+
+
+def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
+    section = road.sections[piece.key.section]
+    own = _last(section.lanes[piece.key.lane].speeds, s - section.s)
+    if own is not None:
+        return own.limit
+    kinds = [kind for kind in road.types if kind.s <= s] or list(road.types[:1])
+    if kinds and kinds[-1].speed is not None:
+        return kinds[-1].speed.limit
+    signal = _signal_limit(road, piece, s)
+    if signal is not None:
+        return signal
+    land = (kinds[-1].country if kinds else "") or country
+    table = _DEFAULTS_US if land.upper() in ("US", "USA") else _DEFAULTS_DE
+    return table.get(kinds[-1].type if kinds else "town", table["town"])
+
+
+def _last(records: Sequence[Speed], s: float) -> Speed | None:
+    before = [record for record in records if record.s <= s]
+    return before[-1] if before else None
+
+
+def _signal_limit(road: Road, piece: Piece, s: float) -> float | None:
+    """Limit of the last sign that traffic has passed on this road."""
+    forward = piece.end >= piece.begin
+    passed = [
+        (signal.s, limit)
+        for signal in road.signals
+        if (signal.s <= s) == forward
+        and signal.orientation in ("none", "+" if forward else "-")
+        and applies_to(signal, piece.key.lane)
+        and (limit := _sign_value(signal)) is not None
+    ]
+    if not passed:
+        return None
+    return (max if forward else min)(passed)[1]
+
+
+def applies_to(signal: Signal, lane: int) -> bool:
+    """Whether a signal is valid for a lane."""
+    return not signal.lanes or any(low <= lane <= high for low, high in signal.lanes)
+
+
+def _sign_value(signal: Signal) -> float | None:
+    """Limit on a speed sign [m/s]; None for any other signal."""
+    is_us = signal.type in ("R2-1", "r2_1")
+    if signal.type != "274" and not is_us:
+        return None
+    value = signal.value if signal.value and signal.value > 0 else None
+    if value is None and signal.subtype.isdecimal():
+        number = int(signal.subtype)
+        value = float((number - 50) * 10 if 51 <= number <= 63 else number)  # nuPlan rule 509
+    if value is None or value <= 0:
+        return None
+    return value * SPEED_UNITS.get(signal.unit, _MPH if is_us else _KMH)

@@ -3,7 +3,7 @@
 A record is a curve (u, v) in the frame of its own start pose. Clothoids are integrated by
 Gauss-Legendre quadrature over panels that turn by at most 0.25 rad, which is exact to rounding and
 does not cancel when both curvatures are nearly equal. The cubic curves are taken by arc length,
-whatever their parameter is (opendrive.md §1).
+whatever their parameter is (nuPlan rule 500).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _TURN_PER_PANEL = 0.25  # rad
 _MAX_PANELS = 4096  # a curve that turns more than 1000 rad is no road; it is evaluated coarsely
 _CUBIC_PANELS = 32
 _STRAIGHT = 1e-12  # 1/m, below it an arc is a line
-_LENGTH_SLACK, _MIN_LENGTH_SLACK = 0.01, 0.05  # opendrive.md §1: 1 %, at least 5 cm
+_LENGTH_SLACK, _MIN_LENGTH_SLACK = 0.01, 0.05  # 1 %, at least 5 cm
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """The reference line of one road.
+    """The reference line of one road."""
 
-    Attributes:
-        geometries: Its records, by s.
-        stretched: Whether a paramPoly3 that is much longer or shorter than it states is run through
-            evenly from end to end; else it is cut off where the stated length is used up.
-    """
-
-    geometries: tuple[Geometry, ...]
+    geometries: tuple[Geometry, ...]  # its records, by s
+    # whether a paramPoly3 that is much longer or shorter than it states is run through evenly from
+    # end to end; else it is cut off where the stated length is used up
     stretched: bool = True
 
     @property
@@ -59,7 +55,7 @@ class ReferenceLine:
     def evaluate(self, s: FloatArray) -> Poses:
         """Poses at distances `s` (K,) [m]; beyond the ends the line stays at its ends.
 
-        The heading at a joint belongs to the later record.
+        nuPlan rule 501: the heading at a joint is that of the later record.
         """
         s = np.asarray(s, np.float64)
         index = np.maximum(np.searchsorted(self.starts, s, side="right") - 1, 0)
@@ -106,7 +102,7 @@ def evaluate_local(
 def length_error(record: Geometry) -> float:
     """By how much the true length of a paramPoly3 differs from its stated one, as a share.
 
-    0 where the difference is within what opendrive.md §1 takes as rounding; inf where the curve
+    0 where the difference is within the rounding of files, 1 % and 5 cm; inf where the curve
     has no finite length.
     """
     if record.kind != PARAM_POLY3:

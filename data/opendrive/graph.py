@@ -3,7 +3,7 @@
 A *group* holds the drivable lanes of one direction of one lane section. Groups that follow each
 other one lane to one lane are joined to a run, which becomes a roadblock. Every other link becomes
 a connector: through a junction along its connecting roads, elsewhere over a short seam cut from
-the lanes before it (deepplan-conversion.md §2.3, §2.4).
+the lanes before it.
 """
 
 from collections import Counter, defaultdict
@@ -16,12 +16,8 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.lanes import LaneKey, lane_links, runs_forward, section_borders
-from shiftsim.data.opendrive.records import Lane, OpenDrive
+from shiftsim.data.opendrive.records import DRIVABLE, Lane, OpenDrive
 
-DRIVABLE = frozenset(
-    "driving entry exit onRamp offRamp connectingRamp slipLane bidirectional HOV bus taxi "
-    "mwyEntry mwyExit".split()
-)
 MIN_LENGTH = 0.1  # m, shorter lanes are linked through
 MIN_WIDTH = 0.5  # m, lanes never wider are linked through
 SEAM_LENGTH, SEAM_SHARE = 3.0, 0.25  # m, and share of the shorter lane
@@ -59,33 +55,22 @@ class LaneRun:
 
 @dataclass
 class ConnectorRun:
-    """A lane connector: pieces in the direction of travel, from one lane to another.
+    """A lane connector: pieces in the direction of travel, from one lane to another."""
 
-    Attributes:
-        pieces: In the direction of travel.
-        source: Lane it comes from.
-        target: Lane it leads to.
-        junctions: OpenDRIVE junctions it lies in; empty for a seam.
-    """
-
-    pieces: list[Piece]
-    source: int
-    target: int
-    junctions: frozenset[str] = frozenset()
+    pieces: list[Piece]  # in the direction of travel
+    source: int  # lane it comes from
+    target: int  # lane it leads to
+    junctions: frozenset[str] = frozenset()  # openDRIVE junctions it lies in; empty for a seam
 
 
 @dataclass
 class LaneGraph:
-    """Lanes and connectors of the map.
+    """Lanes and connectors of the map."""
 
-    Attributes:
-        lanes: Lanes; those of one roadblock follow each other.
-        connectors: Lane connectors.
-        dropped: Drivable lanes that are part of neither: short, narrow, or dead ends in junctions.
-    """
-
+    # lanes; those of one roadblock follow each other
     lanes: list[LaneRun] = field(default_factory=list)
-    connectors: list[ConnectorRun] = field(default_factory=list)
+    connectors: list[ConnectorRun] = field(default_factory=list)  # lane connectors
+    # drivable lanes that are part of neither: short, narrow, or dead ends in junctions
     dropped: list[Piece] = field(default_factory=list)
 
 
@@ -153,7 +138,7 @@ class _Builder:
             for index, section in enumerate(road.sections):
                 begin, end = section.s, road.section_end(index)
                 s = np.linspace(begin, end, 9)
-                borders = section_borders(road, index, s, mend=True)
+                borders = section_borders(road, index, s, repair=True)
                 poses = line.evaluate(s[[0, -1]])
                 for number, lane in section.lanes.items():
                     if not is_drivable(lane):
@@ -197,7 +182,7 @@ class _Builder:
         return runs_forward(self.od.roads[key.road], key.section, key.lane)
 
     def _link_through(self, key: LaneKey) -> None:
-        """Take a lane out and join what lies before it to what lies after it."""
+        """Take a lane out and join what lies before it to what follows (nuPlan rule 514)."""
         sources, targets = sorted(self.before[key]), sorted(self.after[key])
         for source in sources:
             self._part(source, key)
@@ -275,6 +260,7 @@ class _Builder:
         return group if group != self._group_of(keys[0]) else None
 
     def _cut_seams(self) -> None:
+        """Short connectors between lanes that no junction joins (nuPlan rule 504)."""
         lanes = self.graph.lanes
         by_first = {lane.pieces[0].key: i for i, lane in enumerate(lanes)}
         links: dict[int, list[tuple[int, int]]] = defaultdict(list)

@@ -1,7 +1,7 @@
 """Lane borders along a road, and which lane leads to which.
 
 Borders are distances t to the left of the reference line; lanes stack outward from the shifted
-centre line. Links are directed edges in the direction of travel (opendrive.md §2, §3).
+centre line. Links are directed edges in the direction of travel.
 """
 
 from collections import Counter
@@ -30,15 +30,10 @@ class LaneKey(NamedTuple):
 
 @dataclass(frozen=True)
 class SectionBorders:
-    """Borders of all lanes of a section at K places.
+    """Borders of all lanes of a section at K places."""
 
-    Attributes:
-        inner: Per lane, (K,) distance t of the border next to the centre [m].
-        outer: Per lane, (K,) distance t of the other border [m].
-    """
-
-    inner: dict[int, FloatArray]
-    outer: dict[int, FloatArray]
+    inner: dict[int, FloatArray]  # per lane, (K,) distance t of the border next to the centre [m]
+    outer: dict[int, FloatArray]  # per lane, (K,) distance t of the other border [m]
 
 
 def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> FloatArray:
@@ -63,7 +58,7 @@ def section_borders(
     section: int,
     s: FloatArray,
     *,
-    mend: bool = False,
+    repair: bool = False,
     look_up: FloatArray | None = None,
 ) -> SectionBorders:
     """Borders of the lanes of a section at road distances `s` (K,) within it [m].
@@ -72,7 +67,7 @@ def section_borders(
         road: The road.
         section: Number of the section.
         s: Distances from the start of the road [m].
-        mend: Whether negative widths count as 0, borders of right lanes that were written as
+        repair: Whether negative widths count as 0, borders of right lanes that were written as
             positive numbers are put on the right, and records that begin at the very end of the
             section are left to the next one.
         look_up: Where to look for the records instead of at `s`: which side of a step counts.
@@ -80,10 +75,10 @@ def section_borders(
     s = np.asarray(s, np.float64)
     begin, end = road.sections[section].s, road.section_end(section)
     if look_up is None:
-        look_up = np.minimum(s, max(end - BEFORE_END, begin)) if mend else s
+        look_up = np.minimum(s, max(end - BEFORE_END, begin)) if repair else s
     lanes = road.sections[section].lanes
     center = evaluate_cubics(road.offsets, s, look_up)
-    if mend:
+    if repair:
         center = np.clip(np.nan_to_num(center), -0.5 * _MAX_OFFSET, 0.5 * _MAX_OFFSET)
     borders = SectionBorders({}, {})
     for sign in (1, -1):
@@ -91,12 +86,13 @@ def section_borders(
         for number in sorted((i for i in lanes if i * sign > 0), key=abs):
             lane = lanes[number]
             borders.inner[number] = previous
-            if len(lane.widths) or not len(lane.borders):  # nothing at all is width 0
+            # nuPlan rule 502: widths win over borders; nothing at all is width 0
+            if len(lane.widths) or not len(lane.borders):
                 outer = previous + sign * evaluate_cubics(lane.widths, s - begin, look_up - begin)
             else:
                 outer = evaluate_cubics(lane.borders, s - begin, look_up - begin)
-                outer = -outer if mend and border_is_mirrored(lane) else outer
-            if mend:
+                outer = -outer if repair and border_is_mirrored(lane) else outer
+            if repair:
                 if not np.isfinite(outer).all():
                     outer = np.nan_to_num(outer, nan=0.0)
                 outer = np.clip(sign * outer, sign * previous, _MAX_OFFSET) * sign
@@ -106,7 +102,7 @@ def section_borders(
 
 
 def border_is_mirrored(lane: Lane) -> bool:
-    """Whether all border records of a right lane lie on the left."""
+    """Whether all border records of a right lane lie on the left (nuPlan rule 513)."""
     return lane.id < 0 and not len(lane.widths) and bool((lane.borders[:, 1] > 0).all())
 
 
@@ -197,7 +193,7 @@ class _Linker:
             self._add((incoming, here, source, end), (connecting, there, target, contact))
 
     def _add(self, side: _Side, other: _Side) -> None:
-        """An edge between two lanes that touch, if traffic can pass from one to the other."""
+        """A link of two lanes that touch, where traffic can pass (nuPlan rule 503)."""
         if 0 in (side[2], other[2]):
             return
         if any(

@@ -1,4 +1,4 @@
-"""OpenDRIVE to the semantic map of nuPlan's kind (deepplan-conversion.md §2)."""
+"""OpenDRIVE to the semantic map of nuPlan's kind."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -16,6 +16,7 @@ from shiftsim.data.opendrive.control import (
     YIELD,
     connector_controls,
     is_lit,
+    speed_limit,
     stop_lines,
 )
 from shiftsim.data.opendrive.graph import LaneGraph, Piece, build_lane_graph
@@ -28,12 +29,12 @@ from shiftsim.data.opendrive.overlaps import (
 )
 from shiftsim.data.opendrive.preparation import prepare
 from shiftsim.data.opendrive.records import OpenDrive
-from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, largest_part, widen
-from shiftsim.data.opendrive.speed import speed_limit
+from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
+from shiftsim.data.polygons import largest_part
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 
-LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # intersections, nuplan-formats.md
-STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # stop polygons, nuplan-formats.md
+LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
+STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -49,19 +50,13 @@ class Origin:
 
 @dataclass(frozen=True)
 class MapReport:
-    """What the conversion did.
+    """What the conversion did."""
 
-    Attributes:
-        warnings: What was mended, inferred or left out: count by kind.
-        origins: Pieces of OpenDRIVE lanes behind every lane and connector.
-        checks: Self-checks: name and whether the map passes.
-        figures: Numbers behind the checks.
-    """
-
-    warnings: dict[str, int]
-    origins: tuple[Origin, ...]
+    warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
+    origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
+    # self-checks: name and whether the map passes
     checks: dict[str, bool] = field(default_factory=dict)
-    figures: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
 
 
 def build_road_map(

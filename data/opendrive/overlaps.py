@@ -1,8 +1,8 @@
 """Lanes that lie over each other: crossings without a junction, slivers, bridges.
 
-No point may lie inside two lanes (deepplan-conversion.md §2.6). Where lanes cross, both roadblocks
+No point may lie inside two lanes. Where lanes cross, both roadblocks
 are cut and the pieces in between become connectors of an intersection. Other overlaps are taken
-away from the longer lane. Lanes on different levels stay as they are.
+away from the longer lane (nuPlan rule 505). Lanes on different levels stay as they are.
 """
 
 from collections import defaultdict
@@ -18,10 +18,11 @@ from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, LaneRun, Piece, split_pieces
 from shiftsim.data.opendrive.lanes import evaluate_cubics
 from shiftsim.data.opendrive.records import OpenDrive
-from shiftsim.data.opendrive.shapes import Shapes, lane_polygon, largest_part
+from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
+from shiftsim.data.polygons import largest_part, shared_areas
 
 OVERLAP = 1e-6  # m², less is a shared border
-LEVEL = 3.0  # m of height between lanes that do not meet
+LEVEL = 3.0  # m of height between lanes that do not meet, nuPlan rule 512
 _CROSSING_ANGLE = np.deg2rad(20.0)  # flatter overlaps are merges, not crossings
 _MARGIN, _MIN_LANE = 0.5, 1.0  # m around a crossing; shorter lanes beside it join it
 _SAMPLE = 1.0  # m
@@ -30,17 +31,11 @@ _MAX_VANISHED = 8  # lanes in a row that lie within crossings
 
 @dataclass(frozen=True)
 class Trace:
-    """Points along a chain of pieces, to find places on it.
+    """Points along a chain of pieces, to find places on it."""
 
-    Attributes:
-        xy: (K, 2) centre points [m].
-        distance: (K,) along the reference lines from the start [m].
-        height: (K,) of the road [m].
-    """
-
-    xy: FloatArray
-    distance: FloatArray
-    height: FloatArray
+    xy: FloatArray  # (K, 2) centre points [m]
+    distance: FloatArray  # (K,) along the reference lines from the start [m]
+    height: FloatArray  # (K,) of the road [m]
 
     def nearest(self, points: FloatArray) -> list[int]:
         """Index of the nearest point for each of `points` (N, 2)."""
@@ -70,14 +65,7 @@ def trace(od: OpenDrive, shapes: Shapes, pieces: Sequence[Piece]) -> Trace:
 
 def overlapping(polygons: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of polygons that share more than a border."""
-    shapes = np.array(polygons, dtype=object)
-    if len(shapes) == 0:
-        return []
-    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    one, two = one[one < two], two[one < two]
-    areas = shapely.area(shapely.intersection(shapes[one], shapes[two]))
-    kept = areas > OVERLAP
-    return sorted(zip(one[kept].tolist(), two[kept].tolist(), strict=True))
+    return [pair for pair, area in shared_areas(polygons).items() if area > OVERLAP]
 
 
 class Levels:

@@ -5,20 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.data.opendrive.areas import PAVED, SEAMS, WALKED
+from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.curves import ReferenceLine, length_error
-from shiftsim.data.opendrive.graph import DRIVABLE
 from shiftsim.data.opendrive.lanes import border_is_mirrored
-from shiftsim.data.opendrive.records import OpenDrive, Road
 from shiftsim.errors import MapError
 
-UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
-GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m, opendrive.md §7
+GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
 MAX_LANE_LENGTH = 3e6  # m, of all lanes together
 
 
-def prepare(od: OpenDrive, warnings: Counter[str]) -> OpenDrive:
+def prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
     """The file in the frame of its header, without roads that cannot be drawn.
 
     Args:
@@ -53,7 +50,7 @@ def prepare(od: OpenDrive, warnings: Counter[str]) -> OpenDrive:
     return replace(od, roads=roads, offset=None)
 
 
-def _placed(road: Road, offset: tuple[float, float, float, float]) -> Road:
+def _placed(road: records.Road, offset: tuple[float, float, float, float]) -> records.Road:
     """A road with the header's offset applied to its reference line."""
     x, y, _, turn = offset
     cos, sin = np.cos(turn), np.sin(turn)
@@ -69,7 +66,7 @@ def _placed(road: Road, offset: tuple[float, float, float, float]) -> Road:
     return replace(road, geometries=geometries)
 
 
-def _note_gaps(road: Road, warnings: Counter[str]) -> None:
+def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:
     gaps, _ = ReferenceLine(road.geometries).joints()
     small = int(((gaps > GAP_NOTED) & (gaps <= GAP_SERIOUS)).sum())
     serious = int((gaps > GAP_SERIOUS).sum())
@@ -79,8 +76,8 @@ def _note_gaps(road: Road, warnings: Counter[str]) -> None:
         warnings[f"gap of more than {GAP_SERIOUS:g} m between geometries"] += serious
 
 
-def _note_lanes(road: Road, warnings: Counter[str]) -> None:
-    known = DRIVABLE | PAVED | WALKED | SEAMS | UNUSED
+def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:
+    known = records.DRIVABLE | records.PAVED | records.WALKED | records.SEAMS | records.UNUSED
     for section in road.sections:
         for lane in section.lanes.values():
             if lane.type in ("tram", "rail"):

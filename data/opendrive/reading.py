@@ -1,8 +1,8 @@
-"""OpenDRIVE XML to the records of `opendrive_records`.
+"""OpenDRIVE XML to records.
 
-Nothing is evaluated here. Real files are seldom quite right (opendrive.md §7): what can be mended
-is mended and counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error
-that names file, road and element.
+Nothing is evaluated here. Real files are seldom quite right: what can be repaired is repaired and
+counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error that names file,
+road and element.
 """
 
 import io
@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
-from shiftsim.data.opendrive.objects import read_object, read_signal
+from shiftsim.data.opendrive.elements import CUBIC, Reader, read_object, read_signal
 from shiftsim.data.opendrive.records import (
     ARC,
     LINE,
     PARAM_POLY3,
     POLY3,
+    SPEED_UNITS,
     SPIRAL,
     Connection,
     Geometry,
@@ -32,13 +33,11 @@ from shiftsim.data.opendrive.records import (
     RoadType,
     Speed,
 )
-from shiftsim.data.opendrive.xml import CUBIC, Reader
 from shiftsim.errors import ConversionError
 
 MAX_BYTES = 200_000_000
 MAX_COORDINATE = 1e8  # m, beyond any projection of the earth
 MAX_LENGTH = 1e5  # m, of one road
-SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}  # opendrive.md §5
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
 _TOP_LEVEL = ("OpenDRIVE", "header", "road", "junction")
@@ -315,7 +314,8 @@ def _read_speed(element: Any, reader: Reader) -> Speed:
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
         return Speed(begin, None)
-    limit = reader.number(element, "max") * SPEED_UNITS.get(unit, np.nan)
+    # nuPlan rule 508: without a unit in m/s
+    limit = reader.number(element, "max") * SPEED_UNITS.get(unit or "m/s", np.nan)
     if not (np.isfinite(limit) and limit > 0):
         reader.warn("speed limit that is not a positive number in a known unit")
         return Speed(begin, None)
@@ -406,4 +406,4 @@ def _read_junction(element: Any, name: str, reader: Reader) -> Junction:
         )
     if not connections:
         reader.warn("junction without connections")
-    return Junction(name, kind, tuple(connections), element.get("mainRoad"))
+    return Junction(name, kind, tuple(connections))

@@ -5,71 +5,55 @@ from dataclasses import dataclass
 from shiftsim.arrays import FloatArray
 
 LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s
+
+# Types of lanes by what they are used for.
+DRIVABLE = frozenset(
+    "driving entry exit onRamp offRamp connectingRamp slipLane bidirectional HOV bus taxi "
+    "mwyEntry mwyExit".split()
+)
+PAVED = frozenset(("shoulder", "stop", "parking", "roadWorks", "restricted"))
+WALKED = frozenset(("sidewalk", "walking"))
+SEAMS = frozenset(("border", "curb"))  # merged into a neighbouring walkway where narrow
+UNUSED = frozenset(("none", "biking", "median", "tram", "rail", "special1", "special2", "special3"))
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """One record of a reference line.
+    """One record of a reference line."""
 
-    Attributes:
-        s: Where it begins on the road [m].
-        x: Start [m].
-        y: Start [m].
-        heading: At the start [rad].
-        length: Along the curve [m].
-        kind: `line`, `arc`, `spiral`, `poly3` or `paramPoly3`.
-        coefficients: Curvature; curvatures at both ends [1/m]; a b c d; aU bU cU dU aV bV cV dV.
-        p_end: Last value of the parameter of a paramPoly3.
-    """
-
-    s: float
-    x: float
-    y: float
-    heading: float
-    length: float
-    kind: str
+    s: float  # where it begins on the road [m]
+    x: float  # start [m]
+    y: float  # start [m]
+    heading: float  # at the start [rad]
+    length: float  # along the curve [m]
+    kind: str  # `line`, `arc`, `spiral`, `poly3` or `paramPoly3`
+    # curvature; curvatures at both ends [1/m]; a b c d; aU bU cU dU aV bV cV dV
     coefficients: tuple[float, ...] = ()
-    p_end: float = 0.0
+    p_end: float = 0.0  # last value of the parameter of a paramPoly3
 
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """A speed record.
+    """A speed record."""
 
-    Attributes:
-        s: Where it begins, from the start of the road or the lane section [m].
-        limit: [m/s]; None where there is no limit.
-    """
-
-    s: float
-    limit: float | None
+    s: float  # where it begins, from the start of the road or the lane section [m]
+    limit: float | None  # [m/s]; None where there is no limit
 
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """One lane of one lane section.
+    """One lane of one lane section."""
 
-    Attributes:
-        id: Positive left of the reference line, negative right of it.
-        type: As the file has it; `none` where it has none.
-        widths: (n, 5) s from the section's start, then a b c d.
-        borders: (n, 5) likewise.
-        predecessors: Lanes of the previous section, or of the road before.
-        successors: Lanes of the next section, or of the road after.
-        speeds: Limits of this lane.
-        access: Pairs (rule, restriction) such as ("deny", "car").
-        direction: `standard`, `reversed` or `both`.
-    """
-
-    id: int
-    type: str
-    widths: FloatArray
-    borders: FloatArray
-    predecessors: tuple[int, ...] = ()
-    successors: tuple[int, ...] = ()
-    speeds: tuple[Speed, ...] = ()
-    access: tuple[tuple[str, str], ...] = ()
-    direction: str = "standard"
+    id: int  # positive left of the reference line, negative right of it
+    type: str  # as the file has it; `none` where it has none
+    widths: FloatArray  # (n, 5) s from the section's start, then a b c d
+    borders: FloatArray  # (n, 5) likewise
+    predecessors: tuple[int, ...] = ()  # lanes of the previous section, or of the road before
+    successors: tuple[int, ...] = ()  # lanes of the next section, or of the road after
+    speeds: tuple[Speed, ...] = ()  # limits of this lane
+    access: tuple[tuple[str, str], ...] = ()  # pairs (rule, restriction) such as ("deny", "car")
+    direction: str = "standard"  # `standard`, `reversed` or `both`
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,109 +104,61 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True)
 class RoadObject:
-    """An object on a road. Position s, t, `heading` relative to the road [m, rad].
+    """An object on a road. Position s, t, `heading` relative to the road [m, rad]."""
 
-    Attributes:
-        id: Object id.
-        type: Type; empty where the file has none.
-        subtype: Subtype.
-        name: Name.
-        s: Along the road [m].
-        t: To the left [m].
-        heading: Relative to the road [rad].
-        length: Along the object's x axis [m]; None where not given.
-        width: Across [m]; None where not given.
-        outlines: Polygons; the box of length and width holds where there are none.
-        repeats: Copies.
-        lanes: Lanes it is valid for; empty for all.
-    """
-
-    id: str
-    type: str
-    subtype: str
-    name: str
-    s: float
-    t: float
-    heading: float
-    length: float | None
-    width: float | None
+    id: str  # object id
+    type: str  # type; empty where the file has none
+    subtype: str  # subtype
+    name: str  # name
+    s: float  # along the road [m]
+    t: float  # to the left [m]
+    heading: float  # relative to the road [rad]
+    length: float | None  # along the object's x axis [m]; None where not given
+    width: float | None  # across [m]; None where not given
+    # polygons; the box of length and width holds where there are none
     outlines: tuple[Outline, ...] = ()
-    repeats: tuple[Repeat, ...] = ()
-    lanes: tuple[tuple[int, int], ...] = ()
+    repeats: tuple[Repeat, ...] = ()  # copies
+    lanes: tuple[tuple[int, int], ...] = ()  # lanes it is valid for; empty for all
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """A signal, or a reference to one that stands on another road (`reference`).
+    """A signal, or a reference to one that stands on another road (`reference`)."""
 
-    Attributes:
-        id: Signal id.
-        name: Name.
-        type: Type in the country's catalogue.
-        subtype: Subtype; empty where the file says -1 or nothing.
-        country: Catalogue.
-        dynamic: Whether it changes, as lights do.
-        s: Along the road [m].
-        t: To the left [m].
-        orientation: `+` for traffic along s, `-` against, `none` for both.
-        value: Number on it; None where it has none.
-        unit: Unit of the number.
-        width: Across [m]; None where not given.
-        lanes: Ranges of lanes it is valid for; empty for all.
-        reference: Whether this is a signalReference.
-    """
-
-    id: str
-    name: str
-    type: str
-    subtype: str
-    country: str
-    dynamic: bool
-    s: float
-    t: float
-    orientation: str
-    value: float | None
-    unit: str
-    width: float | None
-    lanes: tuple[tuple[int, int], ...] = ()
-    reference: bool = False
+    id: str  # signal id
+    name: str  # name
+    type: str  # type in the country's catalogue
+    subtype: str  # subtype; empty where the file says -1 or nothing
+    country: str  # catalogue
+    dynamic: bool  # whether it changes, as lights do
+    s: float  # along the road [m]
+    t: float  # to the left [m]
+    orientation: str  # `+` for traffic along s, `-` against, `none` for both
+    value: float | None  # number on it; None where it has none
+    unit: str  # unit of the number
+    width: float | None  # across [m]; None where not given
+    lanes: tuple[tuple[int, int], ...] = ()  # ranges of lanes it is valid for; empty for all
+    reference: bool = False  # whether this is a signalReference
 
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """One road.
+    """One road."""
 
-    Attributes:
-        id: Road id.
-        length: The shorter of what it states and what its geometry has [m].
-        stated_length: As the file has it [m].
-        junction: Junction it lies in; None for a road outside.
-        left_hand: Whether traffic keeps to the left.
-        geometries: Reference line, by s.
-        offsets: (n, 5) lane offset: s, a b c d.
-        elevation: (n, 5) height of the reference line.
-        sections: Lane sections, by s; some may have no length.
-        predecessor: What lies before its start.
-        successor: What lies after its end.
-        types: By s.
-        objects: Objects.
-        signals: Signals.
-    """
-
-    id: str
-    length: float
-    stated_length: float
-    junction: str | None
-    left_hand: bool
-    geometries: tuple[Geometry, ...]
-    offsets: FloatArray
-    elevation: FloatArray
-    sections: tuple[LaneSection, ...]
-    predecessor: RoadLink | None = None
-    successor: RoadLink | None = None
-    types: tuple[RoadType, ...] = ()
-    objects: tuple[RoadObject, ...] = ()
-    signals: tuple[Signal, ...] = ()
+    id: str  # road id
+    length: float  # the shorter of what it states and what its geometry has [m]
+    stated_length: float  # as the file has it [m]
+    junction: str | None  # junction it lies in; None for a road outside
+    left_hand: bool  # whether traffic keeps to the left
+    geometries: tuple[Geometry, ...]  # reference line, by s
+    offsets: FloatArray  # (n, 5) lane offset: s, a b c d
+    elevation: FloatArray  # (n, 5) height of the reference line
+    sections: tuple[LaneSection, ...]  # lane sections, by s; some may have no length
+    predecessor: RoadLink | None = None  # what lies before its start
+    successor: RoadLink | None = None  # what lies after its end
+    types: tuple[RoadType, ...] = ()  # by s
+    objects: tuple[RoadObject, ...] = ()  # objects
+    signals: tuple[Signal, ...] = ()  # signals
 
     def section_end(self, index: int) -> float:
         """Where lane section `index` ends [m]."""
@@ -233,18 +169,12 @@ class Road:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """How one road enters a junction.
+    """How one road enters a junction."""
 
-    Attributes:
-        incoming: Road that leads to the junction.
-        connecting: Road inside the junction, or the linked road of a direct junction.
-        contact: Which end of the connecting road touches the incoming one.
-        lane_links: Pairs (lane of the incoming road, lane of the connecting road).
-    """
-
-    incoming: str
-    connecting: str
-    contact: str | None
+    incoming: str  # road that leads to the junction
+    connecting: str  # road inside the junction, or the linked road of a direct junction
+    contact: str | None  # which end of the connecting road touches the incoming one
+    # pairs (lane of the incoming road, lane of the connecting road)
     lane_links: tuple[tuple[int, int], ...]
 
 
@@ -255,29 +185,18 @@ class Junction:
     id: str
     type: str
     connections: tuple[Connection, ...]
-    main_road: str | None = None
 
 
 @dataclass(frozen=True)
 class OpenDrive:
-    """One file.
+    """One file."""
 
-    Attributes:
-        source: Name of the file, for messages.
-        revision: Major and minor version as written.
-        geo_reference: As written; None where there is none.
-        offset: Header offset x, y, z [m], heading [rad]; None where there is none.
-        roads: By id, in the order of the file.
-        junctions: By id, in the order of the file.
-        counts: How many records of each kind the file holds, dropped ones included.
-        warnings: What was mended or left out: count by kind.
-    """
-
-    source: str
-    revision: tuple[str, str]
-    geo_reference: str | None
+    source: str  # name of the file, for messages
+    revision: tuple[str, str]  # major and minor version as written
+    geo_reference: str | None  # as written; None where there is none
+    # header offset x, y, z [m], heading [rad]; None where there is none
     offset: tuple[float, float, float, float] | None
-    roads: dict[str, Road]
-    junctions: dict[str, Junction]
-    counts: dict[str, int]
-    warnings: dict[str, int]
+    roads: dict[str, Road]  # by id, in the order of the file
+    junctions: dict[str, Junction]  # by id, in the order of the file
+    counts: dict[str, int]  # how many records of each kind the file holds, dropped ones included
+    warnings: dict[str, int]  # what was repaired or left out: count by kind

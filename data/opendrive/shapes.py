@@ -18,9 +18,10 @@ from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.graph import Piece
 from shiftsim.data.opendrive.lanes import BEFORE_END, LaneKey, section_borders
 from shiftsim.data.opendrive.records import OpenDrive, Road
+from shiftsim.data.polygons import largest_part
 
-CHORD_ERROR = 0.05  # m, opendrive.md §6
-BASELINE_STEP = 0.25  # m, PLUTO takes every fourth vertex as 1 m
+CHORD_ERROR = 0.05  # m
+BASELINE_STEP = 0.25  # m, nuPlan rule 510: PLUTO takes every fourth vertex as 1 m
 _DENSE_STEP = 0.1  # m, of exact points a baseline is drawn through: 0.4 mm on a radius of 3 m
 _TARGET_ERROR = 0.02  # m at the middle of a chord; the largest error may lie beside it
 _MAX_STEP = 10.0  # m
@@ -30,22 +31,16 @@ _STEP = 0.01  # m, beyond which a jump of the middle of a lane is spread
 _CORNER, _MIN_STRETCH = 0.3, 0.7  # rad, and m between corners, to be kept as vertices
 _KINK, _BEND = 0.1, 5.0  # rad, and m, of ends that are bent into the direction of a neighbour
 _BLEND = 10.0  # m over which a jump between pieces is spread
-_NARROW = 2.5  # m, connectors below it are widened (nuPlan's "scaled width")
+_NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 
 
 @dataclass(frozen=True)
 class SectionShape:
-    """Borders of one lane section at common places.
+    """Borders of one lane section at common places."""
 
-    Attributes:
-        s: (K,) places on the road, ascending [m].
-        inner: Per lane, (K, 2) border next to the centre [m].
-        outer: Per lane, (K, 2) other border [m].
-    """
-
-    s: FloatArray
-    inner: dict[int, FloatArray]
-    outer: dict[int, FloatArray]
+    s: FloatArray  # (K,) places on the road, ascending [m]
+    inner: dict[int, FloatArray]  # per lane, (K, 2) border next to the centre [m]
+    outer: dict[int, FloatArray]  # per lane, (K, 2) other border [m]
 
 
 class Shapes:
@@ -97,15 +92,9 @@ class Shapes:
         return self._middles(piece.key, np.clip(s, low, max(high - BEFORE_END, low)))
 
     def _middles(self, key: LaneKey, s: FloatArray) -> FloatArray:
-        borders = section_borders(self._od.roads[key.road], key.section, s, mend=True, look_up=s)
+        borders = section_borders(self._od.roads[key.road], key.section, s, repair=True, look_up=s)
         middle = 0.5 * (borders.inner[key.lane] + borders.outer[key.lane])
         return self._lines[key.road].evaluate(s).offset(middle)
-
-    def ends(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
-        """First and last centre point of a chain of pieces [m]."""
-        first = self.centers(pieces[0], np.array([pieces[0].begin]))[0]
-        last = self.centers(pieces[-1], np.array([pieces[-1].end]))[0]
-        return first, last
 
     def baseline(
         self,
@@ -172,7 +161,7 @@ class Shapes:
         out = []
         for piece, s in ((pieces[0], pieces[0].begin), (pieces[-1], pieces[-1].end)):
             road = self._od.roads[piece.key.road]
-            borders = section_borders(road, piece.key.section, np.array([s]), mend=True)
+            borders = section_borders(road, piece.key.section, np.array([s]), repair=True)
             out.append(float(abs(borders.outer[piece.key.lane] - borders.inner[piece.key.lane])[0]))
         return out[0], out[1]
 
@@ -228,17 +217,6 @@ def _bend_start(line: FloatArray, direction: FloatArray) -> FloatArray:
 def lane_polygon(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     """The area between two borders of one direction; the largest part where they cross."""
     return largest_part(shapely.Polygon(np.concatenate([left, right[::-1]])))
-
-
-def largest_part(shape: shapely.Geometry) -> shapely.Polygon:
-    """The largest valid polygon of a geometry; an empty polygon where there is none."""
-    if not shape.is_valid:
-        shape = shapely.make_valid(shape)
-    if isinstance(shape, shapely.Polygon):
-        return shape
-    parts = [p for p in shapely.get_parts(shape) if isinstance(p, shapely.Polygon)]
-    nested = [largest_part(p) for p in shapely.get_parts(shape) if hasattr(p, "geoms")]
-    return max(parts + nested, key=lambda part: part.area, default=shapely.Polygon())
 
 
 def widen(left: FloatArray, right: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
@@ -301,7 +279,7 @@ def _sample_section(
 
 
 def _evaluate_section(road: Road, section: int, line: ReferenceLine, s: FloatArray) -> SectionShape:
-    borders, poses = section_borders(road, section, s, mend=True), line.evaluate(s)
+    borders, poses = section_borders(road, section, s, repair=True), line.evaluate(s)
     points = {id(t): poses.offset(t) for t in borders.inner.values()}
     outer = {}
     for number, t in borders.outer.items():

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.data.store.files import digest
-from shiftsim.data.store.reading import MANIFEST, ScenarioStore, read_manifest
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.tables import MANIFEST, digest, read_manifest
 from shiftsim.errors import DataError
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.scenario import Scenario

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from shiftsim.data.store.files import MEND, Table, write_blocks
+from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
@@ -121,14 +121,14 @@ def read_map_file(path: Path) -> VectorMap:
     """
     file = Table(path, SCHEMA)
     if file.num_rows != 1:
-        raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=MEND)
+        raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=REPAIR)
     # column by column: decoding a city at once takes three times its size
     items = {name: _items(file.read(columns=[name])[name]) for name in SCHEMA.names}
     pa.default_memory_pool().release_unused()
     try:
         return _assemble(file.footer, items)
     except (KeyError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: the arrays do not fit together: {error}", hint=MEND) from error
+        raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
 
 
 def _items(column: pa.ChunkedArray) -> Any:

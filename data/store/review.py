@@ -1,8 +1,8 @@
 """The review of a store by people: decisions and corrected routes, as an overlay.
 
-`review/review.jsonl` in the store holds one JSON object per reviewed scenario (see
-deepplan-conversion.md §10): `token`, `decision` (accept, reject or empty), `comment`, `route` (ids
-of the corrected route, or null), `reviewer`, `version`. The scenarios themselves keep their bytes.
+`review/review.jsonl` in the store holds one JSON object per reviewed scenario: `token`, `decision`
+(accept, reject or empty), `comment`, `route` (ids of the corrected route, or null), `reviewer`,
+`version`. The scenarios themselves keep their bytes.
 """
 
 import hashlib
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import DataError
+from shiftsim.files import whole_file
 from shiftsim.world.map import VectorMap
 
 REVIEW = "review/review.jsonl"
@@ -126,7 +127,7 @@ def _review(line: str, where: str) -> Review:
     try:
         values = json.loads(line)
     except ValueError as error:
-        raise DataError(f"{where}: not JSON: {error}", hint="mend or remove that line") from error
+        raise DataError(f"{where}: not JSON: {error}", hint="repair or remove that line") from error
     if not isinstance(values, dict) or set(values) - set(names) or "token" not in values:
         raise DataError(f"{where}: not a review", hint=f"its fields are {', '.join(names)}")
     route = values.get("route")
@@ -151,12 +152,10 @@ def write_reviews(store: Path, reviews: Reviews) -> Path:
     path = store / REVIEW
     path.parent.mkdir(exist_ok=True)
     lines = [json.dumps(asdict(reviews[token]), ensure_ascii=False) + "\n" for token in reviews]
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", encoding="utf-8") as file:
+    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.write("".join(lines))
         file.flush()
         os.fsync(file.fileno())
-    partial.replace(path)
     return path
 
 

@@ -11,14 +11,9 @@ import pyarrow as pa
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.store import schema
-from shiftsim.data.store.files import MEND, Table, file_name, write_blocks
+from shiftsim.data.store.tables import FRAMES, REPAIR, TRACKS, Table, ego_file, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
-
-
-def ego_file(folder: Path, name: str) -> Path:
-    """File of an ego's states."""
-    return folder / f"ego-{file_name(name)}.parquet"
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
@@ -36,13 +31,13 @@ def write_recording(folder: Path, recording: Recording) -> None:
         "log": recording.log_name,
         "connectors": list(lights.connector_ids),
     }
-    write_blocks(folder / "frames.parquet", _split(frames, schema.FRAME_BLOCK), footer)
+    write_blocks(folder / FRAMES, _split(frames, schema.FRAME_BLOCK), footer)
     tracks = recording.tracks
     blocks = [
         _track_block(tracks, start) for start in range(0, max(len(tracks), 1), schema.BLOCK_ROWS)
     ]
     footer = {"tokens": list(tracks.tokens), "kinds": tracks.kinds.tolist()}
-    write_blocks(folder / "tracks.parquet", blocks, footer)
+    write_blocks(folder / TRACKS, blocks, footer)
 
 
 def write_ego(folder: Path, ego: EgoTrace) -> None:
@@ -105,7 +100,7 @@ class StoredRecording:
         if not 0 <= first < last <= self.num_rows:
             raise DataError(
                 f"{self.frames.path}: no rows {first} … {last - 1}, there are {self.num_rows}",
-                hint=MEND,
+                hint=REPAIR,
             )
         return Recording(
             log_name=self.log_name,
@@ -119,18 +114,18 @@ class StoredRecording:
         shape = (last - first, len(self.connectors))
         status = _rows(self.frames, first, last)["light_status"].combine_chunks().flatten()
         if len(status) != shape[0] * shape[1]:
-            raise DataError(f"{self.frames.path}: light_status has gaps", hint=MEND)
+            raise DataError(f"{self.frames.path}: light_status has gaps", hint=REPAIR)
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
         return TrafficLights(self.connectors, values)
 
     def _read_tracks(self, first: int, last: int) -> Tracks:
         blocks = range(first // schema.BLOCK_ROWS, (last - 1) // schema.BLOCK_ROWS + 1)
         if blocks[-1] >= self.tracks.num_blocks:
-            raise DataError(f"{self.tracks.path}: row groups are missing", hint=MEND)
+            raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
         table = self.tracks.read(list(blocks))
         row, track, *values = _views(table, schema.TRACKS.names)
         if len(row) and not 0 <= track.min() <= track.max() < len(self.tokens):
-            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=MEND)
+            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
         place = _places(row, track, first, last, len(self.tokens))
         seen = np.flatnonzero(place >= 0)
         shape = (last - first, len(seen))
@@ -147,12 +142,12 @@ def open_recording(folder: Path) -> StoredRecording:
     Raises:
         DataError: A file is missing, lacks a column or is damaged.
     """
-    frames = Table(folder / "frames.parquet", schema.FRAMES)
-    tracks = Table(folder / "tracks.parquet", schema.TRACKS)
+    frames = Table(folder / FRAMES, schema.FRAMES)
+    tracks = Table(folder / TRACKS, schema.TRACKS)
     head, names = _footer(frames, "log", "city", "connectors"), _footer(tracks, "tokens", "kinds")
     kinds = np.array(names["kinds"], np.int64)
     if len(kinds) != len(names["tokens"]):
-        raise DataError(f"{tracks.path}: kinds and tokens differ in number", hint=MEND)
+        raise DataError(f"{tracks.path}: kinds and tokens differ in number", hint=REPAIR)
     return StoredRecording(
         log_name=head["log"],
         city=head["city"],
@@ -167,7 +162,7 @@ def open_recording(folder: Path) -> StoredRecording:
 def _footer(table: Table, *names: str) -> Mapping[str, Any]:
     for name in names:
         if name not in table.footer:
-            raise DataError(f"{table.path}: the footer has no {name!r}", hint=MEND)
+            raise DataError(f"{table.path}: the footer has no {name!r}", hint=REPAIR)
     return table.footer
 
 
@@ -184,7 +179,7 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     """
     start = int(_footer(table, "first_row")["first_row"])
     if not start <= first < last <= start + table.num_rows:
-        raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=MEND)
+        raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
     rows = _rows(table, first - start, last - start)
     states = np.empty((last - first, NUM_STATE))
     for index, values in enumerate(_views(rows, schema.EGO_COLUMNS)):
@@ -195,7 +190,7 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
 def _rows(table: Table, first: int, last: int) -> pa.Table:
     low, high = first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK
     if high >= table.num_blocks:
-        raise DataError(f"{table.path}: row groups are missing", hint=MEND)
+        raise DataError(f"{table.path}: row groups are missing", hint=REPAIR)
     rows = table.read(list(range(low, high + 1)))
     return rows.slice(first - low * schema.FRAME_BLOCK, last - first)
 

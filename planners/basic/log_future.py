@@ -1,4 +1,4 @@
-"""The oracle: drives what was recorded (idm-planner.md §7)."""
+"""The oracle: drives what was recorded."""
 
 from shiftsim.errors import PlannerError
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -6,7 +6,7 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Trajectory
 
 POSES = 16
-ROWS_BETWEEN = 10  # 0.5 s of a 20 Hz log; nuPlan counts rows, not time
+ROWS_BETWEEN = 10  # 0.5 s of a 20 Hz log; nuPlan rule 393: it counts rows, not time
 
 
 class LogFuture:

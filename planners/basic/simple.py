@@ -1,4 +1,4 @@
-"""nuPlan's SimplePlanner: straight on, and not faster than a limit (idm-planner.md §8)."""
+"""nuPlan's SimplePlanner: straight on, and not faster than a limit."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def _roll_out(states: FloatArray, max_speed: float, wheel_base: float) -> None:
     """Fill rows 1… of `states` (H, 11) from row 0; above `max_speed` [m/s] the ego brakes."""
     before = np.empty(states.shape[1])
     for row in range(1, len(states)):
-        # nuPlan: the new acceleration is not written back into the earlier state
+        # nuPlan rule 394: the new acceleration is not written back into the earlier state
         before[:] = states[row - 1]
         speed = np.sqrt(before[VX] ** 2 + before[VY] ** 2)
         if speed > max_speed:

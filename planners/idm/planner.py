@@ -1,46 +1,22 @@
-"""nuPlan's IDM planner: follow the route's lanes, keep a gap to what stands in the corridor.
+"""nuPlan's IDM planner: follow the route's lanes, keep a gap to what stands in the corridor."""
 
-Everything that moves is taken as standing still during the 8 s roll-out; its speed enters only
-through the desired gap (idm-planner.md §4, quirk I3).
-"""
+from typing import NamedTuple
 
 import numpy as np
-import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners
+from shiftsim.geometry.corridors import OPEN
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.planners.idm.corridor import (
-    CLEAR,
-    HIT,
-    OPEN,
-    UNKNOWN,
-    Occupants,
-    find_lead,
-    find_sides,
-    near_path,
-    sub_path,
-)
-from shiftsim.planners.idm.path import (
-    Path,
-    RoutePlan,
-    build_path,
-    candidate_edges,
-    interpolate,
-    plan_route,
-    route_blocks,
-)
+from shiftsim.geometry.paths import Path, pose_at
+from shiftsim.planners.idm.corridor import UNKNOWN, Objects, exact_side, find_lead, find_sides
+from shiftsim.planners.idm.path import LanePath, build_path, plan_route, route_blocks, sub_path
+from shiftsim.planners.routes.lanes import lanes_of, red_lanes
+from shiftsim.planners.routes.search import Search
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    VX,
-    LightStatus,
-    Trajectory,
-    rear_poses,
-)
+from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, VX, Trajectory, rear_poses
 
 STEPS = 16
 STEP = 0.5  # s
@@ -48,6 +24,28 @@ STEP_US = 500_000
 HORIZON = STEPS * STEP  # s
 RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
 _EGO_TOKEN = "ego_token"
+
+
+class Policy(NamedTuple):
+    """What drives along the path.
+
+    Attributes:
+        length: Of the ego [m].
+        width: Of the ego [m].
+        target_velocity: Speed on a free road [m/s].
+        min_gap: Gap kept at standstill [m].
+        headway: Time gap kept [s].
+        accel_max: Largest acceleration [m/s^2].
+        decel_max: Largest deceleration, positive [m/s^2].
+    """
+
+    length: float
+    width: float
+    target_velocity: float
+    min_gap: float
+    headway: float
+    accel_max: float
+    decel_max: float
 
 
 class Idm:
@@ -77,9 +75,9 @@ class Idm:
         self._limits = (min_gap, headway, accel_max, decel_max)
         self._scene: SceneInfo | None = None
         self._blocks: list[int] = []
-        self._candidates: set[int] = set()
-        self.route_plan: RoutePlan | None = None
-        self.path: Path | None = None
+        self._route_lanes: set[int] = set()
+        self.route_plan: Search | None = None
+        self.path: LanePath | None = None
         self.target_velocity = target_velocity
 
     def reset(self, scene: SceneInfo) -> None:
@@ -90,7 +88,7 @@ class Idm:
         """
         self._scene = scene
         self._blocks = route_blocks(scene.map, scene.route, scene.token)
-        self._candidates = candidate_edges(scene.map, self._blocks)
+        self._route_lanes = set(lanes_of(scene.map, self._blocks))
         self.route_plan = self.path = None
 
     def plan(self, observation: Observation) -> Trajectory:
@@ -108,35 +106,38 @@ class Idm:
             raise PlannerError("idm: plan() was called before reset()")
         ego = observation.ego
         path = self.path or self._make_path(scene, observation)
+        policy = Policy(
+            scene.vehicle.length, scene.vehicle.width, self.target_velocity, *self._limits
+        )
         centers, motion = np.empty((STEPS + 1, 3)), np.empty((STEPS + 1, 2))
         centers[0] = ego.center
         start = path.project(centers[0, 0], centers[0, 1])
         motion[0] = start, ego.values[VX]
-        occupants = self._occupants(observation, path, start, float(ego.values[VX]))
-        sides = np.full((STEPS, len(occupants.speeds)), UNKNOWN)
-        size = (scene.vehicle.length, scene.vehicle.width)
-        model = (self.target_velocity, *self._limits)
+        objects = self._objects(scene, observation)
+        sides = np.full((STEPS, len(objects.speeds)), UNKNOWN)
         step = 0
         while True:
-            step, lead = _roll_on(step, path, occupants, size, model, centers, motion, sides)
+            step, lead = _roll_on(step, path.driven, objects, policy, centers, motion, sides)
             if lead < 0:
                 break
-            reach = _look_ahead(path, motion[step, 0], self.target_velocity)
-            sides[step, lead] = _exact_side(reach, centers[step], size, occupants, lead)
-        centers[0] = interpolate(path, start)
+            line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
+            footprint = boxes_to_corners(centers[step], np.array(policy[:2]))
+            sides[step, lead] = exact_side(line, 0.5 * policy.width, footprint, objects, lead)
+        centers[0] = _pose(path.driven, start)
         return centers, motion[:, 1]
 
-    def _make_path(self, scene: SceneInfo, observation: Observation) -> Path:
+    def _make_path(self, scene: SceneInfo, observation: Observation) -> LanePath:
         """Choose lanes and target velocity, once per scenario."""
         ego = observation.ego
         self.route_plan = plan_route(scene.map, self._blocks, ego.center, scene.vehicle)
-        self.path = build_path(scene.map, self.route_plan.edges)
-        limit = float(scene.map.speed_limits[self.route_plan.edges[0]])
+        self.path = build_path(scene.map, self.route_plan.path)
+        limit = float(scene.map.speed_limits[self.route_plan.path[0]])
         if np.isnan(limit) or limit == 0.0:
-            # nuPlan: the value of the scenario before, where an instance is used again (I9); here a
-            # scenario never depends on those before it
+            # nuPlan rule 155: the value of the scenario before, where a planner is used again; here
+            # a scenario never depends on those before it
             limit = self._fallback_velocity
-        self.target_velocity = max(limit, ego.speed)  # nuPlan: frozen at the first edge (I2)
+        # nuPlan rule 156: the target is that of the first lane for the whole scenario
+        self.target_velocity = max(limit, ego.speed)
         if self.target_velocity <= 0.0:
             raise PlannerError(
                 f"idm: the speed limit at the start of scenario {scene.token!r} is {limit} m/s",
@@ -144,58 +145,39 @@ class Idm:
             )
         return self.path
 
-    def _occupants(
-        self, observation: Observation, path: Path, progress: float, speed: float
-    ) -> Occupants:
-        """Objects and red lights that can come into the corridor during the roll-out."""
-        assert self._scene is not None
-        vehicle, tracks = self._scene.vehicle, observation.history.tracks
-        center = observation.ego.center
+    def _objects(self, scene: SceneInfo, observation: Observation) -> Objects:
+        """Objects around the ego, and the red lights of the route."""
+        tracks, center = observation.history.tracks, observation.ego.center
         poses, sizes = tracks.poses[-1], tracks.sizes[-1]
         distance = np.hypot(poses[:, 0] - center[0], poses[:, 1] - center[1])
         near = np.flatnonzero(tracks.valid[-1] & (distance < RADIUS))
-        # nuPlan: whatever has a part of "ego_token" for a token is overlooked (I8)
+        # nuPlan rule 157: whatever has a part of "ego_token" for a token is overlooked
         near = near[[tracks.tokens[i] not in _EGO_TOKEN for i in near.tolist()]]
-        boxes = boxes_to_corners(poses[near], sizes[near])
-        radii = 0.5 * np.hypot(sizes[near, 0], sizes[near, 1])
         is_agent = tracks.kinds[near] <= LAST_AGENT_KIND
         velocities = tracks.velocities[-1, near]
-        agent_speeds = np.where(is_agent, np.hypot(velocities[:, 0], velocities[:, 1]), 0.0)
-        reds = self._red_lights(observation)
-        circles = np.concatenate(
-            [np.column_stack([poses[near, :2], radii]), *(_circle(ring)[None] for ring in reds)]
-        )
-        reach = 0.5 * float(np.hypot(vehicle.length, vehicle.width))
-        travel = HORIZON * (max(abs(speed), self.target_velocity) + 1.0)
-        high = progress + travel + HORIZON * self.target_velocity
-        kept = near_path(
-            path, progress - abs(speed) - 1.0, high, circles, center[0], center[1], reach
-        )
-        rings = [boxes[i] if i < len(near) else reds[i - len(near)] for i in kept.tolist()]
-        nothing = np.zeros(len(reds))
-        return Occupants(
-            np.concatenate(rings) if rings else np.zeros((0, 2)),
-            np.cumsum([0, *(len(ring) for ring in rings)]),
-            circles[kept],
-            np.concatenate([poses[near, 2], nothing])[kept],
-            np.concatenate([agent_speeds, nothing])[kept],
-        )
-
-    def _red_lights(self, observation: Observation) -> list[FloatArray]:
-        """Shells (V, 2) of the connectors of the route whose light is red [m]."""
-        assert self._scene is not None
-        edges = self._scene.map.edges
-        return [
-            edges.rings(edges.index[name])[0]
-            for name, status in observation.traffic_lights.items()
-            if status == LightStatus.RED and edges.index.get(name, -1) in self._candidates
+        speeds = np.where(is_agent, np.hypot(velocities[:, 0], velocities[:, 1]), 0.0)
+        lanes = scene.map.edges
+        red = [
+            i for i in red_lanes(scene.map, observation.traffic_lights) if i in self._route_lanes
         ]
+        lights = [lanes.rings(lane)[0] for lane in red]
+        rings = [*boxes_to_corners(poses[near], sizes[near]), *lights]
+        radii = 0.5 * np.hypot(sizes[near, 0], sizes[near, 1])
+        circles = [np.column_stack([poses[near, :2], radii]), *map(_circle, lights)]
+        nothing = np.zeros(len(lights))
+        return Objects(
+            np.concatenate([np.zeros((0, 2)), *rings]),
+            np.cumsum([0, *map(len, rings)]),
+            np.concatenate(circles),
+            np.concatenate([poses[near, 2], nothing]),
+            np.concatenate([speeds, nothing]),
+        )
 
 
 def _circle(ring: FloatArray) -> FloatArray:
     middle = 0.5 * (ring.min(axis=0) + ring.max(axis=0))
     radius = np.hypot(ring[:, 0] - middle[0], ring[:, 1] - middle[1]).max()
-    return np.array([middle[0], middle[1], radius])
+    return np.array([[middle[0], middle[1], radius]])
 
 
 @kernel
@@ -207,67 +189,58 @@ def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
 
 
 @kernel
+def _pose(path: Path, progress: float) -> tuple[float, float, float]:
+    x, y, heading = pose_at(path, progress)
+    return x, y, wrap_angle(heading)
+
+
+@kernel
 def _roll_on(
     first: int,
     path: Path,
-    occupants: Occupants,
-    size: tuple[float, float],
-    model: tuple[float, float, float, float, float],
+    objects: Objects,
+    policy: Policy,
     centers: FloatArray,
     motion: FloatArray,
     sides: IntArray,
 ) -> tuple[int, int]:
-    """Fill the rows behind `first` until the end, or until an OPEN occupant would be the lead.
+    """Fill the rows behind `first` until the end, or until an OPEN object would be the lead.
 
     Args:
         first: Row that is known.
         path: The path.
-        occupants: What may stand in the way.
-        size: Length and width of the ego [m].
-        model: Target velocity [m/s] and the remaining parameters of `idm_acceleration`.
+        objects: What may stand in the way.
+        policy: How to drive.
         centers: (17, 3) box centres x [m], y [m], heading [rad].
         motion: (17, 2) progress [m] and speed [m/s].
-        sides: (16, M) side of every occupant at every step, decided as far as needed.
+        sides: (16, M) side of every object at every step, decided as far as needed.
 
     Returns:
-        The row and the occupant to decide, or -1 for the occupant at the end.
+        The row and the object to decide, or -1 for the object at the end.
     """
-    target, min_gap, headway, accel_max, decel_max = model
+    length, width, target, min_gap, headway, accel_max, decel_max = policy
     footprint = np.empty((4, 2))
     for step in range(first, STEPS):
         x, y, heading = centers[step, 0], centers[step, 1], centers[step, 2]
         progress, speed = motion[step, 0], motion[step, 1]
-        box_corners(x, y, heading, size[0], size[1], footprint)
+        box_corners(x, y, heading, length, width, footprint)
         line = _look_ahead(path, progress, target)
-        find_sides(line, 0.5 * size[1], footprint, occupants, sides[step])
-        lead, gap = find_lead(footprint, occupants, sides[step])
+        find_sides(line, 0.5 * width, footprint, objects, sides[step])
+        # nuPlan rule 158: all objects stand still during the roll-out; their speeds count only here
+        lead, gap = find_lead(footprint, objects, sides[step])
         lead_speed = 0.0
         if lead < 0:
-            gap = path.progress[-1] - progress - 0.5 * size[0]
+            gap = path.progress[-1] - progress - 0.5 * length
         elif sides[step, lead] == OPEN:
             return step, lead
         else:
-            turn = wrap_angle(occupants.headings[lead] - heading)
-            lead_speed = occupants.speeds[lead] * np.cos(turn)
+            turn = wrap_angle(objects.headings[lead] - heading)
+            lead_speed = objects.speeds[lead] * np.cos(turn)
         accel = idm_acceleration(
             speed, gap, lead_speed, target, min_gap, headway, accel_max, decel_max
         )
         motion[step + 1, 0] = progress + STEP * speed
         motion[step + 1, 1] = max(0.0, speed + STEP * min(max(accel, -decel_max), accel_max))
-        x, y, heading = interpolate(path, motion[step + 1, 0])
+        x, y, heading = _pose(path, motion[step + 1, 0])
         centers[step + 1, 0], centers[step + 1, 1], centers[step + 1, 2] = x, y, heading
     return STEPS, -1
-
-
-def _exact_side(
-    line: FloatArray,
-    center: FloatArray,
-    size: tuple[float, float],
-    occupants: Occupants,
-    index: int,
-) -> int:
-    """The side of an OPEN occupant, by the polygon nuPlan uses."""
-    buffer = shapely.LineString(line).buffer(0.5 * size[1], cap_style="square")
-    corridor = buffer.union(shapely.Polygon(boxes_to_corners(center, np.array(size))))
-    ring = occupants.xy[occupants.ptr[index] : occupants.ptr[index + 1]]
-    return HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR

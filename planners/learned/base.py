@@ -10,6 +10,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, Self, TypeVar, cast
 
+from shiftsim.planners.learned.checkpoint import checkpoint_fingerprint, load_network
+from shiftsim.planners.learned.device import require_torch, resolve_device
 from shiftsim.sim.planner import BatchPlanner, Observation, SceneInfo
 from shiftsim.world.state import Command, Trajectory
 
@@ -21,10 +23,33 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
     """Base of the adapters.
 
     Attributes:
-        degraded: Why the last plan is a makeshift; empty when it is not.
+        name: Of the planner, in the table of planners.
+        degraded: Why the last plan is a fallback; empty when it is not.
     """
 
+    name: str
     degraded: str = ""
+
+    def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
+        """Load the network.
+
+        Args:
+            checkpoint: File, folder, name, or `deterministic:base|drive`; see `load_weights`.
+            device: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+        Raises:
+            CheckpointError: The checkpoint is missing, damaged or of another network.
+            MissingExtraError: PyTorch is not installed.
+        """
+        self.network = load_network(checkpoint, self.name, device=device)
+        self.device = resolve_device(device)
+
+    @classmethod
+    def fingerprint(cls, checkpoint: str = "", device: str = "cpu") -> tuple[str, str]:
+        """What tells the weights from others, and the kind of device; arguments as above."""
+        require_torch(f"planner {cls.name!r}")
+        weights = checkpoint_fingerprint(checkpoint, cls.name)
+        return weights, resolve_device(device).partition(":")[0]
 
     @abstractmethod
     def reset(self, scene: SceneInfo) -> None:
@@ -68,7 +93,7 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
         return plans
 
     def _infer_all(self, features: Sequence[Features]) -> Sequence[Any]:
-        """Outputs of a batch; where that fails, of each alone, with an error for the guilty."""
+        """Outputs of a batch; where that fails, of each alone, with an error where one fails."""
         if not features:
             return ()
         outputs = _caught(self.infer, features)

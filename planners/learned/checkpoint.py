@@ -1,4 +1,4 @@
-"""Checkpoints: found by path or name, read without running them, loaded strictly.
+"""Checkpoints: found by path or name, opened without running them, loaded strictly.
 
 The authors' own files are read as published: PyTorch-Lightning files (`state_dict`, names with
 `model.`), Diffusion Planner's `model.pth` (`ema_state_dict`, names with `module.`, `args.json`
@@ -7,17 +7,16 @@ The words `deterministic:base` and `deterministic:drive` stand for weights made 
 the tensors: good for trying that everything runs; their scores mean nothing.
 """
 
-import difflib
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from shiftsim.errors import CheckpointError
+from shiftsim.errors import CheckpointError, nearest
 from shiftsim.files import checkpoint_folder
+from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
 from shiftsim.planners.learned.match import (
     differences,
@@ -27,7 +26,7 @@ from shiftsim.planners.learned.match import (
     shapes_of,
 )
 from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
-from shiftsim.planners.registry import PLANNERS
+from shiftsim.planners.table import PUBLISHED
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
 SUFFIXES = (".ckpt", ".pth", ".safetensors")
@@ -38,27 +37,19 @@ _PREFIXES = ("model.", "module.", "_orig_mod.")
 _WITH_ARGS = ("diffusion-planner",)  # planners whose weights mean nothing without their args
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """What an adapter loads into its network.
+class Weights(NamedTuple):
+    """What is loaded into a network.
 
     Attributes:
         state: Tensors by official name, complete, of the network's own types.
         args: Settings of the network that came with them, or None.
-        sha256: Of the file; the name of deterministic weights.
-        source: Where they are from.
-        meaningless: Whether they are deterministic weights, which have learned nothing.
     """
 
     state: dict[str, Any]
     args: dict[str, Any] | None
-    sha256: str
-    source: str
-    meaningless: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
+class Checkpoint(NamedTuple):
     """A checkpoint file as read, for whatever planner it is.
 
     Attributes:
@@ -78,12 +69,23 @@ class Checkpoint:
     made_from: str = ""
 
 
+def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
+    """A planner's network with its weights, on its device and ready to be called.
+
+    The arguments and errors are those of `load_weights`.
+    """
+    weights = load_weights(spec, planner, device=device)
+    network = network_module(planner).build_network(weights.args)
+    network.load_state_dict(weights.state)
+    return network.to(resolve_device(device)).eval()
+
+
 def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
     """Weights of a planner's network, strictly all and nothing else.
 
     Args:
         spec: A file, a folder that holds one, a name in the folder of checkpoints, or one of
-            `DETERMINISTIC`.
+            `DETERMINISTIC`; empty for the published file in the folder of checkpoints.
         planner: Name of the planner.
         device: Where the tensors go, as in `resolve_device`. Torch is set up for inference there.
 
@@ -96,12 +98,12 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
     place = resolve_device(device)
     prepare_inference(place)
     if spec.startswith("deterministic:"):
-        return _deterministic(spec, planner, place)
-    path = find_checkpoint(spec, planner)
-    found = open_checkpoint(path)
-    args = needed_args(found, planner)
-    state = {name: value.to(place) for name, value in checked_state(found, planner, args).items()}
-    return Weights(state, args, file_hash(path), str(path), meaningless=False)
+        state, args = _deterministic(spec, planner), None
+    else:
+        found = open_checkpoint(find_checkpoint(spec, planner))
+        args = needed_args(found, planner)
+        state = checked_state(found, planner, args)
+    return Weights({name: value.to(place) for name, value in state.items()}, args)
 
 
 def checkpoint_fingerprint(spec: str, planner: str) -> str:
@@ -112,12 +114,12 @@ def checkpoint_fingerprint(spec: str, planner: str) -> str:
     Raises:
         CheckpointError: There is no such file.
     """
-    return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec))
+    return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec, planner))
 
 
-def split_ensemble(spec: str) -> tuple[str, ...]:
+def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
     """The checkpoints of `A,B,C`, or of a folder with one folder for each; else the one given."""
-    path = Path(spec).expanduser()
+    path = Path(spec).expanduser() if spec or not planner else _published_path(planner)
     members = [] if (path / _MEMBER).exists() else sorted(path.glob(f"*/{_MEMBER}"))
     if members:
         return tuple(str(member) for member in members)
@@ -125,33 +127,42 @@ def split_ensemble(spec: str) -> tuple[str, ...]:
 
 
 def find_checkpoint(spec: str, planner: str = "") -> Path:
-    """The file that is meant; the planner is for the message only.
+    """The file that is meant, by default the published one of the planner.
 
     Raises:
         CheckpointError: There is none, or a folder holds several.
     """
     given, named = Path(spec).expanduser(), checkpoint_folder() / spec
+    if planner and not spec:
+        given = named = _published_path(planner)
     for path in (given, named, *(named.with_name(named.name + suffix) for suffix in SUFFIXES)):
         if path.is_file():
             return path
         if path.is_dir():
             return _inside(path)
-    known = sorted(path.name for path in checkpoint_folder().glob("*"))
-    near = difflib.get_close_matches(Path(spec).name, known, n=1, cutoff=0.5)
+    near = nearest(Path(spec).name, sorted(path.name for path in checkpoint_folder().glob("*")))
     whose = f" of planner {planner!r}" if planner else ""
     raise CheckpointError(
         f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}",
-        hint=f"did you mean {near[0]!r}?" if near else how_to_get(planner),
+        hint=f"did you mean {near!r}?" if near else how_to_get(planner),
     )
+
+
+def _published_path(planner: str) -> Path:
+    """Where the published checkpoint lies that is taken where none is given."""
+    path = checkpoint_folder() / PUBLISHED[planner].name
+    if not path.exists():
+        raise CheckpointError(f"planner {planner!r} needs a checkpoint", hint=how_to_get(planner))
+    return path
 
 
 def how_to_get(planner: str) -> str:
     """What to do where a planner has no checkpoint, in one line."""
-    published = PLANNERS[planner].checkpoint if planner else None
-    if published is None:
+    if planner not in PUBLISHED:
         return "check the path"
     return (
-        f"get {published.file} from the project {published.project}, then --checkpoint PATH; "
+        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, "
+        "then --checkpoint PATH; "
         "to try without: --checkpoint deterministic:drive (scores mean nothing)"
     )
 
@@ -178,15 +189,40 @@ def open_checkpoint(path: Path) -> Checkpoint:
     dropped = len(tensors) - len(state)
     if dropped:
         others.append(f"{dropped} tensors without the prefix of the others")
-    container = f"{contents.container}, {entry}" if entry else contents.container
     return Checkpoint(
         path,
-        container,
+        f"{contents.container}, {entry}" if entry else contents.container,
         state,
         _args_of(path, contents),
         (*others, *contents.skipped),
         contents.metadata.get("source_sha256", ""),
     )
+
+
+def _without_prefixes(tensors: dict[str, Any]) -> dict[str, Any]:
+    """Names as the network has them; no network's own names begin with such a prefix."""
+    state = tensors
+    while prefix := next((p for p in _PREFIXES if any(n.startswith(p) for n in state)), ""):
+        # nuPlan rule 330: the loader of Diffusion Planner drops what has no prefix; those of PlanTF
+        # and PLUTO keep it, and fail
+        state = {
+            name.removeprefix(prefix): value
+            for name, value in state.items()
+            if prefix != "module." or name.startswith(prefix)
+        }
+    return state
+
+
+def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
+    """Settings in the file's own metadata, or in `args.json` beside it."""
+    if "args" in contents.metadata:
+        try:
+            value = json.loads(contents.metadata["args"])
+        except ValueError as error:
+            raise CheckpointError(f"checkpoint {str(path)!r}: args in it are not JSON") from error
+        return value if isinstance(value, dict) else None
+    beside = path.parent / "args.json"
+    return read_json_object(beside) if beside.is_file() else None
 
 
 def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
@@ -198,11 +234,10 @@ def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
     if planner not in _WITH_ARGS:
         return None
     if found.args is None:
-        if (other := most_like(shapes_of(found.state))) != planner:
-            raise _other_planner(found.path, planner, other)
+        _require_likeness(found, planner)
         raise CheckpointError(
             f"checkpoint {str(found.path)!r} of planner {planner!r} has no args.json beside it",
-            hint=f"get it where the checkpoint is from, project {_project(planner)}",
+            hint=f"get it where the checkpoint is from, project {PUBLISHED[planner].project}",
         )
     return found.args
 
@@ -216,16 +251,13 @@ def checked_state(
         CheckpointError: One is missing, unexpected, of another shape, or not finite.
     """
     wanted = empty_state(planner, args)
-    shapes = shapes_of(found.state)
-    problems = differences(shapes, shapes_of(wanted))
+    problems = differences(shapes_of(found.state), shapes_of(wanted))
     if problems:
-        other = most_like(shapes)
-        if other != planner:
-            raise _other_planner(found.path, planner, other)
+        _require_likeness(found, planner)
         raise CheckpointError(
             f"checkpoint {str(found.path)!r} does not fit planner {planner!r}: "
             f"tensors {'; '.join(problems)}",
-            hint=f"it must be of the published network, project {_project(planner)}",
+            hint=f"it must be of the published network, project {PUBLISHED[planner].project}",
         )
     state = {name: found.state[name].detach().to(wanted[name].dtype) for name in wanted}
     bad = [name for name, value in state.items() if not bool(value.isfinite().all())]
@@ -235,6 +267,19 @@ def checked_state(
             hint="the training has diverged, or the file is damaged",
         )
     return state
+
+
+def _require_likeness(found: Checkpoint, planner: str) -> None:
+    """Raise where a checkpoint is not of the planner's network, but perhaps of another's."""
+    other = most_like(shapes_of(found.state))
+    if other == planner:
+        return
+    name = f"checkpoint {str(found.path)!r} is not for planner {planner!r}"
+    if other:
+        raise CheckpointError(
+            f"{name}: it looks like {other!r}", f"--planner {other}, or {how_to_get(planner)}"
+        )
+    raise CheckpointError(f"{name}, nor for any other known here", how_to_get(planner))
 
 
 def file_hash(path: Path) -> str:
@@ -256,8 +301,7 @@ def _file_hash(path: Path, _time: int, _size: int) -> str:
 
 def _fingerprint(spec: str, planner: str) -> str:
     if spec.startswith("deterministic:"):
-        _check_deterministic(spec)
-        return spec
+        return _known_deterministic(spec)
     path = find_checkpoint(spec, planner)
     args = path.parent / "args.json"
     if planner in _WITH_ARGS and args.is_file():
@@ -280,66 +324,17 @@ def _inside(folder: Path) -> Path:
     )
 
 
-def _without_prefixes(tensors: dict[str, Any]) -> dict[str, Any]:
-    """Names as the network has them; no network's own names begin with such a prefix."""
-    state = tensors
-    while prefix := next((p for p in _PREFIXES if any(n.startswith(p) for n in state)), ""):
-        # the official loader of Diffusion Planner drops what has no prefix (planner-diffusion.md
-        # §1); those of PlanTF and PLUTO keep it, and fail
-        state = {
-            name.removeprefix(prefix): value
-            for name, value in state.items()
-            if prefix != "module." or name.startswith(prefix)
-        }
-    return state
-
-
-def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
-    """Settings in the file's own metadata, or in `args.json` beside it."""
-    if "args" in contents.metadata:
-        try:
-            value = json.loads(contents.metadata["args"])
-        except ValueError as error:
-            raise CheckpointError(f"checkpoint {str(path)!r}: args in it are not JSON") from error
-        return value if isinstance(value, dict) else None
-    beside = path.parent / "args.json"
-    return read_json_object(beside) if beside.is_file() else None
-
-
-def _other_planner(path: Path, planner: str, other: str) -> CheckpointError:
-    if other and other != planner:
-        return CheckpointError(
-            f"checkpoint {str(path)!r} is not for planner {planner!r}: it looks like {other!r}",
-            hint=f"--planner {other}, or {how_to_get(planner)}",
-        )
-    return CheckpointError(
-        f"checkpoint {str(path)!r} is not for planner {planner!r}, nor for any other known here",
-        hint=how_to_get(planner),
-    )
-
-
-def _project(planner: str) -> str:
-    published = PLANNERS[planner].checkpoint
-    return published.project if published is not None else ""
-
-
-def _check_deterministic(spec: str) -> None:
+def _known_deterministic(spec: str) -> str:
     if spec not in DETERMINISTIC:
         raise CheckpointError(
             f"checkpoint {spec!r} unknown", hint=f"there are {' and '.join(DETERMINISTIC)}"
         )
+    return spec
 
 
-def _deterministic(spec: str, planner: str, device: str) -> Weights:
+def _deterministic(spec: str, planner: str) -> dict[str, Any]:
     import torch
 
-    from shiftsim.planners.learned.deterministic import deterministic_state
-
-    _check_deterministic(spec)
-    module = network_module(planner)
-    built = {name: value.numpy() for name, value in module.build_network().state_dict().items()}
-    state = deterministic_state(built, getattr(module, "RULES", None))
-    if spec.endswith(":drive"):
-        module.drive_overrides(state)
-    tensors = {name: torch.from_numpy(value).to(device) for name, value in state.items()}
-    return Weights(tensors, None, spec, spec, meaningless=True)
+    variant = _known_deterministic(spec).removeprefix("deterministic:")
+    state = network_weights(network_module(planner), variant)
+    return {name: torch.from_numpy(value) for name, value in state.items()}

@@ -43,6 +43,21 @@ def deterministic_state(
     return out
 
 
+def network_weights(module: Any, variant: str) -> State:
+    """Deterministic weights of a planner's network.
+
+    Args:
+        module: With `build_network(args)`, `drive_overrides(state)` and, where the table of names
+            does not fit, `RULES`.
+        variant: `base` or `drive`.
+    """
+    built = {name: value.numpy() for name, value in module.build_network().state_dict().items()}
+    state = deterministic_state(built, getattr(module, "RULES", None))
+    if variant == "drive":
+        module.drive_overrides(state)
+    return state
+
+
 def rule_of(name: str, ndim: int) -> str:
     """The letter of the rule by which a tensor is filled."""
     leaf = name.split(".")[-1]

@@ -1,13 +1,13 @@
 """What the feature builders of the learned planners share."""
 
-from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
-from shiftsim.sim.planner import History
+from shiftsim.sim.planner import History, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, Tracks, Trajectory
 
@@ -15,6 +15,7 @@ SAMPLES = 21  # of a history of 2 s
 PLAN_POSES = 80
 EGO_LENGTH, EGO_WIDTH = PACIFICA.length, PACIFICA.width
 
+NO_ROUTE = "the scenario has no route on the map"
 MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
 
 Arrays = TypeVar("Arrays")
@@ -41,6 +42,17 @@ class PerMap(Generic[Arrays]):
         return arrays
 
 
+def route_blocks(scene: SceneInfo) -> list[int]:
+    """Blocks of the scenario's route, each once; those that the map does not have are left out."""
+    index = scene.map.blocks.index
+    return [index[name] for name in dict.fromkeys(scene.route) if name in index]
+
+
+def short_history(count: int) -> str:
+    """What is wrong with a history of `count` samples; empty where it is 2 s long."""
+    return f"the history has {count} samples, not {SAMPLES}" if count < SAMPLES else ""
+
+
 class AgentFeatures(NamedTuple):
     """The ego and the agents nearest to it in the ego frame, float32. A rows, the ego first.
 
@@ -64,7 +76,7 @@ class AgentFeatures(NamedTuple):
 
 
 def agent_features(history: History, center: FloatArray, max_agents: int) -> AgentFeatures:
-    """Histories of the ego and of the agents that are present (planner-plantf.md §2.1, §2.2).
+    """Histories of the ego and of the agents that are present.
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
 
@@ -84,7 +96,8 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
 
 
 def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
-    """Present agents, nearest first. nuPlan: sorted from a list by kind with numpy's default."""
+    """Present agents, nearest first."""
+    # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
     present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= LAST_AGENT_KIND))
     by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
     away = tracks.poses[-1, by_kind, :2] - center[:2]
@@ -137,8 +150,15 @@ def _agent_histories(
     return position, turned, velocity, shape, valid
 
 
+def poses_of(plan: np.ndarray) -> FloatArray:
+    """(H, 3) poses of (H, 4) x, y, cosine and sine of the heading."""
+    exact = plan.astype(np.float64)
+    return np.column_stack([exact[:, :2], np.arctan2(exact[:, 3], exact[:, 2])])
+
+
 def map_poses(poses: FloatArray, ego: FloatArray) -> FloatArray:
-    """Poses (..., 3) of the ego frame in that of the map; nuPlan: headings are not wrapped."""
+    """Poses (..., 3) of the ego frame in that of the map."""
+    # nuPlan rule 303: headings are not wrapped
     cos, sin = np.cos(ego[HEADING]), np.sin(ego[HEADING])
     x, y, heading = poses[..., 0], poses[..., 1], poses[..., 2]
     return np.stack(
@@ -147,7 +167,7 @@ def map_poses(poses: FloatArray, ego: FloatArray) -> FloatArray:
 
 
 def straight_on(history: History) -> Trajectory:
-    """A makeshift where a planner has no plan: heading and speed are kept for 8 s."""
+    """A fallback where a planner has no plan: heading and speed are kept for 8 s."""
     present = history.ego[-1]
     times = STEP * np.arange(1, PLAN_POSES + 1)
     speed = present[VX] * np.array([np.cos(present[HEADING]), np.sin(present[HEADING])])
@@ -155,3 +175,17 @@ def straight_on(history: History) -> Trajectory:
     poses[:, :2] = present[:2] + times[:, None] * speed
     poses[:, HEADING] = present[HEADING]
     return plan_of_poses(poses, history)
+
+
+def stack(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
+    """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
+    import torch
+
+    out: list[Any] = []
+    for arrays in zip(*scenes, strict=True):
+        shape = np.max([array.shape for array in arrays], axis=0)
+        batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
+        for row, array in zip(batch, arrays, strict=True):
+            row[tuple(slice(size) for size in array.shape)] = array
+        out.append(torch.from_numpy(batch).to(device))
+    return out

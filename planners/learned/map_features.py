@@ -1,4 +1,4 @@
-"""Lanes, connectors and crosswalks around the ego as resampled polylines (planner-plantf.md §2.3).
+"""Lanes, connectors and crosswalks around the ego as resampled polylines.
 
 Everything that does not depend on the ego is made once per map, in the map frame: 21 points on the
 centre line and on either side of every object. A step then selects, moves and turns.
@@ -108,7 +108,7 @@ def _resample_all(lines: Polylines, fallback: Polylines, out: FloatArray) -> Non
 
 @kernel
 def _resample(xy: FloatArray, arc: FloatArray, out: FloatArray) -> None:
-    """Write points equally spaced along a polyline into `out` (21, 2) (planner-plantf.md §2.5)."""
+    """Write points equally spaced along a polyline into `out` (21, 2)."""
     last = len(xy) - 1
     length = arc[last] if arc[last] > 0.0 else 1.0
     for point in range(len(out)):
@@ -131,8 +131,9 @@ def oriented_rectangle(ring: FloatArray) -> FloatArray:
     """(4, 2) corners of the smallest rectangle around a polygon, one side along its convex hull.
 
     The first side lies along the hull's edge. Every edge of a rectangle does equally well, so that
-    the last bit of an area decides which corner comes first: sides are compared in the order of
-    the hull, clockwise from its lowest vertex, and measured from the origin of the map.
+    the last bit of an area decides which corner comes first (nuPlan rule 305): sides are compared
+    in the order of the hull, clockwise from its lowest vertex, and measured from the origin of the
+    map.
 
     Args:
         ring: (V, 2) vertices [m].
@@ -163,17 +164,21 @@ def _clockwise_hull(ring: FloatArray) -> FloatArray:
 
 
 class LightLookup:
-    """Traffic lights by edge; the ids of one scenario are looked up once."""
+    """Traffic lights by edge; the ids of one scenario are looked up once.
 
-    def __init__(self, road: VectorMap) -> None:
-        """`road` is the map of the scenario."""
-        self._road = road
+    Attributes:
+        edges: Those that lights are listed for.
+    """
+
+    def __init__(self, road: VectorMap, default: LightStatus = LightStatus.UNKNOWN) -> None:
+        """Take the map of the scenario, and the status of edges for which no light is listed."""
+        self._road, self._default = road, int(default)
         self._ids: tuple[str, ...] | None = None
-        self._columns = self._edges = np.zeros(0, np.int64)
-        self._status = np.full(len(road.edges), int(LightStatus.UNKNOWN))
+        self._columns = self.edges = np.zeros(0, np.int64)
+        self._status = np.full(len(road.edges), self._default)
 
     def at(self, lights: TrafficLights) -> IntArray:
-        """(E,) status by edge of one row of lights, UNKNOWN where none is listed; not to be kept.
+        """(E,) status by edge of one row of lights; not to be kept.
 
         Ids that the map does not have are left out.
         """
@@ -181,12 +186,12 @@ class LightLookup:
             index = self._road.edges.index
             pairs = [(c, index[i]) for c, i in enumerate(lights.connector_ids) if i in index]
             found = np.array(pairs, np.int64).reshape(-1, 2)
-            self._columns, self._edges = found[:, 0].copy(), found[:, 1].copy()
+            self._columns, self.edges = found[:, 0].copy(), found[:, 1].copy()
             self._ids = lights.connector_ids
-            self._status[:] = LightStatus.UNKNOWN
+            self._status[:] = self._default
         codes = lights.status[0, self._columns].astype(np.int64)
-        codes[codes == LightStatus.ABSENT] = LightStatus.UNKNOWN
-        self._status[self._edges] = codes
+        codes[codes == LightStatus.ABSENT] = self._default
+        self._status[self.edges] = codes
         return self._status
 
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any, TypeAlias
 
 from shiftsim.errors import CheckpointError
-from shiftsim.planners.registry import PLANNERS
+from shiftsim.planners.table import PUBLISHED
 
 Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 
@@ -23,11 +23,6 @@ _CANNOT_BUILD = (  # what args of any content make a network's constructor raise
     TypeError,
     ValueError,
 )
-
-
-def learned_planners() -> tuple[str, ...]:
-    """Names of the planners that need a checkpoint."""
-    return tuple(name for name, entry in PLANNERS.items() if entry.checkpoint is not None)
 
 
 def network_module(planner: str) -> Any:
@@ -63,7 +58,7 @@ def shapes_of(state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 def most_like(shapes: Shapes) -> str:
     """The planner whose network has most of these names and shapes; empty where none has half."""
-    best, name = max((_likeness(shapes, planner), planner) for planner in learned_planners())
+    best, name = max((_likeness(shapes, planner), planner) for planner in PUBLISHED)
     return name if best >= LIKENESS else ""
 
 

@@ -18,9 +18,8 @@ _BEND = (_WINDOW**2 - 2.0) / 7.0
 def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
     """The present state followed by a plan.
 
-    nuPlan: velocities and accelerations are derivatives of history and plan together, taken on the
-    uneven past and on the plan resampled at the last interval of the past; their lateral parts
-    point to the right (planner-plantf.md §4).
+    Velocities and accelerations are derivatives of history and plan together, taken on the uneven
+    past and on the plan resampled at the last interval of the past (nuPlan rule 390).
 
     Args:
         poses: (H, 3) rear axle x [m], y [m], heading [rad] in the map frame, 0.1 s apart, from
@@ -38,14 +37,14 @@ def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
     states[1:, VX : AY + 1] = _motion(history.ego[:, :3], past_s, states[:, :3], times)
     time_us = np.empty(len(states), np.int64)
     time_us[0] = history.time_us[-1]
-    time_us[1:] = times * 1e6  # nuPlan: truncated, a microsecond may be lost
+    time_us[1:] = times * 1e6  # nuPlan rule 391: truncated, a microsecond may be lost
     return Trajectory(time_us, states)
 
 
 def _motion(
     past: FloatArray, past_s: FloatArray, planned: FloatArray, times: FloatArray
 ) -> FloatArray:
-    """(H, 4) velocity and acceleration of a plan, each forward and to the right.
+    """(H, 4) velocity and acceleration of a plan, each forward and to the right (not left).
 
     Args:
         past: (N, 3) poses of the history.
@@ -71,7 +70,7 @@ def _motion(
     cos, sin = np.cos(even[:, HEADING]), np.sin(even[:, HEADING])
     parts = []
     for x, y in (slope.T, bend.T):
-        parts += [x * cos + y * sin, x * sin - y * cos]  # nuPlan: positive to the right
+        parts += [x * cos + y * sin, x * sin - y * cos]  # nuPlan rule 392
     return _interpolate(times, grid, np.stack(parts, axis=1))
 
 

@@ -212,18 +212,10 @@ class _Inert(dict[Any, Any]):
     def __call__(self, *_args: object, **_named: object) -> "_Inert":
         return _Inert()
 
-    def __setstate__(self, _state: object) -> None:
+    def _ignore(self, _anything: object) -> None:
         pass
 
-    def append(self, _item: object) -> None:
-        """Forget it."""
-
-    def extend(self, _items: object) -> None:
-        """Forget them."""
-
-    def add(self, _item: object) -> None:
-        """Forget it."""
-
+    __setstate__ = append = extend = add = _ignore
     __hash__ = object.__hash__  # type: ignore[assignment]  # keys of a dict must be hashable
     __eq__ = object.__eq__
 

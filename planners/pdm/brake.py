@@ -1,9 +1,9 @@
-"""The emergency brake of PDM-Closed (pdm-closed.md §9)."""
+"""The emergency brake of PDM-Closed."""
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.planners.pdm.parameters import DT, STEPS
+from shiftsim.planners.proposals.tracker import DT, STEPS
 from shiftsim.world.state import (
     AX,
     HEADING,
@@ -23,7 +23,7 @@ def brake_speed(ego: FloatArray, vehicle: VehicleParameters) -> float:
     speed = float(ego[VX])
     if speed > STOPPED:
         return 1.1 * (speed + float(np.clip(-10.0 * speed, MIN_ACCEL, MAX_ACCEL)))
-    # nuPlan: the centre's acceleration without the angular term
+    # nuPlan rule 194: the centre's acceleration without the angular term
     accel = float(ego[AX]) + vehicle.rear_axle_to_center * float(ego[YAW_RATE]) ** 2
     return float(np.clip(-4.0 * speed - accel, MIN_ACCEL, MAX_ACCEL))
 

@@ -1,4 +1,4 @@
-"""What PDM-Closed sees, and where it will be: boxes moved along their axes, red lights (§5)."""
+"""What PDM-Closed sees, and where it will be: boxes moved along their axes, red lights."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,41 +6,35 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.rings import convex_intersect
-from shiftsim.planners.pdm.parameters import STEPS, PdmParameters
+from shiftsim.geometry.rings import centroid
+from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks
+from shiftsim.planners.proposals.contacts import Others, touches_boxes
+from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
 
 LIGHT_TOKEN = "red_light_"
-NUM_FORECASTS = STEPS // 2 + 1  # nuPlan: every other time index has its own map (§11 Q4)
+NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a map of its own
 
 
-class Occupants(NamedTuple):
-    """Boxes around the ego on every forecast map, and red lights. B boxes, M = B + lights.
+class Forecast(NamedTuple):
+    """Tracks around the ego on every forecast map, and red lights. B boxes, M = B + lights.
 
     Attributes:
-        boxes: (41, B, 4, 2) corners [m].
-        centers: (41, B, 2) centres of the boxes [m].
-        radii: (B,) half diagonals [m].
+        others: The boxes on 41 maps; what the ego has touched before is ignored.
         moves: (B,) whether a box changes from map to map.
         headings: (B,) of the box [rad].
-        speeds: (B,) 0 for static objects [m/s].
-        kinds: (B,) AgentKind codes.
-        ignored: (M,) whether the ego has touched it before.
+        ignored: (M,) whether the ego has touched it before; the first B are those of `others`.
         light_xy: (V, 2) vertices of the red connectors, not closed [m].
         light_ptr: (lights + 1,) first vertex of each.
     """
 
-    boxes: FloatArray
-    centers: FloatArray
-    radii: FloatArray
+    others: Others
     moves: BoolArray
     headings: FloatArray
-    speeds: FloatArray
-    kinds: IntArray
     ignored: BoolArray
     light_xy: FloatArray
     light_ptr: IntArray
@@ -49,7 +43,7 @@ class Occupants(NamedTuple):
 def select_tracks(
     tracks: Tracks, x: float, y: float, collided: set[str], params: PdmParameters
 ) -> IntArray:
-    """Tracks of the last row that are seen from the ego centre, in nuPlan's order (§5.1, §5.3)."""
+    """Tracks of the last row that are seen from the ego centre, in nuPlan's order."""
     poses = tracks.poses[-1]
     distance = np.hypot(poses[:, 0] - x, poses[:, 1] - y)
     seen = tracks.valid[-1] & ~(distance > params.map_radius)
@@ -67,126 +61,101 @@ def select_tracks(
     parts = []
     for members, most in groups:
         group = near[members]
-        # nuPlan: NumPy's default sort, which is not stable (pdm-closed.md §12)
+        # nuPlan rule 189: NumPy's default sort, which is not stable
         parts.append(group[np.argsort(distance[group])[:most]])
     return np.concatenate(parts)
 
 
-def make_occupants(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray]) -> Occupants:
-    """Occupants from tracks of the last row and rings (V, 2) of red connectors; none ignored."""
-    kinds = tracks.kinds[chosen]
+def make_forecast(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray]) -> Forecast:
+    """From tracks of the last row and rings (V, 2) of red connectors; none ignored."""
     count = len(chosen)
-    made = Occupants(
-        np.empty((NUM_FORECASTS, count, 4, 2)),
-        np.empty((NUM_FORECASTS, count, 2)),
-        np.empty(count),
+    shape = (NUM_FORECASTS, count)
+    ignored = np.zeros(count + len(lights), np.bool_)
+    is_agent = tracks.kinds[chosen] <= LAST_AGENT_KIND
+    others = Others(
+        boxes=np.empty((*shape, 4, 2)),
+        centers=np.empty((*shape, 2)),
+        centroids=np.empty((*shape, 2)),
+        speeds=np.empty(shape),
+        radii=np.empty(count),
+        is_agent=is_agent,
+        ignored=ignored[:count],
+    )
+    poses = tracks.poses[-1, chosen]
+    made = Forecast(
+        others,
         np.empty(count, np.bool_),
-        np.empty(count),
-        np.empty(count),
-        kinds,
-        np.zeros(count + len(lights), np.bool_),
+        np.ascontiguousarray(poses[:, 2]),
+        ignored,
         np.concatenate([np.zeros((0, 2)), *lights]),
         np.cumsum([0, *(len(ring) for ring in lights)]),
     )
-    _forecast(
-        tracks.poses[-1, chosen], tracks.velocities[-1, chosen], tracks.sizes[-1, chosen], made
-    )
+    _forecast(poses, tracks.velocities[-1, chosen], tracks.sizes[-1, chosen], made)
     return made
 
 
 @lean_kernel
-def _forecast(poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out: Occupants) -> None:
+def _forecast(poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out: Forecast) -> None:
     """Fill in the boxes of all forecast maps."""
+    others = out.others
     for index in range(len(poses)):
         heading, vx, vy = poses[index, 2], velocities[index, 0], velocities[index, 1]
-        speed = np.hypot(vx, vy) if out.kinds[index] <= LAST_AGENT_KIND else 0.0
-        # nuPlan: boxes move along their own axis with the full speed (pdm-closed.md §11 Q9)
+        speed = np.hypot(vx, vy) if others.is_agent[index] else 0.0
+        # nuPlan rule 186: boxes move along their own axis with the full speed
         is_forward = abs(wrap_angle(heading - np.arctan2(vy, vx))) < np.pi / 2.0
         course = heading if is_forward else heading + np.pi
         step_x, step_y = speed * np.cos(course), speed * np.sin(course)
-        out.radii[index] = 0.5 * np.hypot(sizes[index, 0], sizes[index, 1])
+        others.radii[index] = 0.5 * np.hypot(sizes[index, 0], sizes[index, 1])
         out.moves[index] = step_x != 0.0 or step_y != 0.0
-        out.headings[index], out.speeds[index] = heading, speed
-        x, y, box = poses[index, 0], poses[index, 1], out.boxes[0, index]
+        x, y, box = poses[index, 0], poses[index, 1], others.boxes[0, index]
         box_corners(x, y, heading, sizes[index, 0], sizes[index, 1], box)
         for forecast in range(NUM_FORECASTS):
             seconds = 0.1 * (2 * forecast)
-            out.centers[forecast, index, 0] = x + seconds * step_x
-            out.centers[forecast, index, 1] = y + seconds * step_y
+            others.speeds[forecast, index] = speed
+            others.centers[forecast, index, 0] = x + seconds * step_x
+            others.centers[forecast, index, 1] = y + seconds * step_y
+            ring = others.boxes[forecast, index]
             for corner in range(4):
-                out.boxes[forecast, index, corner, 0] = box[corner, 0] + seconds * step_x
-                out.boxes[forecast, index, corner, 1] = box[corner, 1] + seconds * step_y
+                ring[corner, 0] = box[corner, 0] + seconds * step_x
+                ring[corner, 1] = box[corner, 1] + seconds * step_y
+            # nuPlan rule 187: bearings and progress are those of the ring's centroid
+            middle = centroid(ring)
+            others.centroids[forecast, index, 0] = middle[0]
+            others.centroids[forecast, index, 1] = middle[1]
 
 
-def touched(occupants: Occupants, footprint: FloatArray) -> list[int]:
-    """Occupants to ignore from now on: those that touch the ego (4, 2), in nuPlan's order (§5.5).
+def touched(forecast: Forecast, footprint: FloatArray) -> list[int]:
+    """What to ignore from now on: what touches the ego (4, 2), in nuPlan's order.
 
     A red light counts only once the ego is entirely on its connector.
     """
-    chosen = np.flatnonzero(touches_boxes(footprint, occupants.boxes[0])).tolist()
-    count = len(occupants.kinds)
-    lights = range(count, len(occupants.ignored))
+    boxes = forecast.others.boxes[0]
+    chosen = np.flatnonzero(touches_boxes(footprint, boxes)).tolist()
+    lights = range(len(boxes), len(forecast.ignored))
     if lights:
         ego = shapely.Polygon(footprint)
-        chosen += [i for i in lights if ego.within(shapely.Polygon(ring_of(occupants, i)))]
+        chosen += [i for i in lights if ego.within(shapely.Polygon(ring_of(forecast, i)))]
     if len(chosen) > 1:
-        ranks = forecast_ranks(occupants, 0)
+        ranks = forecast_ranks(forecast, 0)
         chosen.sort(key=lambda i: int(ranks[i]))
     return chosen
 
 
-@kernel
-def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
-    """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
-    out = np.zeros(len(boxes), np.bool_)
-    for index in range(len(boxes)):
-        dx = boxes[index, 0, 0] + boxes[index, 2, 0] - footprint[0, 0] - footprint[2, 0]
-        dy = boxes[index, 0, 1] + boxes[index, 2, 1] - footprint[0, 1] - footprint[2, 1]
-        reach = _diagonal(footprint) + _diagonal(boxes[index])
-        if dx * dx + dy * dy <= 1.001 * reach * reach:
-            out[index] = convex_intersect(boxes[index], footprint)
-    return out
+def ring_of(forecast: Forecast, index: int, row: int = 0) -> FloatArray:
+    """(V, 2) ring of one of the boxes or lights on a forecast map [m]."""
+    boxes = forecast.others.boxes[row]
+    if index < len(boxes):
+        return boxes[index]
+    light = index - len(boxes)
+    return forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
 
 
-@lean_kernel
-def _diagonal(box: FloatArray) -> float:
-    return np.hypot(box[0, 0] - box[2, 0], box[0, 1] - box[2, 1])
-
-
-def ring_of(occupants: Occupants, index: int, forecast: int = 0) -> FloatArray:
-    """(V, 2) ring of one occupant on a forecast map [m]."""
-    count = len(occupants.kinds)
-    if index < count:
-        return occupants.boxes[forecast, index]
-    light = index - count
-    return occupants.light_xy[occupants.light_ptr[light] : occupants.light_ptr[light + 1]]
-
-
-def forecast_ranks(occupants: Occupants, forecast: int) -> IntArray:
-    """(M,) place of each occupant among the results of nuPlan's index of one forecast map."""
-    boxes = occupants.boxes[forecast]
+def forecast_ranks(forecast: Forecast, row: int) -> IntArray:
+    """(M,) place of each box and light among the results of nuPlan's index of a forecast map."""
+    boxes = forecast.others.boxes[row]
     bounds = np.hstack([boxes.min(axis=1), boxes.max(axis=1)])
-    if len(occupants.light_ptr) > 1:
-        starts, xy = occupants.light_ptr[:-1], occupants.light_xy
+    if len(forecast.light_ptr) > 1:
+        starts, xy = forecast.light_ptr[:-1], forecast.light_xy
         lights = np.hstack([np.minimum.reduceat(xy, starts), np.maximum.reduceat(xy, starts)])
         bounds = np.concatenate([bounds, lights])
     return index_ranks(bounds)
-
-
-@lean_kernel
-def centroid(ring: FloatArray) -> tuple[float, float]:
-    """Centroid of the area of a ring (V, 2) [m].
-
-    nuPlan: triangles from the first vertex, coordinates not reduced first, so that far from the
-    origin the last bits are those of its geometry library (pdm-closed.md §11 Q23).
-    """
-    area = x = y = 0.0
-    ox, oy = ring[0, 0], ring[0, 1]
-    for index in range(len(ring)):
-        after = index + 1 if index + 1 < len(ring) else 0
-        ax, ay, bx, by = ring[index, 0], ring[index, 1], ring[after, 0], ring[after, 1]
-        double = (ax - ox) * (by - oy) - (bx - ox) * (ay - oy)
-        x += double * (ox + ax + bx)
-        y += double * (oy + ay + by)
-        area += double
-    return x / 3.0 / area, y / 3.0 / area

@@ -1,4 +1,4 @@
-"""Numbers of PDM-Closed (pdm-closed.md §1). Defaults are those of the official configuration."""
+"""Numbers of PDM-Closed. Defaults are those of the official configuration."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -6,13 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.errors import ConfigError
-
-DT = 0.1  # s, between the states of a plan
-STEP_US = 100_000
-STEPS = 80  # of the plan
-SCORED = 40  # of a proposal, as far as proposals are compared
-EGO_STOPPED = TRACK_STOPPED = 5e-2  # m/s
-TTC_STOPPED = 5e-3  # m/s
+from shiftsim.planners.proposals.comfort import ComfortBounds
 
 
 class FollowingModel(NamedTuple):
@@ -30,19 +24,7 @@ class FollowingModel(NamedTuple):
     headway: float = 1.5
     accel_max: float = 1.5
     decel_max: float = 3.0
-    exponent: float = 10.0  # nuPlan's own IDM uses 4 (pdm-closed.md §11 Q1)
-
-
-class ComfortBounds(NamedTuple):
-    """Open intervals of the comfort test; the last four are symmetric."""
-
-    lon_accel_min: float = -4.05  # m/s^2
-    lon_accel_max: float = 2.40  # m/s^2
-    lat_accel: float = 4.89  # m/s^2
-    jerk: float = 8.37  # m/s^3
-    lon_jerk: float = 4.13  # m/s^3
-    yaw_accel: float = 1.93  # rad/s^2
-    yaw_rate: float = 0.95  # rad/s
+    exponent: float = 10.0  # nuPlan rule 182: its own IDM uses 4
 
 
 @dataclass(frozen=True, slots=True)

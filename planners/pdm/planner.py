@@ -1,72 +1,61 @@
 """PDM-Closed: the strongest rule-based planner of the nuPlan challenge, with the same numbers.
 
 It drives 15 proposals along the centerline of the route and two paths beside it, simulates each,
-scores them, and returns the best one, or an emergency brake (pdm-closed.md). Here the state that
-survives from step to step is kept; everything else is in the `pdm_*` modules.
+scores them, and returns the best one, or an emergency brake. Here is what survives from step to
+step.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.paths import Path, make_path
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
-    Occupants,
-    make_occupants,
+    Forecast,
+    make_forecast,
     select_tracks,
     touched,
 )
-from shiftsim.planners.pdm.parameters import STEP_US, STEPS, FollowingModel, PdmParameters
-from shiftsim.planners.pdm.path import PdmPath, make_path, offset_poses
-from shiftsim.planners.pdm.route import centerline, follow_route, lane_off_road, nearest_vertex
-from shiftsim.planners.pdm.scorer import Road
+from shiftsim.planners.pdm.parameters import FollowingModel, PdmParameters
+from shiftsim.planners.pdm.rollout import Scene
+from shiftsim.planners.pdm.route import (
+    Route,
+    centerline,
+    current_lane,
+    follow_route,
+    offset_poses,
+    start_route,
+)
+from shiftsim.planners.pdm.scorer import Place
 from shiftsim.planners.pdm.step import Step, plan_step
-from shiftsim.planners.proposals.areas import Areas, admit, covering, index_ranks, make_areas
-from shiftsim.planners.route_correction import Start, correct_route, find_start, known_blocks
+from shiftsim.planners.proposals.areas import select_areas
+from shiftsim.planners.proposals.contacts import ego_box
+from shiftsim.planners.proposals.tracker import STEP_US, STEPS
+from shiftsim.planners.routes.correction import known_blocks
+from shiftsim.planners.routes.lanes import red_lanes
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import NUM_STATE, LightStatus, Trajectory
-
-START_HALF_WIDTH = 1.0  # m, of the square around the rear axle that is searched for the start
-MAX_COVERING = 64  # areas over one point
+from shiftsim.world.state import NUM_STATE, Trajectory
 
 
-@dataclass(frozen=True, slots=True)
-class Route:
-    """What PDM-Closed decides once per scenario.
-
-    Attributes:
-        start: Where it begins.
-        corrected: Blocks of the corrected route.
-        lanes: Lanes and connectors of these blocks, in order.
-        areas: The drivable areas of the map, those of the route marked.
-    """
-
-    start: Start
-    corrected: list[int]
-    lanes: IntArray
-    areas: Areas
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
+class Seen(NamedTuple):
     """What one step was planned from.
 
     Attributes:
-        occupants: What is around.
-        tokens: Of the occupants, red lights included.
-        road: The map of the step.
+        forecast: What is around.
+        tokens: Of the tracks, then of the red lights.
+        place: The map of the step.
         lane: The current lane.
     """
 
-    occupants: Occupants
+    forecast: Forecast
     tokens: list[str]
-    road: Road
+    place: Place
     lane: int
 
 
@@ -108,7 +97,7 @@ class PdmClosed:
             map_radius=map_radius,
         )
         self._scene: SceneInfo | None = None
-        self._paths: list[PdmPath] = []
+        self._paths: list[Path] = []
         self.collided: list[str] = []
         self.route: Route | None = None
         self.centerline: FloatArray | None = None
@@ -126,7 +115,7 @@ class PdmClosed:
         self.route = self.centerline = self.seen = None
 
     def plan(self, observation: Observation) -> Trajectory:
-        """81 poses, 0.1 s apart, without speeds (pdm-closed.md §10)."""
+        """81 poses, 0.1 s apart, without speeds."""
         states = np.zeros((STEPS + 1, NUM_STATE))
         states[:, :3] = self.step(observation).poses
         return Trajectory(observation.time_us + STEP_US * np.arange(STEPS + 1), states)
@@ -141,120 +130,42 @@ class PdmClosed:
         if self.route is None:
             self.route = start_route(scene.map, scene.route, ego, scene.token)
         route = self.route
-        admitted = admit(scene.map, route.areas, center[0], center[1], params.map_radius)
-        size = (vehicle.length, vehicle.width)
-        lane = current_lane(scene.map, route, admitted, ego, center, size)
+        selected = select_areas(scene.map, center[0], center[1], params.map_radius)
+        size = ego_box(vehicle)
+        lane = current_lane(scene.map, route, selected, ego, center, size)
         if not self._paths:
             self._follow(scene.map, route, lane)
-        tracks = observation.history.tracks
-        chosen = select_tracks(tracks, center[0], center[1], set(self.collided), params)
-        lights = self._red_lights(scene.map, route, observation)
-        edges = scene.map.edges
-        occupants = make_occupants(tracks, chosen, [edges.rings(i)[0] for i in lights])
-        tokens = [tracks.tokens[i] for i in chosen.tolist()]
-        tokens += [LIGHT_TOKEN + edges.ids[i] for i in lights]
-        footprint = boxes_to_corners(center, np.array(size))
-        self.collided += [tokens[i] for i in touched(occupants, footprint)]
+        forecast, tokens = self._forecast(scene.map, route, observation)
+        footprint = boxes_to_corners(center, np.array([size.length, size.width]))
+        self.collided += [tokens[i] for i in touched(forecast, footprint)]
         if self.collided:
-            occupants.ignored[:] = [token in self.collided for token in tokens]
+            forecast.ignored[:] = [token in self.collided for token in tokens]
         limit = float(scene.map.speed_limits[lane])
         limit = params.fallback_velocity if np.isnan(limit) else limit
-        road = Road(route.areas, admitted, scene.map.intersections.polygons, self._paths[0])
-        self.seen = Seen(occupants, tokens, road, lane)
-        return plan_step(
-            ego,
-            limit * np.array(params.speed_fractions),
-            self._paths,
-            occupants,
-            road,
-            vehicle,
-            params,
-        )
+        place = Place(route.areas, selected, scene.map.intersections.polygons, self._paths[0])
+        self.seen = Seen(forecast, tokens, place, lane)
+        targets = limit * np.array(params.speed_fractions)
+        around = Scene(self._paths, forecast, size, params.following)
+        return plan_step(ego, targets, around, place, vehicle, params)
+
+    def _forecast(
+        self, road: VectorMap, route: Route, observation: Observation
+    ) -> tuple[Forecast, list[str]]:
+        """What is around, and the tokens of tracks and red lights."""
+        tracks, center = observation.history.tracks, observation.ego.center
+        chosen = select_tracks(tracks, center[0], center[1], set(self.collided), self.parameters)
+        red = red_lanes(road, observation.traffic_lights)
+        red = [lane for lane in red if route.areas.on_route[lane]]
+        tokens = [tracks.tokens[i] for i in chosen.tolist()]
+        tokens += [LIGHT_TOKEN + road.edges.ids[i] for i in red]
+        return make_forecast(tracks, chosen, [road.edges.rings(i)[0] for i in red]), tokens
 
     def _follow(self, road: VectorMap, route: Route, lane: int) -> None:
         """Lay the centerline and the paths beside it, once per scenario."""
-        line = centerline(road, follow_route(road, route.corrected, lane).edges)
+        line = centerline(road, follow_route(road, route.corrected, lane).path)
         self.centerline = line
         offsets = self.parameters.lateral_offsets
         self._paths = [make_path(line), *(make_path(offset_poses(line, by)) for by in offsets)]
-
-    def _red_lights(self, road: VectorMap, route: Route, observation: Observation) -> list[int]:
-        """Connectors of the route whose light is red."""
-        red = [n for n, s in observation.traffic_lights.items() if s == LightStatus.RED]
-        edges = [road.edges.index.get(name, -1) for name in red]
-        return [edge for edge in edges if edge >= 0 and route.areas.on_route[edge]]
-
-
-def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
-    """Correct a route at the start of a scenario (pdm-closed.md §3).
-
-    Args:
-        road: The map.
-        ids: Roadblock ids of the route.
-        ego: (11,) ego state.
-        token: Id of the scenario, for messages.
-
-    Raises:
-        PlannerError: The route is empty, unknown to the map, or has no lanes.
-    """
-    blocks = known_blocks(road, ids, token, PdmClosed.name)
-    square = square_around(float(ego[0]), float(ego[1]), START_HALF_WIDTH)
-    start = find_start(road, blocks, ego[:3], square)
-    corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
-    lanes = [edge for block in corrected for edge in road.block_edges.at(block).tolist()]
-    if not lanes:
-        raise PlannerError(
-            f"pdm-closed: the route of scenario {token!r} has no lanes",
-            hint="correct the route of the scenario, or leave it out",
-        )
-    return Route(start, corrected, np.array(lanes), make_areas(road, lanes))
-
-
-def current_lane(
-    road: VectorMap,
-    route: Route,
-    admitted: IntArray,
-    ego: FloatArray,
-    center: FloatArray,
-    size: tuple[float, float],
-) -> int:
-    """The lane of the route that the ego is on (pdm-closed.md §4.1).
-
-    Args:
-        road: The map.
-        route: The corrected route.
-        admitted: Drivable areas of this step.
-        ego: (11,) ego state.
-        center: (3,) its centre x [m], y [m], heading [rad].
-        size: Its length and width [m].
-    """
-    areas, errors = lanes_at(road, route, admitted, ego)
-    if not areas:
-        return int(lane_off_road(road.edges.polygons, route.lanes, center, *size))
-    least = min(errors)
-    tied = [area for area, error in zip(areas, errors, strict=True) if error == least]
-    if len(tied) > 1:
-        tied = in_index_order(route, admitted, tied)
-    return int(route.areas.edge[tied[0]])
-
-
-def lanes_at(
-    road: VectorMap, route: Route, admitted: IntArray, ego: FloatArray
-) -> tuple[list[int], list[float]]:
-    """Areas of the route under the rear axle, and their heading errors [rad]."""
-    found = np.empty(MAX_COVERING, np.int64)
-    areas, x, y = route.areas, float(ego[0]), float(ego[1])
-    under = found[: covering(areas, admitted, x, y, found)].tolist()
-    under = [area for area in under if areas.on_route[area]]
-    lines, heading = road.baselines, float(ego[2])
-    return under, [nearest_vertex(lines, int(areas.edge[a]), x, y, heading)[1] for a in under]
-
-
-def in_index_order(route: Route, admitted: IntArray, chosen: list[int]) -> list[int]:
-    """Some of the admitted areas, in the order in which nuPlan's spatial index yields them."""
-    ranks = index_ranks(route.areas.polygons.bounds[admitted])
-    rank_of = dict(zip(admitted.tolist(), ranks.tolist(), strict=True))
-    return sorted(chosen, key=rank_of.__getitem__)
 
 
 def _floats(name: str, value: Sequence[float] | str) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Proposals of PDM-Closed: every path driven by every target speed, behind what is ahead (§6, §10).
+"""Proposals of PDM-Closed: every path driven by every target speed, behind what is ahead.
 
 Array axes: L paths, F target speeds, 81 time indices.
 """
@@ -9,143 +9,143 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import box_corners
+from shiftsim.geometry.boxes import box_corners, circle_around
+from shiftsim.geometry.corridors import HIT
 from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.paths import Path, pose_at, project
 from shiftsim.geometry.rings import ring_distance
-from shiftsim.planners.idm.corridor import HIT
 from shiftsim.planners.pdm.corridor import Corridor, fill_corridor, make_corridor
-from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Occupants, forecast_ranks
-from shiftsim.planners.pdm.parameters import DT, SCORED, STEPS, FollowingModel
-from shiftsim.planners.pdm.path import PdmPath, interpolate, project
-from shiftsim.planners.pdm.route import box_to_ring
-from shiftsim.world.state import VX, VehicleParameters
+from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks
+from shiftsim.planners.pdm.parameters import FollowingModel
+from shiftsim.planners.proposals.contacts import EgoBox
+from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS
+from shiftsim.world.state import VX
 
-DONE = -1
+MIN_PROGRESS = 1e-5  # m, nuPlan rule 190: keeps clear of a duplicate vertex at the very start
+_DONE = -1
+_NOBODY, _TIED = -1, -2  # instead of what is nearest
 
 
-class Proposals(NamedTuple):
-    """Rear-axle poses, motion along the path, and leads; zeros where not rolled out yet.
+class Scene(NamedTuple):
+    """What proposals are rolled out in.
 
     Attributes:
-        poses: (L, F, 81, 3) x [m], y [m], heading [rad].
-        motion: (L, F, 81, 2) progress [m], speed [m/s].
-        leads: (L, F, 81, 3) progress [m], speed [m/s], rear length [m].
-        targets: (F,) target speeds [m/s].
-        corridors: One per path.
+        paths: The centerline and those beside it.
+        forecast: What is around.
+        size: Of the ego.
+        model: The longitudinal policy.
     """
 
+    paths: Sequence[Path]
+    forecast: Forecast
+    size: EgoBox
+    model: FollowingModel
+
+
+class Rows(NamedTuple):
+    """Policies of one path; zeros where not rolled out yet.
+
+    Attributes:
+        targets: (F,) target speeds [m/s].
+        poses: (F, 81, 3) x [m], y [m], heading [rad].
+        motion: (F, 81, 2) progress [m], speed [m/s].
+        leads: (F, 81, 3) progress [m], speed [m/s], rear length [m].
+    """
+
+    targets: FloatArray
     poses: FloatArray
     motion: FloatArray
     leads: FloatArray
+
+
+class Proposals(NamedTuple):
+    """Rear-axle poses, motion along the path, and leads, as in `Rows`, of all paths.
+
+    Attributes:
+        targets: (F,) target speeds [m/s].
+        poses: (L, F, 81, 3)
+        motion: (L, F, 81, 2)
+        leads: (L, F, 81, 3)
+        corridors: One per path.
+    """
+
     targets: FloatArray
+    poses: FloatArray
+    motion: FloatArray
+    leads: FloatArray
     corridors: tuple[Corridor, ...]
 
+    def rows(self, path: int, chosen: slice = slice(None)) -> Rows:
+        """Some of the policies of a path."""
+        arrays = (self.poses, self.motion, self.leads)
+        return Rows(self.targets[chosen], *(array[path, chosen] for array in arrays))
 
-def start_proposals(
-    paths: Sequence[PdmPath],
-    ego: FloatArray,
-    targets: FloatArray,
-    vehicle: VehicleParameters,
-    num_occupants: int,
-) -> Proposals:
+
+def start_proposals(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
     """Proposals at time index 0: on the paths, beside the ego (11,)."""
-    shape = (len(paths), len(targets), STEPS + 1)
-    made = Proposals(
-        np.zeros((*shape, 3)), np.zeros((*shape, 2)), np.zeros((*shape, 3)), targets, ()
-    )
+    shape = (len(scene.paths), len(targets), STEPS + 1)
+    poses, motion = np.zeros((*shape, 3)), np.zeros((*shape, 2))
     reach = STEPS * DT * abs(float(targets.max()))
+    half_width, count = 0.5 * scene.size.width, len(scene.forecast.ignored)
     corridors = []
-    pose = np.empty(3)
-    for index, path in enumerate(paths):
+    for index, path in enumerate(scene.paths):
         progress = project(path, ego[0], ego[1], 0)[0]
-        interpolate(path, progress, pose)
-        made.poses[index, :, 0] = pose
-        made.motion[index, :, 0] = progress, ego[VX]
-        corridors.append(
-            make_corridor(progress, progress + reach, 0.5 * vehicle.width, num_occupants)
-        )
-    return made._replace(corridors=tuple(corridors))
+        read_pose(path, progress, poses[index, 0, 0])
+        poses[index, :, 0] = poses[index, 0, 0]
+        motion[index, :, 0] = progress, ego[VX]
+        corridors.append(make_corridor(progress, progress + reach, half_width, count))
+    return Proposals(targets, poses, motion, np.zeros((*shape, 3)), tuple(corridors))
 
 
-def roll_out(
-    proposals: Proposals,
-    paths: Sequence[PdmPath],
-    occupants: Occupants,
-    vehicle: VehicleParameters,
-    model: FollowingModel,
-) -> None:
+def roll_out(proposals: Proposals, scene: Scene) -> None:
     """Fill time indices 1 … 40 of all proposals."""
-    for index in range(len(paths)):
-        _roll_path(
-            proposals, index, slice(None), 1, SCORED, paths[index], occupants, vehicle, model
-        )
+    for index in range(len(scene.paths)):
+        _roll_path(proposals, scene, index, proposals.rows(index), range(1, SCORED + 1))
 
 
-def extend(
-    proposals: Proposals,
-    best: int,
-    paths: Sequence[PdmPath],
-    occupants: Occupants,
-    vehicle: VehicleParameters,
-    model: FollowingModel,
-) -> FloatArray:
+def extend(proposals: Proposals, scene: Scene, best: int) -> FloatArray:
     """Fill time indices 41 … 80 of the proposal numbered `best`; its poses (81, 3)."""
     index, speed = divmod(best, len(proposals.targets))
-    chosen = slice(speed, speed + 1)
-    path = paths[index]
-    _roll_path(proposals, index, chosen, SCORED + 1, STEPS, path, occupants, vehicle, model)
+    chosen = proposals.rows(index, slice(speed, speed + 1))
+    _roll_path(proposals, scene, index, chosen, range(SCORED + 1, STEPS + 1))
     return proposals.poses[index, speed]
 
 
-def _roll_path(
-    proposals: Proposals,
-    index: int,
-    chosen: slice,
-    first: int,
-    last: int,
-    path: PdmPath,
-    occupants: Occupants,
-    vehicle: VehicleParameters,
-    model: FollowingModel,
-) -> None:
-    corridor = proposals.corridors[index]
-    fill_corridor(path, corridor, occupants, (first + 1) // 2, last // 2 + 1)
-    ranks = np.full((NUM_FORECASTS, len(occupants.ignored)), -1)
-    step = first
+def _roll_path(proposals: Proposals, scene: Scene, index: int, rows: Rows, steps: range) -> None:
+    path, corridor, forecast = scene.paths[index], proposals.corridors[index], scene.forecast
+    last = steps[-1]
+    fill_corridor(path, corridor, forecast, (steps[0] + 1) // 2, last // 2 + 1)
+    ranks = np.full((NUM_FORECASTS, len(forecast.ignored)), -1)
+    step = steps[0]
     while True:
-        step = _roll(
-            step,
-            last,
-            path,
-            corridor,
-            occupants,
-            ranks,
-            (vehicle.length, vehicle.width, vehicle.rear_axle_to_center),
-            model,
-            proposals.targets[chosen],
-            proposals.poses[index, chosen],
-            proposals.motion[index, chosen],
-            proposals.leads[index, chosen],
-        )
-        if step == DONE:
+        step = _roll(step, last, path, corridor, forecast, ranks, scene.size, scene.model, rows)
+        if step == _DONE:
             return
-        ranks[step // 2] = forecast_ranks(occupants, step // 2)
+        ranks[step // 2] = forecast_ranks(forecast, step // 2)
+
+
+@lean_kernel
+def read_pose(path: Path, progress: float, out: FloatArray) -> None:
+    """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN."""
+    if progress != progress:
+        # nuPlan rule 191: a speed limit of 0 makes progress undefined
+        out[0], out[1], out[2] = 0.0, 0.0, 0.0
+        return
+    out[0], out[1], turn = pose_at(path, max(progress, MIN_PROGRESS))
+    out[2] = np.arctan2(np.sin(turn), np.cos(turn))
 
 
 @kernel
 def _roll(
     first: int,
     last: int,
-    path: PdmPath,
+    path: Path,
     corridor: Corridor,
-    occupants: Occupants,
+    forecast: Forecast,
     ranks: IntArray,
-    size: tuple[float, float, float],
+    size: EgoBox,
     model: FollowingModel,
-    targets: FloatArray,
-    poses: FloatArray,
-    motion: FloatArray,
-    leads: FloatArray,
+    rows: Rows,
 ) -> int:
     """Roll the policies of one path on, from time index `first` to `last`.
 
@@ -154,114 +154,91 @@ def _roll(
         last: Last time index to fill.
         path: The path.
         corridor: What stands in its way.
-        occupants: The polygons.
-        ranks: (41, M) order of the occupants on a forecast map, -1 where not known.
-        size: Length and width of the ego, rear axle to centre [m].
+        forecast: What is around.
+        ranks: (41, M) order of what is around on a forecast map, -1 where not known.
+        size: Of the ego.
         model: The longitudinal policy.
-        targets: (F,) target speeds [m/s].
-        poses: (F, 81, 3) as in `Proposals`.
-        motion: (F, 81, 2) as in `Proposals`.
-        leads: (F, 81, 3) as in `Proposals`.
+        rows: The policies.
 
     Returns:
-        DONE, or the time index whose ranks are needed to break a tie.
+        _DONE, or the time index whose ranks are needed to break a tie.
     """
     footprint = np.empty((4, 2))
-    sides, centroids = corridor.sides, corridor.progress
-    ignored, headings, speeds = occupants.ignored, occupants.headings, occupants.speeds
-    hits = np.empty(len(ignored), np.int64)
-    num_boxes = len(speeds)
+    hits = np.empty(len(forecast.ignored), np.int64)
+    num_boxes = len(forecast.headings)
     for step in range(first, last + 1):
-        forecast = step // 2
+        row = step // 2
         num_hits = 0
-        for index in range(len(ignored)):
-            if sides[forecast, index] == HIT and not ignored[index]:
+        for index in range(len(hits)):
+            if corridor.sides[row, index] == HIT and not forecast.ignored[index]:
                 hits[num_hits] = index
                 num_hits += 1
-        # nuPlan: one lead for all policies of a path, cleared once per time index; what a policy
-        # does not overwrite it inherits from the one before (pdm-closed.md §11 Q2)
+        # nuPlan rule 192: one lead for all policies of a path, cleared once per time index; what a
+        # policy does not overwrite it inherits from the one before
         lead_speed, rear = 0.0, 0.0
-        for policy in range(len(targets)):
-            progress, speed = motion[policy, step - 1, 0], motion[policy, step - 1, 1]
-            pose, lead = poses[policy, step - 1], leads[policy, step]
+        for policy in range(len(rows.targets)):
+            before, pose = rows.motion[policy, step - 1], rows.poses[policy, step - 1]
+            progress, lead = before[0], rows.leads[policy, step]
             if step % 2 == 1:
-                for column in range(3):  # nuPlan: at index 1 these are zeros (§11 Q3)
-                    lead[column] = leads[policy, step - 1, column]
+                for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
+                    lead[column] = rows.leads[policy, step - 1, column]
             else:
-                x = pose[0] + size[2] * np.cos(pose[2])
-                y = pose[1] + size[2] * np.sin(pose[2])
+                x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
+                y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
                 lead[0] = path.progress[-1]
-                if _any_ahead(hits[:num_hits], centroids[forecast], progress):
-                    box_corners(x, y, pose[2], size[0], size[1], footprint)
-                    found, distance = _nearest(
-                        hits[:num_hits],
-                        centroids[forecast],
-                        progress,
-                        footprint,
-                        occupants.boxes[forecast],
-                        occupants.centers[forecast],
-                        occupants.radii,
-                        occupants.light_xy,
-                        occupants.light_ptr,
-                        ranks[forecast],
-                    )
-                    if found < 0:
-                        return step
+                box_corners(x, y, pose[2], size.length, size.width, footprint)
+                found, distance = _nearest(
+                    hits[:num_hits],
+                    corridor.progress[row],
+                    progress,
+                    footprint,
+                    forecast,
+                    row,
+                    ranks[row],
+                )
+                if found == _TIED:
+                    return step
+                if found == _NOBODY:
+                    rear = 0.5 * size.length
+                else:
                     lead[0] = progress + distance
                     if found < num_boxes:
-                        turn = wrap_angle(headings[found] - pose[2])
-                        lead_speed = speeds[found] * np.cos(turn)
-                else:
-                    rear = 0.5 * size[0]
+                        turn = wrap_angle(forecast.headings[found] - pose[2])
+                        lead_speed = forecast.others.speeds[row, found] * np.cos(turn)
                 lead[1], lead[2] = lead_speed, rear
-            accel = acceleration(progress, speed, lead, targets[policy], model)
-            motion[policy, step, 0] = progress + 0.1 * speed
-            motion[policy, step, 1] = speed + 0.1 * accel
-            interpolate(path, motion[policy, step, 0], poses[policy, step])
-    return DONE
-
-
-@lean_kernel
-def _any_ahead(hits: IntArray, centroids: FloatArray, progress: float) -> bool:
-    for index in hits:
-        if centroids[index] > progress:
-            return True
-    return False
+            follow(before, lead, rows.targets[policy], model, rows.motion[policy, step])
+            read_pose(path, rows.motion[policy, step, 0], rows.poses[policy, step])
+    return _DONE
 
 
 @lean_kernel
 def _nearest(
     hits: IntArray,
-    centroids: FloatArray,
+    along: FloatArray,
     progress: float,
     footprint: FloatArray,
-    boxes: FloatArray,
-    centers: FloatArray,
-    radii: FloatArray,
-    light_xy: FloatArray,
-    light_ptr: IntArray,
+    forecast: Forecast,
+    row: int,
     ranks: IntArray,
 ) -> tuple[int, float]:
-    """The occupant ahead nearest to the footprint, by rank on ties, and its distance [m].
+    """What is nearest to the footprint (4, 2) of all ahead, by rank on ties, and its distance [m].
 
-    The occupant is -1 where ranks are needed and not known.
+    It is _NOBODY where nothing is ahead, _TIED where ranks are needed and not known.
     """
-    x = 0.5 * (footprint[0, 0] + footprint[2, 0])
-    y = 0.5 * (footprint[0, 1] + footprint[2, 1])
-    radius = np.hypot(footprint[0, 0] - x, footprint[0, 1] - y) + 1e-6
-    best, found, is_tied = np.inf, -1, False
+    others = forecast.others
+    x, y, radius = circle_around(footprint)
+    best, found, is_tied = np.inf, _NOBODY, False
     for index in hits:
-        if not centroids[index] > progress:
+        if not along[index] > progress:
             continue
-        light = index - len(radii)
+        light = index - len(others.radii)
         if light >= 0:
-            ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
-            distance = box_to_ring(footprint, ring)
+            ring = forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
         else:
-            away = np.hypot(centers[index, 0] - x, centers[index, 1] - y)
-            if away - radius - radii[index] > best:
+            ring, center = others.boxes[row, index], others.centers[row, index]
+            if np.hypot(center[0] - x, center[1] - y) - radius - others.radii[index] > best:
                 continue
-            distance = ring_distance(footprint, boxes[index])
+        distance = ring_distance(footprint, ring)
         if distance < best:
             best, found, is_tied = distance, index, False
         elif distance == best:
@@ -270,36 +247,24 @@ def _nearest(
             elif ranks[index] < ranks[found]:
                 found = index
     if is_tied:
-        return -1, best
+        return _TIED, best
     return found, best
 
 
 @lean_kernel
-def acceleration(
-    progress: float, speed: float, lead: FloatArray, target: float, model: FollowingModel
-) -> float:
-    """Clipped IDM acceleration [m/s^2] behind a lead (3,); NaN where the target speed is 0 (Q6)."""
+def follow(
+    before: FloatArray, lead: FloatArray, target: float, model: FollowingModel, out: FloatArray
+) -> None:
+    """Write progress and speed (2,) one step after `before`, behind a lead (3,)."""
+    # nuPlan rule 191: a target speed of 0 gives NaN
+    progress, speed = before[0], before[1]
     closing = speed * (speed - lead[1]) / (2.0 * np.sqrt(model.accel_max * model.decel_max))
     wanted = model.min_gap + speed * model.headway + closing
     gap = max(lead[0] - progress - lead[2], model.min_gap)
     free = (speed / target) ** model.exponent
     accel = model.accel_max * (1.0 - free - (wanted / gap) ** 2)
     if accel < -model.decel_max:
-        return -model.decel_max
-    if accel > model.accel_max:
-        return model.accel_max
-    return accel
-
-
-@kernel
-def follow_many(
-    motion: FloatArray, leads: FloatArray, targets: FloatArray, model: FollowingModel
-) -> FloatArray:
-    """(K, 2) progress and speed after one step, for K unrelated rows as in `Proposals`."""
-    out = np.empty((len(motion), 2))
-    for row in range(len(motion)):
-        progress, speed = motion[row, 0], motion[row, 1]
-        out[row, 0] = progress + 0.1 * speed
-        accel = acceleration(progress, speed, leads[row], targets[row], model)
-        out[row, 1] = speed + 0.1 * accel
-    return out
+        accel = -model.decel_max
+    elif accel > model.accel_max:
+        accel = model.accel_max
+    out[0], out[1] = progress + 0.1 * speed, speed + 0.1 * accel

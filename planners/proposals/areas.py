@@ -1,4 +1,4 @@
-"""The drivable area PDM-Closed knows: lanes and connectors of near blocks, and car parks (§5.4).
+"""The drivable area that proposals are scored on: lanes and connectors, and car parks.
 
 nuPlan puts them into a new spatial index at every step. Here a step names the areas that belong to
 it. Every ring is sliced into horizontal slabs that list the edges in them, so that a
@@ -11,12 +11,33 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.boxes import meets_bounds
 from shiftsim.geometry.rings import BOUNDARY, EXTERIOR, INTERIOR, ray_crossings
-from shiftsim.world.layers import Lists, Polygons, index_polygons, meets_convex, square_around
+from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
+MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
+_ALL_CORNERS, _WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
+
+
+class Slabs(NamedTuple):
+    """Rings sliced into horizontal slabs. R rings, S slabs.
+
+    Attributes:
+        xy: (V, 2) vertices of all rings [m].
+        rings: (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs.
+        grid: (R, 2) y of the lowest slab [m], slabs per metre.
+        edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
+        edge_ends: Vertices at which the edges of a slab end.
+    """
+
+    xy: FloatArray
+    rings: IntArray
+    grid: FloatArray
+    edge_ptr: IntArray
+    edge_ends: IntArray
 
 
 class Areas(NamedTuple):
@@ -24,19 +45,13 @@ class Areas(NamedTuple):
 
     Attributes:
         polygons: The areas.
-        rings: (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs.
-        slab_grid: (R, 2) y of the lowest slab [m], slabs per metre.
-        edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
-        edge_ends: Vertices at which the edges of a slab end.
+        slabs: Their rings.
         on_route: (M,) whether the route holds an edge of that id.
         edge: (M,) the edge of that id; for a car park usually -1.
     """
 
     polygons: Polygons
-    rings: IntArray
-    slab_grid: FloatArray
-    edge_ptr: IntArray
-    edge_ends: IntArray
+    slabs: Slabs
     on_route: BoolArray
     edge: IntArray
 
@@ -51,7 +66,7 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
             np.concatenate([first.ring_ptr, second.ring_ptr[1:] + len(first.xy)]),
             np.concatenate([first.poly_ptr, second.poly_ptr[1:] + len(first.ring_ptr) - 1]),
         )
-    # nuPlan: membership is a test on ids, which car parks share with lanes (pdm-closed.md §11 Q11)
+    # nuPlan rule 181: membership is a test on ids, which car parks may share with lanes
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
     edge = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
     return areas_of(polygons, np.isin(edge, np.array(route_lanes)), edge)
@@ -62,26 +77,26 @@ def areas_of(polygons: Polygons, on_route: BoolArray, edge: IntArray) -> Areas:
     starts, stops = polygons.ring_ptr[:-1], polygons.ring_ptr[1:]
     num_slabs = (stops - starts) // EDGES_PER_SLAB + 1
     rings = np.column_stack([starts, stops, np.cumsum(num_slabs) - num_slabs, num_slabs])
-    slab_grid, counts = np.empty((len(rings), 2)), np.zeros(num_slabs.sum(), np.int64)
-    _slice(polygons.xy, rings, slab_grid, counts, np.zeros(0, np.int64))
+    grid, counts = np.empty((len(rings), 2)), np.zeros(num_slabs.sum(), np.int64)
+    _slice(polygons.xy, rings, grid, counts, np.zeros(0, np.int64))
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
     edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
-    _slice(polygons.xy, rings, slab_grid, fill, edge_ends)
-    return Areas(polygons, rings, slab_grid, edge_ptr, edge_ends, on_route, edge)
+    _slice(polygons.xy, rings, grid, fill, edge_ends)
+    return Areas(polygons, Slabs(polygons.xy, rings, grid, edge_ptr, edge_ends), on_route, edge)
 
 
 @lean_kernel
 def _slice(
-    xy: FloatArray, rings: IntArray, slab_grid: FloatArray, fill: IntArray, edge_ends: IntArray
+    xy: FloatArray, rings: IntArray, grid: FloatArray, fill: IntArray, edge_ends: IntArray
 ) -> None:
-    """Add the edges of every slab to `fill`, and write them to `edge_ends` where it has room."""
+    """Add the edges of every slab to `fill`, and write them to `edge_ends` unless that is empty."""
     for ring in range(len(rings)):
         start, stop, first_slab, num_slabs = rings[ring]
         low, high = np.inf, -np.inf
         for vertex in range(start, stop):
             low, high = min(low, xy[vertex, 1]), max(high, xy[vertex, 1])
         scale = num_slabs / (high - low) if high > low else 0.0
-        slab_grid[ring, 0], slab_grid[ring, 1] = low, scale
+        grid[ring, 0], grid[ring, 1] = low, scale
         before = stop - 1
         for vertex in range(start, stop):
             bottom = min(xy[before, 1], xy[vertex, 1])
@@ -95,69 +110,34 @@ def _slice(
             before = vertex
 
 
-def admit(road: VectorMap, areas: Areas, x: float, y: float, half_width: float) -> IntArray:
+def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
     """Areas of the blocks and the car parks that touch a square around (x, y) [m], in their order.
 
     Edges come by block, in the order of the blocks.
     """
-    out = np.empty(len(areas.edge), np.int64)
-    blocks, members = road.blocks.polygons, road.block_edges
-    count = _admit(blocks, members, areas.polygons, len(road.edges), x, y, half_width, out)
-    return out[:count]
-
-
-@kernel
-def _admit(
-    blocks: Polygons,
-    block_edges: Lists,
-    polygons: Polygons,
-    num_edges: int,
-    x: float,
-    y: float,
-    half_width: float,
-    out: IntArray,
-) -> int:
-    count = 0
     square = square_around(x, y, half_width)
-    for layer in range(2):
-        layer_polygons = blocks if layer == 0 else polygons
-        bounds = layer_polygons.bounds
-        for index in range(0 if layer == 0 else num_edges, len(bounds)):
-            if (
-                bounds[index, 0] > x + half_width
-                or bounds[index, 2] < x - half_width
-                or bounds[index, 1] > y + half_width
-                or bounds[index, 3] < y - half_width
-                or not meets_convex(layer_polygons, index, square)
-            ):
-                continue
-            if layer == 1:
-                out[count] = index
-                count += 1
-                continue
-            for entry in range(block_edges.ptr[index], block_edges.ptr[index + 1]):
-                out[count] = block_edges.items[entry]
-                count += 1
-    return count
+    edges = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
+    return np.concatenate([*edges, meeting(road.car_parks.polygons, square) + len(road.edges)])
+
+
+def near_areas(areas: Areas, selected: IntArray, points: FloatArray) -> IntArray:
+    """Those of the selected areas whose bounds overlap the bounds of points (..., 2)."""
+    (x, y), bounds = points.reshape(-1, 2).T, areas.polygons.bounds[selected]
+    near = (bounds[:, 0] <= x.max()) & (bounds[:, 2] >= x.min())
+    near &= (bounds[:, 1] <= y.max()) & (bounds[:, 3] >= y.min())
+    return selected[near]
 
 
 @lean_kernel
-def locate(
-    slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
-    first: int,
-    last: int,
-    x: float,
-    y: float,
-) -> int:
+def _locate(slabs: Slabs, first: int, last: int, x: float, y: float) -> int:
     """Where a point lies relative to rings `first` … `last` - 1: INTERIOR, BOUNDARY or EXTERIOR.
 
-    The point must be within their bounds. `slabs` are the vertices and the fields of `Areas` from
-    `rings` to `edge_ends`; the whole of `Areas` takes longer to pass than to use.
+    The point must be within their bounds.
     """
-    xy, rings, slab_grid, edge_ptr, edge_ends = slabs
+    xy, rings, grid, edge_ptr, edge_ends = slabs
     inside = False
     for ring in range(first, last):
-        place = (y - slab_grid[ring, 0]) * slab_grid[ring, 1]
+        place = (y - grid[ring, 0]) * grid[ring, 1]
         if not place >= 0.0:
             continue
         start, stop = rings[ring, 0], rings[ring, 1]
@@ -184,135 +164,104 @@ def locate(
 
 
 @lean_kernel
-def covering(areas: Areas, admitted: IntArray, x: float, y: float, out: IntArray) -> int:
-    """Write the admitted areas that hold a point, boundary included, into `out`; their number.
+def covering(areas: Areas, selected: IntArray, x: float, y: float, out: IntArray) -> int:
+    """Write the selected areas that hold a point, boundary included, into `out`; their number.
 
-    They are in the order of `admitted`; at most `len(out)` are found.
+    They are in the order of `selected`; at most `len(out)` are found.
     """
-    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
     bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
     found = 0
-    for area in admitted:
-        if (
-            x < bounds[area, 0]
-            or y < bounds[area, 1]
-            or x > bounds[area, 2]
-            or y > bounds[area, 3]
-            or found == len(out)
-        ):
-            continue
-        if locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
-            out[found] = area
-            found += 1
+    for area in selected:
+        if found < len(out) and _in_bounds(bounds[area], x, y):
+            if _locate(areas.slabs, poly_ptr[area], poly_ptr[area + 1], x, y) != EXTERIOR:
+                out[found] = area
+                found += 1
     return found
 
 
 @kernel
-def near_areas(areas: Areas, admitted: IntArray, points: FloatArray) -> IntArray:
-    """Those of the admitted areas whose bounds overlap the bounds of points (..., 2)."""
-    flat = points.reshape(-1, 2)
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for row in range(len(flat)):
-        low_x, high_x = min(low_x, flat[row, 0]), max(high_x, flat[row, 0])
-        low_y, high_y = min(low_y, flat[row, 1]), max(high_y, flat[row, 1])
-    bounds = areas.polygons.bounds
-    out = np.empty(len(admitted), np.int64)
-    count = 0
-    for area in admitted:
-        if (
-            bounds[area, 0] <= high_x
-            and bounds[area, 2] >= low_x
-            and bounds[area, 1] <= high_y
-            and bounds[area, 3] >= low_y
-        ):
-            out[count] = area
-            count += 1
-    return out[:count]
-
-
-@kernel
-def cover_poses(
+def find_places(
     areas: Areas,
     near: IntArray,
+    limits: FloatArray,
     corners: FloatArray,
-    centers: FloatArray,
-    off_road: BoolArray,
-    oncoming: BoolArray,
+    points: FloatArray,
+    flags: BoolArray,
+    speed_limits: FloatArray,
 ) -> None:
-    """Whether every pose of every proposal lies on the road, and on the route (§8.1).
+    """On which areas every pose of every proposal is.
 
     Args:
-        areas: The areas.
+        areas: All areas of the map.
         near: Those that count.
+        limits: (M,) speed limits of all areas [m/s].
         corners: (P, T, 4, 2) corners of the ego [m].
-        centers: (P, T, 2) its centres [m].
-        off_road: (P, T) receives whether a corner is on no area.
-        oncoming: (P, T) receives whether the centre is on no area of the route.
+        points: (P, T, 2) where the ego is on the route or off it, and which limit it has [m].
+        flags: (P, T, 3) receives whether the ego is on several lanes, off the road, off the route.
+        speed_limits: (P, T) receives the largest limit at its point, 0 off the road [m/s].
     """
-    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
-    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
-    on_route = np.empty(len(near), np.int64)
-    count = 0
+    slabs, bounds, poly_ptr = areas.slabs, areas.polygons.bounds, areas.polygons.poly_ptr
+    highest = 0.0
     for area in near:
-        if areas.on_route[area]:
-            on_route[count] = area
-            count += 1
-    on_route = on_route[:count]
-    last = np.full(5, -1)  # the area that held each point one step before is tried first
-    for proposal in range(corners.shape[0]):
+        highest = max(highest, limits[area])
+    guess = -1  # the area that held the whole ego last is tried first
+    for row in range(corners.shape[0]):
         for step in range(corners.shape[1]):
-            is_off = False
-            for corner in range(4):
-                x, y = corners[proposal, step, corner, 0], corners[proposal, step, corner, 1]
-                last[corner] = _find_holder(slabs, bounds, poly_ptr, near, last[corner], x, y)
-                is_off = is_off or last[corner] < 0
-            off_road[proposal, step] = is_off
-            x, y = centers[proposal, step, 0], centers[proposal, step, 1]
-            last[4] = _find_holder(slabs, bounds, poly_ptr, on_route, last[4], x, y)
-            oncoming[proposal, step] = last[4] < 0
+            box = corners[row, step]
+            x, y = points[row, step, 0], points[row, step, 1]
+            num_touched, held, is_on_route, limit = 0, 0, False, 0.0
+            for entry in range(-1, len(near)):
+                area = guess if entry < 0 else near[entry]
+                if area < 0 or (entry >= 0 and area == guess):
+                    continue
+                is_known = is_on_route and limit >= highest
+                if (held == _WHOLE and is_known) or not meets_bounds(box, bounds[area]):
+                    continue
+                first, last = poly_ptr[area], poly_ptr[area + 1]
+                if not is_known and _holds(slabs, bounds[area], first, last, x, y):
+                    limit = max(limit, limits[area])
+                    is_on_route = is_on_route or areas.on_route[area]
+                if held == _WHOLE:
+                    continue
+                only_whole = num_touched > 1 and held == _ALL_CORNERS  # may change anything
+                within = _corners_within(slabs, bounds[area], first, last, box, only_whole)
+                if within == _ALL_CORNERS:
+                    held, guess = _WHOLE, area
+                elif within > 0:
+                    held |= within
+                    num_touched += 1
+            flags[row, step, MULTIPLE] = num_touched > 1 and held != _WHOLE
+            flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
+            flags[row, step, OFF_ROUTE] = not is_on_route
+            speed_limits[row, step] = limit
 
 
 @lean_kernel
-def _find_holder(
-    slabs: tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray],
-    bounds: FloatArray,
-    poly_ptr: IntArray,
-    near: IntArray,
-    guess: int,
-    x: float,
-    y: float,
+def _corners_within(
+    slabs: Slabs, bounds: FloatArray, first: int, last: int, box: FloatArray, only_all: bool
 ) -> int:
-    """An area that holds a point in its interior, tried from `guess` on; -1 if none does."""
-    for attempt in range(-1, len(near)):
-        area = guess if attempt < 0 else near[attempt]
-        if area < 0 or not (
-            bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
-        ):
-            continue  # also where a coordinate is NaN
-        if locate(slabs, poly_ptr[area], poly_ptr[area + 1], x, y) == INTERIOR:
-            return area
-    return -1
+    """Which corners of a box (4, 2) the rings `first` … `last` - 1 hold, a bit for each.
+
+    With `only_all` the search ends at the first corner that they do not hold.
+    """
+    within = 0
+    for corner in range(4):
+        if _holds(slabs, bounds, first, last, box[corner, 0], box[corner, 1]):
+            within |= 1 << corner
+        elif only_all:
+            return 0
+    return within
 
 
 @lean_kernel
-def on_multiple_lanes(areas: Areas, near: IntArray, box: FloatArray) -> bool:
-    """Whether the corners (4, 2) of the ego are on several areas, none of which has all (§8.1)."""
-    slabs = (areas.polygons.xy, areas.rings, areas.slab_grid, areas.edge_ptr, areas.edge_ends)
-    bounds, poly_ptr = areas.polygons.bounds, areas.polygons.poly_ptr
-    num_touched = 0
-    for entry in range(len(near)):
-        num_held = 0
-        for corner in range(4):
-            x, y = box[corner, 0], box[corner, 1]
-            this = near[entry : entry + 1]
-            if _find_holder(slabs, bounds, poly_ptr, this, -1, x, y) >= 0:
-                num_held += 1
-        if num_held == 4:
-            return False
-        if num_held > 0:
-            num_touched += 1
-    return num_touched > 1
+def _holds(slabs: Slabs, bounds: FloatArray, first: int, last: int, x: float, y: float) -> bool:
+    """Whether the rings `first` … `last` - 1 hold a point in their interior."""
+    return _in_bounds(bounds, x, y) and _locate(slabs, first, last, x, y) == INTERIOR
+
+
+@lean_kernel
+def _in_bounds(bounds: FloatArray, x: float, y: float) -> bool:
+    return bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

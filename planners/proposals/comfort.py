@@ -1,7 +1,6 @@
-"""The comfort test of PDM-Closed on driven proposals (pdm-closed.md §8.7).
+"""The comfort test on driven proposals.
 
-The filters are linear, so each is a matrix, made once. Windows are nuPlan's: 41 samples mean one
-parabola over the whole horizon, 5 samples for the yaw signals because the length is not passed on.
+The filters are linear, so each is a matrix, made once.
 """
 
 import functools
@@ -10,10 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
-from shiftsim.planners.pdm.parameters import DT, SCORED, ComfortBounds
+from shiftsim.planners.proposals.tracker import DT, SCORED
 from shiftsim.world.state import AX, AY, HEADING
 
 SIGNALS = ("lon_accel", "lat_accel", "jerk", "lon_jerk", "yaw_accel", "yaw_rate")
+
+
+class ComfortBounds(NamedTuple):
+    """Open intervals of the comfort test; the last four are symmetric."""
+
+    lon_accel_min: float = -4.05  # m/s^2
+    lon_accel_max: float = 2.40  # m/s^2
+    lat_accel: float = 4.89  # m/s^2
+    jerk: float = 8.37  # m/s^3
+    lon_jerk: float = 4.13  # m/s^3
+    yaw_accel: float = 1.93  # rad/s^2
+    yaw_rate: float = 0.95  # rad/s
 
 
 class Filters(NamedTuple):
@@ -36,29 +47,38 @@ def make_filters() -> Filters:
         made = savgol_filter(samples, window, order, deriv=derivative, delta=DT, axis=-1)
         return np.ascontiguousarray(made)
 
+    # nuPlan rule 183: one parabola over the whole horizon, and 5 samples for the yaw signals,
+    # because the length of the window is not passed on
     long = SCORED + 1
     return Filters(
         matrix(long, 2), matrix(8, 2), matrix(long, 2, 1), matrix(5, 2, 1), matrix(5, 3, 2)
     )
 
 
-@kernel
-def comfort(
-    states: FloatArray,
-    filters: Filters,
-    bounds: ComfortBounds,
-    signals: FloatArray,
-    is_comfortable: BoolArray,
-) -> None:
-    """Filtered signals of P driven proposals, and whether they stay within the bounds.
+class Comfort(NamedTuple):
+    """How P driven proposals feel.
 
-    Args:
-        states: (P, 41, 11) driven states.
-        filters: The filters.
-        bounds: The bounds.
-        signals: (P, 6, 41) receives the signals named by `SIGNALS`.
-        is_comfortable: (P, 6) receives whether each stays strictly within its bounds.
+    Attributes:
+        signals: (P, 6, 41) filtered signals named by `SIGNALS`.
+        is_within: (P, 6) whether each stays strictly within its bounds.
     """
+
+    signals: FloatArray
+    is_within: BoolArray
+
+
+def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
+    """The comfort test of driven states (P, 41, 11)."""
+    count, steps = states.shape[:2]
+    made = Comfort(
+        np.empty((count, len(SIGNALS), steps)), np.empty((count, len(SIGNALS)), np.bool_)
+    )
+    _comfort(states, make_filters(), bounds, made)
+    return made
+
+
+@kernel
+def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: Comfort) -> None:
     count = states.shape[1]
     raw, brief = np.empty((4, count)), np.empty(count)
     highs = (
@@ -79,7 +99,7 @@ def comfort(
                 change = state[HEADING] - states[row, step - 1, HEADING]
                 turn -= 2.0 * np.pi * np.rint(change / (2.0 * np.pi))
             raw[3, step] = state[HEADING] + turn
-        out = signals[row]
+        out = made.signals[row]
         _filter(raw[0], filters.smooth, out[0])
         _filter(raw[1], filters.smooth, out[1])
         _filter(raw[2], filters.smooth_briefly, brief)
@@ -93,12 +113,12 @@ def comfort(
             within = True
             for step in range(count):
                 within = within and low < out[signal, step] < highs[signal]
-            is_comfortable[row, signal] = within
+            made.is_within[row, signal] = within
 
 
 @lean_kernel
 def _filter(samples: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
-    """Write samples @ matrix into `out`, rounded to 8 decimals as nuPlan does."""
+    """Write samples @ matrix into `out`, rounded to 8 decimals."""
     for column in range(len(out)):
         out[column] = 0.0
     for row in range(len(samples)):

@@ -1,29 +1,44 @@
-"""Proposals driven by PDM-Closed's own tracker and the kinematic bicycle (pdm-closed.md §7).
+"""Proposals driven by a tracker and the kinematic bicycle.
 
 The tracker is nuPlan's LQR but for the speed profile, and for time, which is a whole index here.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.arrays import FloatArray, kernel, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.sim.dynamics.bicycle import step_bicycle
-from shiftsim.sim.dynamics.lqr import TRACKED, LqrParameters, Reference, command, fit_curvature
-from shiftsim.world.state import HEADING, X, Y
+from shiftsim.sim.dynamics.lqr import (
+    NUPLAN,
+    TRACKED,
+    LqrParameters,
+    Reference,
+    command,
+    fit_curvature,
+)
+from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, VehicleParameters, X, Y
+
+DT = 0.1  # s, between poses
+STEP_US = 100_000
+STEPS = 80  # of a plan
+SCORED = 40  # of a proposal, as far as proposals are compared
 
 
 @kernel
 def fit_speed(poses: FloatArray, dt: float, penalty: float, out: FloatArray) -> None:
     """Smoothed signed speed between poses (M + 1, 3), into `out` (M,) [m/s]; M >= 3.
 
-    nuPlan: meant to penalise differences of accelerations a_j = (v_j+1 - v_j) / dt, the reference
-    implementation penalises the accelerations themselves, but for the last row, which is a
-    difference (pdm-closed.md §7.1). In the speeds v that is a system with two sub-diagonals,
+    Penalises the accelerations a_j = (v_j+1 - v_j) / dt. In the speeds v that is a system with two
+    sub-diagonals,
 
         sum (d_k - dt v_k)^2 + penalty (sum_{j < M - 3} a_j^2 + (a_M-2 - a_M-3)^2),
 
     solved by an LDL' factorisation.
     """
+    # nuPlan rule 185: differences of accelerations are meant to be penalised, but only the last row
+    # of the matrix is one
     count = len(out)
     weight = penalty / dt**4
     diagonal, side1, side2 = np.ones(count), np.zeros(count), np.zeros(count)
@@ -62,43 +77,88 @@ def fit_speed(poses: FloatArray, dt: float, penalty: float, out: FloatArray) -> 
             out[row] -= side2[row + 2] * out[row + 2]
 
 
+class Profiles(NamedTuple):
+    """What poses are tracked by.
+
+    Attributes:
+        speeds: (T - 1,) reference speeds [m/s].
+        curvatures: (T - 1,) reference curvatures [1/m].
+        ahead: (horizon,) scratch.
+    """
+
+    speeds: FloatArray
+    curvatures: FloatArray
+    ahead: FloatArray
+
+
 @kernel
-def simulate_proposals(
-    poses: FloatArray,
-    ego: FloatArray,
-    params: LqrParameters,
-    dt: float,
-    speeds: FloatArray,
-    curvatures: FloatArray,
-    states: FloatArray,
-) -> None:
-    """Drive P proposals from one ego state.
+def fit_profiles(poses: FloatArray, dt: float, params: LqrParameters, profiles: Profiles) -> None:
+    """Fill in the profiles of poses (T, 3)."""
+    fit_speed(poses, dt, params.jerk_penalty, profiles.speeds)
+    rate_penalty = params.curvature_rate_penalty
+    fit_curvature(poses, profiles.speeds, dt, rate_penalty, profiles.curvatures)
+
+
+@lean_kernel
+def look_ahead(
+    state: FloatArray, pose: FloatArray, step: int, profiles: Profiles
+) -> tuple[float, float]:
+    """Lateral error [m] and heading error [rad] of a state (11,) beside the pose (3,) of a step.
+
+    The curvatures from there on are written into `profiles.ahead`.
+    """
+    last = len(profiles.curvatures) - 1
+    for index in range(len(profiles.ahead)):
+        profiles.ahead[index] = profiles.curvatures[min(step + index, last)]
+    lateral = (state[Y] - pose[1]) * np.cos(pose[2]) - (state[X] - pose[0]) * np.sin(pose[2])
+    return lateral, wrap_angle(state[HEADING] - pose[2])
+
+
+class Driven(NamedTuple):
+    """Proposals as driven.
+
+    Attributes:
+        speeds: (P, T - 1) reference speeds [m/s].
+        curvatures: (P, T - 1) reference curvatures [1/m].
+        states: (P, 41, 11) states.
+    """
+
+    speeds: FloatArray
+    curvatures: FloatArray
+    states: FloatArray
+
+
+def drive_proposals(
+    poses: FloatArray, ego: FloatArray, vehicle: VehicleParameters = PACIFICA
+) -> Driven:
+    """Drive proposals from one ego state.
 
     Args:
-        poses: (P, T, 3) poses of the proposals x [m], y [m], heading [rad].
+        poses: (P, T, 3) x [m], y [m], heading [rad]; T > 40.
         ego: (11,) ego state.
-        params: Of the tracker.
-        dt: Time between poses [s].
-        speeds: (P, T - 1) receives the reference speeds [m/s].
-        curvatures: (P, T - 1) receives the reference curvatures [1/m].
-        states: (P, S, 11) receives the driven states, S <= T.
+        vehicle: Dimensions of the ego.
     """
+    shape = (len(poses), poses.shape[1] - 1)
+    driven = Driven(np.empty(shape), np.empty(shape), np.empty((len(poses), SCORED + 1, NUM_STATE)))
+    _drive(poses, ego, NUPLAN._replace(wheel_base=vehicle.wheel_base), DT, driven)
+    return driven
+
+
+@kernel
+def _drive(
+    poses: FloatArray, ego: FloatArray, params: LqrParameters, dt: float, out: Driven
+) -> None:
     last = poses.shape[1] - 2
     ahead = np.empty(params.horizon)
     for row in range(len(poses)):
-        fit_speed(poses[row], dt, params.jerk_penalty, speeds[row])
-        fit_curvature(poses[row], speeds[row], dt, params.curvature_rate_penalty, curvatures[row])
+        profiles = Profiles(out.speeds[row], out.curvatures[row], ahead)
+        fit_profiles(poses[row], dt, params, profiles)
+        states = out.states[row]
         for column in range(len(ego)):
-            states[row, 0, column] = ego[column]
-        for step in range(states.shape[1] - 1):
-            state, pose = states[row, step], poses[row, step]
-            for index in range(params.horizon):
-                ahead[index] = curvatures[row, min(step + index, last)]
-            lateral = (state[Y] - pose[1]) * np.cos(pose[2]) - (state[X] - pose[0]) * np.sin(
-                pose[2]
-            )
-            turn = wrap_angle(state[HEADING] - pose[2])
-            speed = speeds[row, min(step + params.horizon, last)]
+            states[0, column] = ego[column]
+        for step in range(len(states) - 1):
+            speed = profiles.speeds[min(step + params.horizon, last)]
+            lateral, turn = look_ahead(states[step], poses[row, step], step, profiles)
             reference = Reference(TRACKED, lateral, turn, speed, ahead)
-            accel, rate = command(state, reference, params)
-            step_bicycle(state, accel, rate, params.wheel_base, dt, states[row, step + 1])
+            accel, rate = command(states[step], reference, params)
+            step_bicycle(states[step], accel, rate, params.wheel_base, dt, states[step + 1])

@@ -8,26 +8,74 @@ tasks, 130 interrupted; `verify` has its own.
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from shiftsim.cli import bench, checkpoint, convert, reading, running, stores, viewing
+from shiftsim.cli.common import new_app
 from shiftsim.errors import DataError, ShiftsimError
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
+# command -> where it is: a function, or further commands; imported when it is used
+_COMMANDS = {
+    "demo": "running:demo",
+    "run": "running:run",
+    "score": "running:score",
+    "merge": "running:merge",
+    "bench": "bench:bench",
+    "report": "reading:report",
+    "explain": "reading:explain",
+    "diff": "reading:diff",
+    "check": "stores:check",
+    "verify": "doctor:verify",
+    "doctor": "doctor:doctor",
+    "view": "viewing:view",
+    "plot": "viewing:plot",
+    "inspect": "viewing:inspect",
+    "filter": "stores:filter_scenarios",
+    "stats": "stores:show_stats",
+    "split": "stores:make_split",
+    "planners": "planners:app",
+    "convert": "convert:app",
+    "export": "stores:export",
+    "checkpoint": "planners:checkpoint",
+}
 
-app = typer.Typer(
+
+class _Commands(typer.core.TyperGroup):
+    """The commands of the table above."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Their names, in the order of the help."""
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One of them, imported; None where there is none."""
+        if cmd_name not in _COMMANDS:
+            return None
+        module, _, attribute = _COMMANDS[cmd_name].partition(":")
+        found = getattr(import_module(f"shiftsim.cli.{module}"), attribute)
+        if isinstance(found, typer.Typer):
+            command: Any = typer.main.get_group(found)
+        else:
+            alone = new_app()
+            alone.command()(found)
+            command = typer.main.get_command(alone)
+        command.name = cmd_name
+        return command
+
+
+app = new_app(
+    "Closed-loop evaluation of driving planners with nuPlan's semantics.",
     name="shiftsim",
-    help="Closed-loop evaluation of driving planners with nuPlan's semantics.",
+    cls=_Commands,
+    add_completion=True,
     epilog="Every command explains itself: shiftsim COMMAND --help",
     no_args_is_help=True,
-    rich_markup_mode=None,  # square brackets in help texts are defaults, not markup
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -41,15 +89,6 @@ def _options(
 
         typer.echo(__version__)
         raise typer.Exit
-
-
-running.register(app)
-bench.register(app)
-reading.register(app)
-viewing.register(app)
-convert.register(app)
-stores.register(app)
-checkpoint.register(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

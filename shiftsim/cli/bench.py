@@ -1,95 +1,63 @@
 """The command that runs a whole benchmark track and reports it."""
 
-import shlex
 import sys
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.reading import terminal_width
-from shiftsim.cli.running import (
-    BatchSize,
-    Checkpoints,
-    Controller,
-    Device,
-    DryRun,
-    Executor,
-    Limit,
-    Out,
-    Partial,
-    PlannerArgs,
-    Planners,
-    SaveRollouts,
-    Scheduler,
-    Strict,
-    Timeout,
-    Workers,
-    numbers,
-    planner_arguments,
-    progress_note,
-    stopped_as_interrupt,
-    worker_count,
-)
+from shiftsim.cli.common import Debug, Json, Quiet, plural, say, say_json, terminal_width
+from shiftsim.cli.options import Settings, planner_arguments, with_settings
+from shiftsim.cli.running import DryRun, interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from shiftsim.benchmarks.bench import Plan
-    from shiftsim.report import Group
     from shiftsim.report.figures import Figure
-    from shiftsim.runs.execute import Progress
+    from shiftsim.report.groups import Group
 
-_UNFINISHED, _INTERRUPTED = 3, 130
+_UNFINISHED = 3
 _MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustness"}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this module."""
-    app.command()(bench)
-
-
+@with_settings(
+    "planners",
+    "store",
+    "split",
+    "checkpoints",
+    "planner_args",
+    "seeds",
+    "noise",
+    "traffic",
+    "controller",
+    "limit",
+    "device",
+    "batch_size",
+    "strict",
+    "workers",
+    "timeout",
+    "executor",
+    "scheduler",
+    "retry_failed",
+    "out",
+    "save_rollouts",
+    "allow_partial",
+    store="Own scenarios: name or folder (demo).",
+    split="Name or file (the whole store; demo-mini of the demo).",
+    seeds="Only these, such as 0,1; the result is partial.",
+    noise="Only these; the result is partial.",
+    traffic="Only this mode; the result is partial.",
+    retry_failed="Do again what failed before.",
+)
 def bench(
     track: Annotated[str, typer.Argument(help="semantic-shift or state-drift.")],
-    planner: Planners = None,
-    store: Annotated[
-        str | None, typer.Option("--store", "-s", help="Own scenarios: name or folder (demo).")
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="Name or file (the whole store; demo-mini of the demo).")
-    ] = None,
+    settings: Settings,
     val14: Annotated[
         str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14 (left out).")
     ] = None,
-    checkpoint: Checkpoints = None,
-    planner_arg: PlannerArgs = None,
-    seeds: Annotated[
-        str | None, typer.Option(help="Only these, such as 0,1; the result is partial.")
-    ] = None,
-    noise: Annotated[
-        list[str] | None, typer.Option("--noise", "-n", help="Only these; the result is partial.")
-    ] = None,
-    traffic: Annotated[
-        str | None, typer.Option(help="Only this mode; the result is partial.")
-    ] = None,
-    controller: Controller = None,
-    limit: Limit = None,
-    device: Device = None,
-    batch_size: BatchSize = None,
-    strict: Strict = False,
-    workers: Workers = None,
-    timeout: Timeout = None,
-    executor: Executor = None,
-    scheduler: Scheduler = None,
-    retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Do again what failed before.")
-    ] = False,
-    out: Out = None,
-    save_rollouts: SaveRollouts = None,
     published: Annotated[
         bool, typer.Option("--published", help="The paper's figures beside the own ones.")
     ] = False,
-    allow_partial: Partial = False,
     dry_run: DryRun = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -103,47 +71,19 @@ def bench(
     from shiftsim.benchmarks.bench import plan_bench, run_bench
 
     chosen = load_track(track)
-    settings = {
-        "planners": planner or None,
-        "planner_args": planner_arguments(planner_arg, {}, planner or ()) or None,
-        "checkpoints": checkpoint or None,
-        "store": store,
-        "split": split,
-        "seeds": None if seeds is None else numbers(seeds),
-        "noise": noise or None,
-        "traffic": traffic,
-        "controller": controller,
-        "limit": limit,
-        "device": device,
-        "batch_size": batch_size,
-        "strict": strict or None,
-        "timeout": timeout,
-        "executor": executor,
-        "scheduler": scheduler,
-        "retry_failed": retry_failed or None,
-        "workers": None if workers is None else worker_count(workers),
-        "save_rollouts": save_rollouts,
-        "allow_partial": allow_partial or None,
-    }
-    given = {name: value for name, value in settings.items() if value is not None}
-    plan = plan_bench(chosen, given, reference=val14 or "", out=out or "")
+    out = settings.pop("out", "")
+    if texts := settings.pop("planner_args", None):
+        planners = settings.get("planners", ())
+        settings["planner_args"] = planner_arguments(texts, {}, planners)
+    plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
     if not as_json:
         _announce(plan)
     if dry_run:
         say("dry run: everything checked, nothing simulated")
         return
-    with progress_bar(quiet=quiet or as_json) as advance, stopped_as_interrupt():
-
-        def show(progress: "Progress") -> None:
-            advance(progress.done, progress.total, progress_note(progress))
-
-        try:
-            runs = run_bench(plan, on_progress=show, argv=sys.argv)
-        except KeyboardInterrupt:
-            typer.echo("error: interrupted", err=True)
-            again = shlex.join(["shiftsim", *sys.argv[1:]])
-            typer.echo(f"hint: kept: {plan.folder}; go on with: {again}", err=True)
-            raise typer.Exit(_INTERRUPTED) from None
+    with interruptible(plan.folder, sys.argv[1:], quiet=quiet or as_json) as show:
+        runs = run_bench(plan, on_progress=show, argv=sys.argv)
+    allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
         raise typer.Exit(_UNFINISHED)
@@ -173,8 +113,10 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import TABLES, Options, make_tables, write_report
+    from shiftsim.report.groups import read_groups
+    from shiftsim.report.scores import summary
+    from shiftsim.report.writers import FORMATS, render
 
     runs, own, extra = open_runs([plan.folder])
     groups = read_groups(runs, (*known_sets(), *own))

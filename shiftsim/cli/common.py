@@ -1,6 +1,7 @@
 """What several commands share: options, progress, JSON."""
 
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,18 @@ import typer
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def new_app(help: str = "", **settings: Any) -> typer.Typer:
+    """A group of commands."""
+    settings = {"add_completion": False, **settings}
+    return typer.Typer(
+        help=help or None,
+        rich_markup_mode=None,  # square brackets in help texts are defaults, not markup
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        **settings,
+    )
 
 
 def say(text: str = "") -> None:
@@ -27,6 +40,11 @@ def say_json(value: Any) -> None:
 def plural(count: int, noun: str) -> str:
     """`1 task`, `2 tasks`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def terminal_width() -> int:
+    """Columns of the terminal; 0 where the output goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
 
 
 Advance = Callable[[int, int, str], None]

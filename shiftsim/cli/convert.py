@@ -7,28 +7,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.running import Workers, worker_count
+from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim.cli.options import Settings, with_settings
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
     from shiftsim.data.deepplan.windows import ConversionConfig
 
-_CONVERT = typer.Typer(help="Make a scenario store from recordings.")
+app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 _PARTIAL, _INTERRUPTED = 3, 130
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    _CONVERT.command("nuplan")(nuplan)
-    _CONVERT.command("dsc3d")(dsc3d)
-    app.add_typer(_CONVERT, name="convert", no_args_is_help=True)
 
 
 Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
 _MAX_NAMED = 20
 
 
+@app.command()
 def nuplan(
     logs: Annotated[Path, typer.Argument(metavar="LOGS", help="Folder of .db logs, or one log.")],
     maps: Annotated[Path, typer.Argument(metavar="MAPS", help="Folder of the maps.")],
@@ -86,12 +80,14 @@ def _token_list(text: str) -> list[str]:
     """Tokens from a file, or from the words themselves."""
     path = Path(text)
     if path.is_file():
-        from shiftsim.runs.splits import read_split
+        from shiftsim.runs.scenarios import read_split
 
         return list(read_split(path).tokens)
     return [word.strip() for word in text.split(",")]
 
 
+@app.command()
+@with_settings("workers")
 def dsc3d(
     source: Annotated[
         Path, typer.Argument(metavar="SRC", help="Folder with data_meta.json, annotations, map.")
@@ -122,7 +118,8 @@ def dsc3d(
     config: Annotated[
         Path | None, typer.Option(help="All thresholds in TOML; flags win over it.")
     ] = None,
-    workers: Workers = None,
+    *,
+    settings: Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -139,8 +136,7 @@ def dsc3d(
 
     from shiftsim.data.deepplan.convert import convert_dsc3d
     from shiftsim.files import store_path
-    from shiftsim.runs.config import default_workers
-    from shiftsim.runs.workers import map_unordered
+    from shiftsim.runs.workers import default_workers, map_unordered
 
     flags = {
         "country": country,
@@ -153,7 +149,7 @@ def dsc3d(
     }
     options = _options(config, {name: value for name, value in flags.items() if value is not None})
     folder = store_path(store)
-    count = worker_count(workers) or default_workers()
+    count = settings.get("workers") or default_workers()
     with progress_bar(quiet=quiet or as_json) as advance:
         try:
             report = convert_dsc3d(

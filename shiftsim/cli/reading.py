@@ -1,38 +1,30 @@
-"""Commands that look at things: report, explain, diff, check, planners, verify, doctor."""
+"""Commands that read runs: report, explain, diff."""
 
-import shutil
-import sys
-from collections.abc import Sequence
-from functools import partial
+import html
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli.common import (
+    Debug,
+    Json,
+    Quiet,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+    terminal_width,
+)
 
 if TYPE_CHECKING:
+    from shiftsim.report.figures import Figure
+    from shiftsim.report.tables import Table
     from shiftsim.runs.results import Run
-
-_USAGE, _DATA = 1, 2
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders.")]
-_PLANNERS = typer.Typer(help="Planners: what there is, and does mine obey the contract.")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(report)
-    app.command()(explain)
-    app.command()(diff)
-    app.command()(check)
-    app.command()(verify)
-    app.command()(doctor)
-    _PLANNERS.command("list")(list_planners)
-    _PLANNERS.command("check")(check_one_planner)
-    _PLANNERS.callback(invoke_without_command=True)(planners)
-    app.add_typer(_PLANNERS, name="planners")
 
 
 def report(
@@ -76,8 +68,10 @@ def report(
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.errors import one_of
-    from shiftsim.report import FORMATS, read_groups, render, summary
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
+    from shiftsim.report.groups import read_groups
+    from shiftsim.report.scores import summary
+    from shiftsim.report.writers import FORMATS, render
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:
@@ -103,17 +97,9 @@ def report(
         files = write_report(out, tables, drawn, style or FORMATS)
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
-        from shiftsim.cli.site import write_report_site
-
         with progress_bar(quiet=quiet) as advance:
-            page = write_report_site(
-                site,
-                opened,
-                tables,
-                drawn,
-                on_progress=lambda done, total: advance(done, total, ""),
-            )
-        say(f"written: {page}")
+            _write_pages(site, opened, tables, drawn, lambda i, n: advance(i, n, ""))
+        say(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return
     say("\n\n".join(render(one, kind, width=terminal_width()) for one in tables))
@@ -121,13 +107,36 @@ def report(
         _say_worst(opened, worst)
 
 
-def terminal_width() -> int:
-    """Columns of the terminal; 0 where the output goes elsewhere."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+def _write_pages(
+    folder: Path,
+    runs: "Sequence[Run]",
+    tables: "Sequence[Table]",
+    drawn: "Sequence[Figure]",
+    on_progress: Callable[[int, int], None],
+) -> None:
+    """A folder of pages: tables and pictures, and every scenario with its replay."""
+    from shiftsim.report.writers import render
+    from shiftsim.runs.scenarios import open_run_store
+    from shiftsim.view.build import Choice, galleries, write_site
+
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [render(table, "html") for table in tables]
+    for figure in drawn:
+        name, title = html.escape(figure.save(folder).name), html.escape(figure.title)
+        parts.append(f'<figure><img src="{name}" alt="{title}"></figure>')
+    stored = [run for run in runs if any(run.rollout_places.values())]
+    write_site(
+        folder,
+        galleries(stored, [open_run_store(run) for run in stored], Choice()),
+        title=", ".join(run.path.name for run in runs),
+        limit=0,
+        above="\n".join(parts),
+        on_progress=on_progress,
+    )
 
 
 def _say_worst(runs: "Sequence[Run]", count: int) -> None:
-    from shiftsim.report import worst_rollouts
+    from shiftsim.report.scores import worst_rollouts
 
     for run in runs:
         rows = worst_rollouts(run, count)
@@ -181,145 +190,3 @@ def diff(
         return
     for line in diff_lines(found):
         say(line)
-
-
-def check(
-    store: Annotated[str, typer.Argument(help="Store, by name or folder.")],
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
-    from shiftsim.data.store.check import check_store
-    from shiftsim.files import store_path
-
-    path = store_path(store)
-    problems = check_store(path)
-    num_errors = sum(problem.is_error for problem in problems)
-    if as_json:
-        from dataclasses import asdict
-
-        say_json([asdict(problem) for problem in problems])
-    else:
-        for problem in problems:
-            kind = "error" if problem.is_error else "unusual"
-            say(f" {kind}: {problem.where}: {problem.what}")
-        unusual = len(problems) - num_errors
-        say(f"{path}: {plural(num_errors, 'error')}, {unusual} unusual")
-    if num_errors:
-        raise typer.Exit(_DATA)
-
-
-def planners(context: typer.Context, as_json: Json = False, debug: Debug = False) -> None:
-    """The planners that come with shiftsim, and whether they are ready to run."""
-    if context.invoked_subcommand is None:
-        list_planners(as_json)
-
-
-def list_planners(as_json: Json = False, debug: Debug = False) -> None:
-    """The planners that come with shiftsim, and whether they are ready to run."""
-    from dataclasses import asdict
-
-    from shiftsim.planners.registry import PLANNERS, readiness
-
-    missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
-    if as_json:
-        say_json(
-            [
-                {**asdict(entry), "ready": not missing[name], "missing": missing[name]}
-                for name, entry in PLANNERS.items()
-            ]
-        )
-        return
-    for name, entry in PLANNERS.items():
-        say(f" {name:18} {entry.kind:11} {entry.description}")
-        if entry.checkpoint is not None:
-            published = f"{entry.checkpoint.file}, of the project {entry.checkpoint.project}"
-            say(f" {'':18} checkpoint  {published}")
-        if entry.arguments:
-            say(f" {'':18} arguments   --planner-arg {', '.join(entry.arguments)}")
-        if missing[name]:
-            say(f" {'':18} not ready   {missing[name]}")
-    ready = sum(not text for text in missing.values())
-    say(f" {ready} of {len(missing)} are ready to run")
-
-
-def check_one_planner(
-    planner: Annotated[str, typer.Argument(help="Name or package.module:Class.")],
-    planner_arg: Annotated[
-        list[str] | None, typer.Option("--planner-arg", help="key=value; repeatable.")
-    ] = None,
-    store: Annotated[str, typer.Option(help="Store with scenarios to try it on.")] = "demo",
-    token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Does a planner obey the contract? Says what is wrong, and what to do."""
-    from shiftsim.planners.contract import check_planner
-    from shiftsim.planners.registry import load_planner
-    from shiftsim.runs.config import parse_argument
-    from shiftsim.runs.execute import open_named_store
-
-    arguments = {}
-    for text in planner_arg or ():
-        _, name, value = parse_argument(text, (planner,))
-        arguments[name] = value
-    load_planner(planner, arguments)
-    scenes = open_named_store(store)
-    scenario = scenes.read(token or scenes.tokens[0])
-    findings = check_planner(partial(load_planner, planner, arguments), scenario)
-    errors = [finding for finding in findings if finding.severity == "error"]
-    if as_json:
-        from dataclasses import asdict
-
-        say_json([asdict(finding) for finding in findings])
-    else:
-        for finding in findings:
-            say(f" {finding.severity}: {finding.check}: {finding.message}")
-            if finding.hint:
-                say(f"   hint: {finding.hint}")
-        verdict = plural(len(errors), "error") if errors else "obeys the contract"
-        say(f"{planner} on scenario {scenario.token}: {verdict}")
-    if errors:
-        raise typer.Exit(_USAGE)
-
-
-def verify(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
-    mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
-    scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
-    maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
-    require_all: Annotated[
-        bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
-    ] = False,
-    debug: Debug = False,
-) -> None:
-    """Compare with reference outputs of nuPlan's own code.
-
-    Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
-    3 not all covered (with --require-all).
-    """
-    from shiftsim.errors import one_of
-    from shiftsim.verify import MODES
-    from shiftsim.verify import verify as compare
-
-    if mode is not None:
-        one_of("mode", mode, MODES)
-    result = compare(folder, mode=mode, scenes=scenes, maps=maps)
-    for line in result.lines():
-        say(line)
-    raise typer.Exit(result.exit_code(require_all=require_all))
-
-
-def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
-    """Versions, cores and memory, and whether the kernels compute what they should."""
-    from shiftsim.cli.diagnosis import examine
-
-    with progress_bar(quiet=quiet or as_json) as advance:
-        found = examine(advance)
-    if as_json:
-        say_json(found.to_dict())
-    else:
-        for line in found.lines():
-            say(line)
-    if not found.is_well:
-        raise typer.Exit(_DATA)

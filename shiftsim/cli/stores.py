@@ -1,42 +1,58 @@
-"""Commands that work on a whole store: filter, stats, split, export nuplan."""
+"""Commands that work on a whole store: check, filter, stats, split, export nuplan."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.running import AllScenarios, Split, Workers, worker_count
+from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim.cli.options import Settings, with_settings
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.runs.filter import Verdicts
 
-_EXPORT = typer.Typer(help="Write scenarios in the formats of others.")
-_PARTIAL = 3
+_DATA, _PARTIAL = 2, 3
+export = new_app("Write scenarios in the formats of others.", no_args_is_help=True)
 
 Store = Annotated[str, typer.Argument(metavar="STORE", help="Store, by name or folder.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("filter")(filter_scenarios)
-    app.command("stats")(show_stats)
-    app.command("split")(make_split)
-    _EXPORT.command("nuplan")(export_to_nuplan)
-    app.add_typer(_EXPORT, name="export", no_args_is_help=True)
+def check(
+    store: Annotated[str, typer.Argument(help="Store, by name or folder.")],
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
+    from shiftsim.data.store.check import check_store
+    from shiftsim.files import store_path
+
+    path = store_path(store)
+    problems = check_store(path)
+    num_errors = sum(problem.is_error for problem in problems)
+    if as_json:
+        from dataclasses import asdict
+
+        say_json([asdict(problem) for problem in problems])
+    else:
+        for problem in problems:
+            kind = "error" if problem.is_error else "unusual"
+            say(f" {kind}: {problem.where}: {problem.what}")
+        unusual = len(problems) - num_errors
+        say(f"{path}: {plural(num_errors, 'error')}, {unusual} unusual")
+    if num_errors:
+        raise typer.Exit(_DATA)
 
 
+@with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
 def filter_scenarios(
     store: Store,
     min_path: Annotated[float | None, typer.Option(help="Shortest path [m]. [5]")] = None,
     min_progress: Annotated[
         float | None, typer.Option(help="Least share of it along the route. [0.5]")
     ] = None,
-    thresholds: Annotated[
-        str | None, typer.Option(help="nuplan or deepplan. [deepplan]", show_default=False)
-    ] = None,
-    workers: Workers = None,
+    *,
+    settings: Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -46,11 +62,11 @@ def filter_scenarios(
     Dropped scenarios stay in the store and are listed; runs over the whole store leave them out.
     An interrupted filter goes on when it is started again.
     """
-    from shiftsim.runs.execute import open_named_store
     from shiftsim.runs.filter import FilterConfig, filter_store
+    from shiftsim.runs.scenarios import open_named_store
 
     given: dict[str, Any] = {
-        "thresholds": thresholds,
+        "thresholds": settings.get("thresholds"),
         "min_path_m": min_path,
         "min_progress_share": min_progress,
     }
@@ -60,7 +76,7 @@ def filter_scenarios(
         found = filter_store(
             folder,
             config,
-            workers=worker_count(workers),
+            workers=settings.get("workers", 0),
             on_progress=lambda done, total: advance(done, total, ""),
         )
     if as_json:
@@ -89,29 +105,30 @@ def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
 
 
-def _chosen(store: "ScenarioStore", split: str | None, every: bool) -> tuple[str, ...]:
+def _chosen(store: "ScenarioStore", settings: Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
     from shiftsim.runs.filter import read_verdicts
-    from shiftsim.runs.splits import find_split
+    from shiftsim.runs.scenarios import find_split
 
-    if split:
+    if split := settings.get("split"):
         tokens = find_split(split, store.path, store.tokens).tokens
-        lacking = sorted(set(tokens) - set(store.tokens))
-        if lacking:
+        missing = sorted(set(tokens) - set(store.tokens))
+        if missing:
             raise DataError(
-                f"split {split!r} needs {len(tokens)} scenarios, the store lacks {len(lacking)} of"
-                f" them, such as {lacking[0]!r}",
+                f"split {split!r} needs {len(tokens)} scenarios, the store lacks {len(missing)} of"
+                f" them, such as {missing[0]!r}",
                 hint="name the store that was converted for this split",
             )
         return tokens
-    if every:
+    if settings.get("all_scenarios"):
         return store.tokens
     verdicts = read_verdicts(store.path, store.hash)
     usable = store.tokens if verdicts is None else verdicts.accepted
     return store.reviews.usable(store.tokens, usable)
 
 
+@with_settings("split", "all_scenarios")
 def make_split(
     store: Store,
     out: Annotated[
@@ -123,8 +140,8 @@ def make_split(
     cities: Annotated[list[str] | None, typer.Option("--city", help="Repeatable. [all]")] = None,
     per_type: Annotated[int | None, typer.Option(min=1, help="At most N of every type.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="At most N in all.")] = None,
-    split: Split = None,
-    all_scenarios: AllScenarios = False,
+    *,
+    settings: Settings,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -132,13 +149,12 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runs.execute import open_named_store
-    from shiftsim.runs.splits import choose_scenarios, write_split
+    from shiftsim.runs.scenarios import choose_scenarios, open_named_store, write_split
 
     opened = open_named_store(store)
     found = choose_scenarios(
         opened.summary().select(["token", "type", "city"]).to_pylist(),
-        set(_chosen(opened, split, all_scenarios)),
+        set(_chosen(opened, settings)),
         wanted={"type": types or [], "city": cities or []},
         per_type=per_type,
         limit=limit,
@@ -150,11 +166,13 @@ def make_split(
         say(f" {plural(len(found), 'scenario')} of {len(opened)}, hash {written.hash} → {out}")
 
 
+@export.command("nuplan")
+@with_settings("split", "all_scenarios")
 def export_to_nuplan(
     store: Store,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
-    split: Split = None,
-    all_scenarios: AllScenarios = False,
+    *,
+    settings: Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -165,10 +183,10 @@ def export_to_nuplan(
     of the maps too, and merge the two index files.
     """
     from shiftsim.data.nuplan.export import export_nuplan
-    from shiftsim.runs.execute import open_named_store
+    from shiftsim.runs.scenarios import open_named_store
 
     opened = open_named_store(store)
-    tokens = _chosen(opened, split, all_scenarios)
+    tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         report = export_nuplan(opened, out, tokens=tokens, progress=advance)
     mappings: list[dict[str, Any]] = [
@@ -204,6 +222,7 @@ def export_to_nuplan(
     )
 
 
+@with_settings("split", "all_scenarios")
 def show_stats(
     store: Store,
     by: Annotated[str, typer.Option(help="city or type.")] = "city",
@@ -214,8 +233,8 @@ def show_stats(
     figure: Annotated[
         Path | None, typer.Option(help="Draw bars into this file (.png, .svg, .pdf).")
     ] = None,
-    split: Split = None,
-    all_scenarios: AllScenarios = False,
+    *,
+    settings: Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -224,11 +243,11 @@ def show_stats(
     from shiftsim.data.store.statistics import store_stats
     from shiftsim.errors import one_of
     from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
-    from shiftsim.runs.execute import open_named_store
+    from shiftsim.runs.scenarios import open_named_store
 
     one_of("column", by, ("city", "type"))
     opened = open_named_store(store)
-    tokens = _chosen(opened, split, all_scenarios)
+    tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = store_stats(
             opened, tokens, progress=lambda done, total, token: advance(done, total, "")

@@ -29,13 +29,6 @@ Store = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command()(view)
-    app.command()(plot)
-    app.command()(inspect)
-
-
 def view(
     run: RunFolder,
     token: Annotated[
@@ -116,7 +109,7 @@ def inspect(
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.review import REVIEW
-    from shiftsim.runs.execute import open_named_store
+    from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.review.server import ReviewServer
     from shiftsim.view.review.service import Desk
 
@@ -140,8 +133,8 @@ def _gallery(
     seed: list[int] | None,
     store: str | None,
 ) -> "Gallery":
-    from shiftsim.runs.bundle import open_run_store
     from shiftsim.runs.results import open_run
+    from shiftsim.runs.scenarios import open_run_store
     from shiftsim.view.build import Choice, Gallery
 
     opened = [open_run(path) for path in runs]

@@ -1,4 +1,4 @@
-"""Oriented boxes: corners and overlap.
+"""Oriented boxes: corners, overlap, and where a point lies as seen from a pose.
 
 A box is (x, y, heading, length, width) with its centre pose; its corners run front-left, rear-left,
 rear-right, front-right.
@@ -7,23 +7,66 @@ rear-right, front-right.
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
-from shiftsim.geometry.rings import convex_intersect
+from shiftsim.geometry.rings import (
+    EXTERIOR,
+    convex_intersect,
+    locate_in_ring,
+    segments_intersect,
+)
+
+# rad, bearings from the rear axle that at-fault tests compare with
+BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)
 
 
 @lean_kernel
 def box_corners(x: float, y: float, heading: float, length: float, width: float, out: FloatArray):  # type: ignore[no-untyped-def]
-    """Write the corners of a box into `out` (4, 2): front-left, rear-left, rear-right, front-right.
-
-    nuPlan: the lateral axis is evaluated literally at heading + pi/2 (nuplan-simulation.md §3).
-    """
+    """Write the corners of a box into `out` (4, 2), in the order named above [m]."""
     lon_x, lon_y = np.cos(heading), np.sin(heading)
+    # nuPlan rule 1: the lateral axis is evaluated at heading + pi/2, and the offset is summed first
     lat_x, lat_y = np.cos(heading + np.pi / 2.0), np.sin(heading + np.pi / 2.0)
     for index in range(4):
         lon = 0.5 * length if index == 0 or index == 3 else -0.5 * length
         lat = 0.5 * width if index < 2 else -0.5 * width
-        # nuPlan: the offset is summed first, which decides the last bit
         out[index, 0] = x + (lat * lat_x + lon * lon_x)
         out[index, 1] = y + (lat * lat_y + lon * lon_y)
+
+
+@lean_kernel
+def circle_around(box: FloatArray) -> tuple[float, float, float]:
+    """Centre and radius of a circle around a box (4, 2), a little larger than it [m]."""
+    x, y = 0.5 * (box[0, 0] + box[2, 0]), 0.5 * (box[0, 1] + box[2, 1])
+    return x, y, np.hypot(box[0, 0] - x, box[0, 1] - y) + 1e-6
+
+
+@lean_kernel
+def bearing(pose: FloatArray, x: float, y: float) -> float:
+    """Angle between the heading of a pose (3,) and the direction to a point, in [0, pi] [rad]."""
+    # nuPlan rule 3: the cosine is not clamped, so the angle may be NaN
+    dx, dy = x - pose[0], y - pose[1]
+    distance = np.sqrt(dx * dx + dy * dy)
+    return np.arccos(np.cos(pose[2]) * (dx / distance) + np.sin(pose[2]) * (dy / distance))
+
+
+@lean_kernel
+def front_touches(box: FloatArray, ring: FloatArray) -> bool:
+    """Whether the front edge of a box (4, 2) touches the area of a convex ring (V, 2)."""
+    if locate_in_ring(ring, box[0, 0], box[0, 1]) != EXTERIOR:
+        return True
+    for index in range(len(ring)):
+        if segments_intersect(box[0], box[3], ring[index - 1], ring[index]):
+            return True
+    return False
+
+
+@lean_kernel
+def meets_bounds(box: FloatArray, bounds: FloatArray) -> bool:
+    """Whether the bounds of a box (4, 2) overlap `bounds` (4,) min x, min y, max x, max y."""
+    return (
+        max(box[0, 0], box[1, 0], box[2, 0], box[3, 0]) >= bounds[0]
+        and max(box[0, 1], box[1, 1], box[2, 1], box[3, 1]) >= bounds[1]
+        and min(box[0, 0], box[1, 0], box[2, 0], box[3, 0]) <= bounds[2]
+        and min(box[0, 1], box[1, 1], box[2, 1], box[3, 1]) <= bounds[3]
+    )
 
 
 def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Polylines: arc length, projection, points by distance."""
+"""Polylines: arc length, headings, nearest vertices, projection, points by distance."""
 
 import numpy as np
 
@@ -53,6 +53,49 @@ def point_on_polyline(
         xy[index, 0] + along * (xy[index + 1, 0] - xy[index, 0]),
         xy[index, 1] + along * (xy[index + 1, 1] - xy[index, 1]),
     )
+
+
+@lean_kernel
+def interpolate(start: float, end: float, span: float, ahead: float) -> float:
+    """Value `ahead` of the start on the way from `start` to `end`, which is `span` long."""
+    # nuPlan rule 4: the slope comes first, so that the end may be missed by the last bit
+    return (end - start) / span * ahead + start
+
+
+@lean_kernel
+def vertex_heading(xy: FloatArray, index: int, stop: int) -> float:
+    """Direction from a vertex to the next one; the last, `stop` - 1, repeats that before [rad]."""
+    at = min(index, stop - 2)
+    return np.arctan2(xy[at + 1, 1] - xy[at, 1], xy[at + 1, 0] - xy[at, 0])
+
+
+def vertex_headings(xy: FloatArray) -> FloatArray:
+    """(K,) direction from each vertex (K, 2) to the next; the last repeats that before [rad]."""
+    step = np.diff(xy, axis=0)
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    return np.append(heading, heading[-1])
+
+
+@lean_kernel
+def nearest_vertex(
+    xy: FloatArray, start: int, stop: int, stride: int, x: float, y: float
+) -> tuple[int, float]:
+    """The vertex nearest to a point and its distance [m]; the first one on ties.
+
+    Args:
+        xy: (V, 2) vertices of many polylines [m].
+        start: First vertex of the polyline.
+        stop: One past its last vertex.
+        stride: Only every so manieth vertex is looked at.
+        x: Point [m].
+        y: Point [m].
+    """
+    best, found = np.inf, start
+    for index in range(start, stop, stride):
+        distance = np.hypot(xy[index, 0] - x, xy[index, 1] - y)
+        if distance < best:
+            best, found = distance, index
+    return found, best
 
 
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:

@@ -42,22 +42,26 @@ def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
 
 
 @lean_kernel
-def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """Whether the closed segments a-b and c-d, points (2,) each, share a point."""
+def segments_meet(
+    ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
+) -> bool:
+    """Whether the closed segments a-b and c-d share a point."""
     if (
-        max(a[0], b[0]) < min(c[0], d[0])
-        or max(c[0], d[0]) < min(a[0], b[0])
-        or max(a[1], b[1]) < min(c[1], d[1])
-        or max(c[1], d[1]) < min(a[1], b[1])
+        max(ax, bx) < min(cx, dx)
+        or max(cx, dx) < min(ax, bx)
+        or max(ay, by) < min(cy, dy)
+        or max(cy, dy) < min(ay, by)
     ):
         return False
-    o1 = orientation(a[0], a[1], b[0], b[1], c[0], c[1])
-    o2 = orientation(a[0], a[1], b[0], b[1], d[0], d[1])
-    if o1 * o2 > 0:
+    if orientation(ax, ay, bx, by, cx, cy) * orientation(ax, ay, bx, by, dx, dy) > 0:
         return False
-    o3 = orientation(c[0], c[1], d[0], d[1], a[0], a[1])
-    o4 = orientation(c[0], c[1], d[0], d[1], b[0], b[1])
-    return o3 * o4 <= 0
+    return orientation(cx, cy, dx, dy, ax, ay) * orientation(cx, cy, dx, dy, bx, by) <= 0
+
+
+@lean_kernel
+def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
+    """As `segments_meet`, for points (2,)."""
+    return segments_meet(a[0], a[1], b[0], b[1], c[0], c[1], d[0], d[1])
 
 
 @lean_kernel
@@ -197,26 +201,61 @@ def boundary_distance_below(
 
 
 @lean_kernel
+def rings_touch(a: FloatArray, b: FloatArray) -> bool:
+    """Whether the areas of two simple rings (V, 2) share a point; touching counts."""
+    if (
+        locate_in_ring(a, b[0, 0], b[0, 1]) != EXTERIOR
+        or locate_in_ring(b, a[0, 0], a[0, 1]) != EXTERIOR
+    ):
+        return True
+    for i in range(len(a)):
+        for j in range(len(b)):
+            if segments_intersect(a[i - 1], a[i], b[j - 1], b[j]):
+                return True
+    return False
+
+
+@lean_kernel
 def ring_distance(a: FloatArray, b: FloatArray) -> float:
-    """Distance between two convex rings (V, 2), counter-clockwise; 0 when they share a point."""
-    if convex_intersect(a, b):
+    """Distance between the areas of two simple rings (V, 2); 0 when they share a point [m]."""
+    if rings_touch(a, b):
         return 0.0
     best = np.inf
-    for swap in range(2):
-        first, second = (a, b) if swap == 0 else (b, a)
-        before = len(second) - 1
-        for edge in range(len(second)):
-            for vertex in range(len(first)):
-                best = min(
-                    best,
-                    point_segment_distance(
-                        first[vertex, 0],
-                        first[vertex, 1],
-                        second[before, 0],
-                        second[before, 1],
-                        second[edge, 0],
-                        second[edge, 1],
-                    ),
-                )
-            before = edge
+    for i in range(len(a)):
+        for j in range(len(b)):
+            p, q, c, d = a[i - 1], a[i], b[j - 1], b[j]
+            best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
+            best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
     return best
+
+
+@lean_kernel
+def ring_segment_distance(ring: FloatArray, a: FloatArray, b: FloatArray) -> float:
+    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m]."""
+    if locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
+        return 0.0
+    best = np.inf
+    for index in range(len(ring)):
+        c, d = ring[index - 1], ring[index]
+        if segments_intersect(a, b, c, d):
+            return 0.0
+        best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
+        best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
+        best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
+    return best
+
+
+@lean_kernel
+def centroid(ring: FloatArray) -> tuple[float, float]:
+    """Centroid of the area of a ring (V, 2) [m]."""
+    # nuPlan rule 2: triangles from the first vertex, of coordinates that are not reduced
+    area = x = y = 0.0
+    ox, oy = ring[0, 0], ring[0, 1]
+    for index in range(len(ring)):
+        after = index + 1 if index + 1 < len(ring) else 0
+        ax, ay, bx, by = ring[index, 0], ring[index, 1], ring[after, 0], ring[after, 1]
+        double = (ax - ox) * (by - oy) - (bx - ox) * (ay - oy)
+        x += double * (ox + ax + bx)
+        y += double * (oy + ay + by)
+        area += double
+    return x / 3.0 / area, y / 3.0 / area

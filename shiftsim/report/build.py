@@ -2,8 +2,9 @@
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 from shiftsim.errors import one_of
@@ -27,7 +28,8 @@ TABLES = (
     "data-statistics",
     "benchmark-comparison",
 )
-_LONG = ("planner-comparison-noise", "data-statistics", "benchmark-comparison")
+_ABOUT_DATA = ("data-statistics", "benchmark-comparison")
+_LONG = ("planner-comparison-noise", *_ABOUT_DATA)
 BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
 
 
@@ -65,25 +67,28 @@ def make_tables(
     chosen = options or Options()
     partial = chosen.allow_partial
     beside = published if chosen.beside else None
-    out: list[Table | None] = []
-    if "semantic-shift" in chosen.tables:
-        out += paper.semantic_shift(groups, published, beside=chosen.beside, allow_partial=partial)
-    if "noise-robustness" in chosen.tables:
-        out.append(paper.noise_robustness(groups, beside, allow_partial=partial))
-    if "planner-comparison" in chosen.tables:
-        out.append(details.planner_comparison(groups))
-    if "planner-comparison-noise" in chosen.tables:
-        out.append(details.planner_comparison(groups, noisy=True))
-    if "scenario-types" in chosen.tables:
-        out += details.scenario_types(groups, allow_partial=partial)
-    if "scores" in chosen.tables:
-        out.append(scores(groups, by=chosen.by, allow_partial=partial))
-    if "planning-time" in chosen.tables:
-        out.append(details.planning_times(groups))
+    statistics = cache(lambda: data_tables.own_statistics(groups))
+    makers: dict[str, Callable[[], Sequence[Table | None]]] = {
+        "semantic-shift": lambda: paper.semantic_shift(
+            groups, published, beside=chosen.beside, allow_partial=partial
+        ),
+        "noise-robustness": lambda: [paper.noise_robustness(groups, beside, allow_partial=partial)],
+        "planner-comparison": lambda: [details.planner_comparison(groups)],
+        "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
+        "scenario-types": lambda: details.scenario_types(groups, allow_partial=partial),
+        "scores": lambda: [scores(groups, by=chosen.by, allow_partial=partial)],
+        "planning-time": lambda: [details.planning_times(groups)],
+        "data-statistics": lambda: [data_tables.data_statistics(statistics())],
+        "benchmark-comparison": lambda: (
+            [data_tables.benchmark_comparison(published, statistics())] if published else []
+        ),
+    }
     made_up = made_up_note(group.run for group in groups)
-    driven = [_noted(table, made_up) for table in out if table is not None]
-    about_data = [table for table in _data_tables(groups, published, chosen) if table is not None]
-    return _named_apart([*driven, *about_data])
+    out: list[Table] = []
+    for name in (name for name in TABLES if name in chosen.tables):
+        note = "" if name in _ABOUT_DATA else made_up
+        out += [_noted(table, note) for table in makers[name]() if table is not None]
+    return _named_apart(out)
 
 
 def _noted(table: Table, note: str) -> Table:
@@ -105,20 +110,6 @@ def _named_apart(tables: Sequence[Table]) -> list[Table]:
     return out
 
 
-def _data_tables(
-    groups: Sequence[Group], published: Published | None, options: Options
-) -> list[Table | None]:
-    if not {"data-statistics", "benchmark-comparison"} & set(options.tables):
-        return []
-    found = data_tables.own_statistics(groups)
-    out: list[Table | None] = []
-    if "data-statistics" in options.tables:
-        out.append(data_tables.data_statistics(found))
-    if "benchmark-comparison" in options.tables and published is not None:
-        out.append(data_tables.benchmark_comparison(published, found))
-    return out
-
-
 def write_report(
     folder: Path, tables: Sequence[Table], drawn: Sequence[Figure], styles: Sequence[str]
 ) -> list[Path]:
@@ -134,21 +125,20 @@ def write_report(
         The files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = [figure.save(folder) for figure in drawn]
+    pictures = {figure.save(folder): figure.title for figure in drawn}
     out = [*pictures]
     for style in styles:
-        ending = ENDINGS[style]
+        parts = [render(table, style) for table in tables]
         if style == "csv":
-            files = {f"{table.name}.csv": render(table, style) for table in tables}
+            files = {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
         else:
-            text = "\n\n".join(render(table, style) for table in tables)
-            titles = [figure.title for figure in drawn]
+            text = "\n\n".join(parts)
             if style == "html":
-                text = _page(text, pictures, titles)
+                text = _page(text, pictures)
             elif style == "md":
-                named = zip(titles, pictures, strict=True)
-                text = "\n\n".join([text, *(f"![{t}]({path.name})" for t, path in named)])
-            files = {f"report.{ending}": text}
+                images = (f"![{title}]({path.name})" for path, title in pictures.items())
+                text = "\n\n".join([text, *images])
+            files = {f"report.{ENDINGS[style]}": text}
         for name, text in files.items():
             path = folder / name.replace("/", "-")
             path.write_text(f"{text}\n", encoding="utf-8")
@@ -171,12 +161,12 @@ img { max-width: 100%; margin-top: 1.5rem; }
 """
 
 
-def _page(body: str, pictures: Sequence[Path], titles: Sequence[str]) -> str:
+def _page(body: str, pictures: Mapping[Path, str]) -> str:
     """One HTML file that holds its pictures."""
     images = (
         f'<img alt="{html.escape(title)}" src="data:image/png;base64,'
         f'{base64.b64encode(path.read_bytes()).decode()}">'
-        for title, path in zip(titles, pictures, strict=True)
+        for path, title in pictures.items()
     )
     return "\n".join(
         [

@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 
 from shiftsim.data.store.statistics import ALL, StoreStats, store_stats
 from shiftsim.errors import DataError
-from shiftsim.report.groups import DataSet, Group
-from shiftsim.report.paper import distinct_sets
+from shiftsim.report.groups import DataSet, Group, distinct_sets
 from shiftsim.report.published import Published
 from shiftsim.report.tables import Cell, Number, Table
-from shiftsim.runs.bundle import open_run_store
 from shiftsim.runs.results import Run
+from shiftsim.runs.scenarios import open_run_store
 
 _COLUMNS = {
     "vehicles_t0": "vehicles t0",

@@ -1,8 +1,7 @@
 """Statistics of a store as tables and as a picture."""
 
-import csv
-import io
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from shiftsim.data.store.statistics import (
     ALL,
@@ -11,8 +10,12 @@ from shiftsim.data.store.statistics import (
     PUBLISHED_SETS,
     StoreStats,
 )
-from shiftsim.errors import ConfigError, MissingExtraError, one_of
+from shiftsim.errors import ConfigError, one_of
+from shiftsim.report.palette import new_figure, save_picture
+from shiftsim.report.tables import aligned
+from shiftsim.report.writers import csv_text
 
+_Means: TypeAlias = dict[str, dict[str, float]]
 FORMATS = ("text", "csv")
 _HEADINGS = {
     "scenarios": "scenarios",
@@ -55,40 +58,26 @@ def stats_table(stats: StoreStats, *, by: str = "city", style: str = "text") -> 
         return _csv(stats)
     lines = [[by, *_HEADINGS.values()]]
     for name, row in stats.groups(by).items():
-        lines.append(
-            [
-                name,
-                f"{row['scenarios']:.0f}",
-                *(_cell(n, row) for n in _HEADINGS if n != "scenarios"),
-            ]
-        )
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = [
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+        lines.append([name, *(_cell(column, row) for column in _HEADINGS)])
     notes = "means per scenario; t0 = at iteration 0, else over all iterations; m, m/s"
     sets = ", ".join(f"{name} {count}" for name, count in PUBLISHED_SETS.items())
-    return "\n".join([*text, f" {notes}", f" published scenarios: {sets}"])
+    return "\n".join([*aligned(lines, 1), f" {notes}", f" published scenarios: {sets}"])
 
 
 def _cell(name: str, row: dict[str, float]) -> str:
     if name not in row:
         return "–"
-    return f"{100.0 * row[name]:.0f} %" if name == "intersection" else f"{row[name]:.1f}"
+    if name == "intersection":
+        return f"{100.0 * row[name]:.0f} %"
+    return f"{row[name]:.0f}" if name == "scenarios" else f"{row[name]:.1f}"
 
 
 def _csv(stats: StoreStats) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["token", "city", "type", *COLUMNS])
+    rows = [["token", "city", "type", *COLUMNS]]
     for token, row in stats.rows.items():
         numbers = [repr(getattr(row, name)) for name in COLUMNS]
-        writer.writerow([token, stats.cities[token], stats.types[token], *numbers])
-    return out.getvalue().rstrip("\n")
+        rows.append([token, stats.cities[token], stats.types[token], *numbers])
+    return csv_text(rows)
 
 
 def stats_dict(stats: StoreStats) -> dict[str, object]:
@@ -116,15 +105,9 @@ def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
         MissingExtraError: matplotlib is not installed.
         ConfigError: The ending is none that can be drawn.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "the picture needs matplotlib", hint="pip install 'shiftsim[plots]'"
-        ) from error
+    figure = new_figure(figsize=(11.0, 4.2))
     groups = stats.groups("city")
     cities = [name for name in groups if name != ALL]
-    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.7, 1.0))
     _draw_counts(left, cities, groups)
     _draw_agents(middle, [*cities, ALL], groups)
@@ -134,14 +117,12 @@ def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
         axes.tick_params(axis="x", labelrotation=0 if len(cities) < 4 else 30)
     figure.suptitle(title)
     try:
-        figure.savefig(
-            path, dpi=150, metadata={"Software": None} if path.suffix == ".png" else None
-        )
+        save_picture(figure, path)
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
 
 
-def _draw_counts(axes, cities, groups) -> None:  # type: ignore[no-untyped-def]  # matplotlib has no types here
+def _draw_counts(axes: Any, cities: list[str], groups: _Means) -> None:
     counts = [groups[name]["scenarios"] for name in cities]
     axes.bar(cities, counts, color="#3b6ea5", label="this store", width=0.6)
     published = [published_scenarios(name) for name in cities]
@@ -164,7 +145,7 @@ def _draw_counts(axes, cities, groups) -> None:  # type: ignore[no-untyped-def] 
     axes.set_xlabel(f"published sets:\n{sets}", fontsize=8, color="0.35")
 
 
-def _draw_agents(axes, names, groups) -> None:  # type: ignore[no-untyped-def]  # matplotlib has no types here
+def _draw_agents(axes: Any, names: list[str], groups: _Means) -> None:
     width = 0.27
     for shift, (kind, color) in enumerate(_COLORS.items(), -1):
         places = [place + shift * width for place in range(len(names))]
@@ -180,7 +161,7 @@ def _draw_agents(axes, names, groups) -> None:  # type: ignore[no-untyped-def]  
     axes.legend(frameon=False, ncols=3, loc="upper center")
 
 
-def _draw_interactions(axes, names, groups) -> None:  # type: ignore[no-untyped-def]  # matplotlib has no types here
+def _draw_interactions(axes: Any, names: list[str], groups: _Means) -> None:
     values = [groups[name].get("interactions", 0.0) for name in names]
     axes.bar(names, values, color="#8a5aa8", width=0.6)
     for place, value in enumerate(values):

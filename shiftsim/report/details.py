@@ -1,14 +1,15 @@
 """Tables beyond the paper's: planners compared, scenario types, planning times."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.report.groups import Group
-from shiftsim.report.paper import distinct_sets, traffics
-from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, cluster_codes, compare, holm
+from shiftsim.arrays import FloatArray
+from shiftsim.report.groups import Group, distinct_sets
+from shiftsim.report.paper import traffics
+from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
 from shiftsim.report.tables import Cell, Number, Table
 from shiftsim.runs.results import Run
 
@@ -20,84 +21,54 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         groups: The groups.
         noisy: Compare under noise instead of without.
     """
+    blocks: dict[tuple[object, ...], list[Group]] = {}  # they differ in nothing but the planner
+    for group in groups:
+        if group.is_complete and (group.noise != "none") == noisy:
+            key = (group.data.key, group.traffic, group.noise, group.seeds)
+            blocks.setdefault(key, []).append(group)
     rows: list[tuple[Cell, ...]] = []
-    recordings: set[int] = set()
+    num_recordings: set[int] = set()
     smallest = 0.0
-    for block in _blocks(group for group in groups if (group.noise != "none") == noisy):
+    for block in blocks.values():
         pairs = list(combinations(block, 2))
-        data = block[0].data
-        clusters = cluster_codes(data.recordings)
+        clusters = cluster_codes(block[0].data.recordings)
         results = [compare(100.0 * a.column(), 100.0 * b.column(), clusters) for a, b in pairs]
         corrected = holm([result.p_value for result in results])
-        for (a, b), result, p_value in zip(pairs, results, corrected, strict=True):
-            rows.append(_comparison_row(a, b, result, p_value))
-            recordings.add(data.num_recordings)
+        for (first, second), result, p_value in zip(pairs, results, corrected, strict=True):
+            num_recordings.add(first.data.num_recordings)
             smallest = max(smallest, result.smallest_p)
+            rows.append(
+                (
+                    *(first.data.label, first.traffic, first.noise, first.planner, second.planner),
+                    Number(result.difference),
+                    result.interval,
+                    f"{result.wins}/{result.ties}/{result.losses}",
+                    Number(result.p_value, 4),
+                    Number(p_value, 4),
+                )
+            )
     if not rows:
         return None
+    notes = [
+        *(data.rules for data in distinct_sets(groups)),
+        "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
+        "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
+    ]
+    if min(num_recordings) < FEW_CLUSTERS:
+        notes.append(
+            f"few recordings ({min(num_recordings)}): intervals are too narrow, and no p can be "
+            f"below {smallest:.4f}"
+        )
+    labels = ("set", "traffic", "noise", "first", "second")
     return Table(
         "planner-comparison-noise" if noisy else "planner-comparison",
         f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
         "difference of CLS x 100, first minus second",
-        (
-            "set",
-            "traffic",
-            "noise",
-            "first",
-            "second",
-            "difference",
-            "95 % CI",
-            "better/same/worse",
-            "p",
-            "p (Holm)",
-        ),
+        (*labels, "difference", "95 % CI", "better/same/worse", "p", "p (Holm)"),
         tuple(rows),
-        5,
-        (
-            *(data.rules for data in distinct_sets(groups)),
-            *_comparison_notes(min(recordings), smallest),
-        ),
+        len(labels),
+        tuple(notes),
     )
-
-
-def _blocks(groups: Iterable[Group]) -> list[list[Group]]:
-    """Complete groups that differ in nothing but the planner; two or more."""
-    found: dict[tuple[object, ...], list[Group]] = {}
-    for group in groups:
-        if group.is_complete:
-            key = (group.data.key, group.traffic, group.noise, group.seeds)
-            found.setdefault(key, []).append(group)
-    return [block for block in found.values() if len(block) > 1]
-
-
-def _comparison_row(
-    first: Group, second: Group, result: Comparison, p_value: float
-) -> tuple[Cell, ...]:
-    return (
-        first.data.label,
-        first.traffic,
-        first.noise,
-        first.planner,
-        second.planner,
-        Number(result.difference),
-        result.interval,
-        f"{result.wins}/{result.ties}/{result.losses}",
-        Number(result.p_value, 4),
-        Number(p_value, 4),
-    )
-
-
-def _comparison_notes(num_recordings: int, smallest: float) -> list[str]:
-    notes = [
-        "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
-        "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
-    ]
-    if num_recordings < FEW_CLUSTERS:
-        notes.append(
-            f"few recordings ({num_recordings}): intervals are too narrow, and no p can be below "
-            f"{smallest:.4f}"
-        )
-    return notes
 
 
 def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Table]:
@@ -109,24 +80,17 @@ def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> l
         if len(types) < 2:
             continue
         mine = [group for group in clean if group.data.key == data.key]
-        columns = [(t, g) for t in traffics(mine) for g in mine if g.traffic == t]
-        kinds = np.array(data.types)
-        rows = [
-            (
-                name or "unknown",
-                Number(int(np.sum(kinds == name)), 0),
-                *(
-                    g.estimate("cls", kinds == name, allow_partial=allow_partial)
-                    for _, g in columns
-                ),
-            )
-            for name in types
-        ]
+        columns = [g for traffic in traffics(mine) for g in mine if g.traffic == traffic]
+        rows: list[tuple[Cell, ...]] = []
+        for name in types:
+            where = np.array(data.types) == name
+            scores = (g.estimate("cls", where, allow_partial=allow_partial) for g in columns)
+            rows.append((name or "unknown", Number(int(where.sum()), 0), *scores))
         out.append(
             Table(
                 f"scenario-types_{data.name}",
                 f"Scores by scenario type: {data.label}, clean, CLS x 100",
-                ("type", "scenarios", *(f"{g.planner} {t}" for t, g in columns)),
+                ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in columns)),
                 tuple(rows),
                 1,
                 (data.rules,),
@@ -135,63 +99,44 @@ def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> l
     return out
 
 
-def planning_times(groups: Sequence[Group]) -> Table | None:
-    """How long planners think, and how often a makeshift plan had to do."""
-    rows = []
-    runs: dict[object, Run] = {}
-    for first in {(g.run.path, g.planner): g for g in groups}.values():
-        runs[first.run.path] = first.run
-        rows.append(_times_row(first, _own_name(first)))
-    notes = [f"machine: {_machine(run)}" for run in runs.values()]
+def planning_times(groups: Sequence[Group]) -> Table:
+    """How long planners think, and how often the simulator's fallback plan had to do."""
+    each = {(group.run.path, group.planner): group for group in groups}
+    runs = {group.run.path: group.run for group in groups}
+    labels = ("set", "traffic", "planner")
+    times = ("ms per step", "95 % ms", "worst 95 % ms", "s per rollout")
     return Table(
         "planning-time",
         "Planning time, and steps driven on a degraded (makeshift) plan",
-        (
-            "set",
-            "traffic",
-            "planner",
-            "rollouts",
-            "ms per step",
-            "95 % ms",
-            "worst 95 % ms",
-            "s per rollout",
-            "degraded steps",
-            "in rollouts",
-        ),
-        tuple(rows),
-        3,
+        (*labels, "rollouts", *times, "degraded steps", "in rollouts"),
+        tuple(_times_row(group) for group in each.values()),
+        len(labels),
         (
             "per step: mean and 95th percentile within a rollout, of both the median over the "
             "rollouts, which compilation at the start of a run does not touch; per rollout: the "
             "median of reading, driving and scoring",
-            *dict.fromkeys(notes),
+            *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
         ),
     )
 
 
-def _own_name(group: Group) -> str:
-    """The planner as it is called in its run."""
-    return group.planner.removesuffix(f" @{group.run.path.name}")
-
-
-def _times_row(group: Group, planner: str) -> tuple[Cell, ...]:
+def _times_row(group: Group) -> tuple[Cell, ...]:
+    planner = group.planner.removesuffix(f" @{group.run.path.name}")  # as its run calls it
     tasks, scores = group.run.tasks, group.run.scores
     done = tasks.filter(
         pc.and_(pc.equal(tasks["planner"], planner), pc.equal(tasks["status"], "ok"))
     )
     degraded = scores.filter(pc.equal(scores["planner"], planner))["degraded_steps"].to_numpy()
 
-    def numbers(name: str) -> np.ndarray:
+    def known(name: str) -> FloatArray:
         values = done[name].to_numpy() if name in done.column_names else np.zeros(0)
         return values[np.isfinite(values)]
 
-    parts = [numbers(f"{name}_seconds") for name in ("read", "simulate", "metrics")]
+    parts = [known(f"{name}_seconds") for name in ("read", "simulate", "metrics")]
     each = [float(np.median(values)) for values in parts if len(values)]
-    mean, tail = numbers("planning_ms_mean"), numbers("planning_ms_p95")
+    mean, tail = known("planning_ms_mean"), known("planning_ms_p95")
     return (
-        group.data.label,
-        group.traffic,
-        group.planner,
+        *(group.data.label, group.traffic, group.planner),
         Number(len(done), 0),
         Number(float(np.median(mean))) if len(mean) else None,
         Number(float(np.median(tail))) if len(tail) else None,

@@ -1,9 +1,11 @@
 """Why a rollout has its score: every metric, its value, threshold and first violation."""
 
-import difflib
 from typing import Any
 
-from shiftsim.errors import ConfigError
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from shiftsim.errors import ConfigError, nearest
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -48,10 +50,10 @@ def select_tasks(
         ConfigError: There is no such task, or several scenarios begin like that.
     """
     full = _find_token(run, token)
-    wanted = {"planner": planner, "noise": noise, "seed": seed, "token": full}
+    wanted = {"planner": planner, "noise": noise, "seed": seed}
     rows = [
         row
-        for row in run.tasks.to_pylist()
+        for row in _rows_of(run.tasks, full)
         if all(value is None or row[name] == value for name, value in wanted.items())
     ]
     if not rows:
@@ -60,16 +62,20 @@ def select_tasks(
             f"run {run.path.name!r} has no task planner={planner} noise={noise} seed={seed}",
             hint=f"planners {config['planners']}, noise {config['noise']}, seeds {config['seeds']}",
         )
-    scores = {_key(row): row for row in run.scores.to_pylist()}
+    scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}
-    for row in run.metrics.to_pylist():
-        metrics.setdefault(_key(row), []).append(row)
+    for row in _rows_of(run.metrics, full):
+        metrics.setdefault(_key(row), []).append(_with_role(row))
     out = []
     for row in rows:
-        cls = scores.get(_key(row), {}).get("cls")
-        known = [_with_role(metric) for metric in metrics.get(_key(row), [])]
+        cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
         out.append({**row, "cls": cls, "why": why(cls, known), "metrics": known})
     return out
+
+
+def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = table.filter(pc.equal(table["token"], token)).to_pylist()
+    return rows
 
 
 def _with_role(row: dict[str, Any]) -> dict[str, Any]:
@@ -100,8 +106,11 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
 def _first_violation(row: dict[str, Any]) -> str:
     if row["first_violation_iteration"] is None:
         return ""
-    partner = f", track {row['partner_token']}" if row["partner_token"] else ""
-    return f" ({row['first_violation_s']:.1f} s{partner})"
+    return f" ({row['first_violation_s']:.1f} s{_partner(row)})"
+
+
+def _partner(row: dict[str, Any]) -> str:
+    return f", track {row['partner_token']}" if row["partner_token"] else ""
 
 
 def _key(row: dict[str, Any]) -> Task:
@@ -119,10 +128,10 @@ def _find_token(run: Run, token: str) -> str:
         raise ConfigError(
             f"{len(found)} scenarios begin with {token!r}", hint=f"such as {', '.join(found[:4])}"
         )
-    near = difflib.get_close_matches(token, tokens, n=1) or tokens[:1]
+    near = nearest(token, tokens) or next(iter(tokens), "")
     raise ConfigError(
         f"run {run.path.name!r} has no scenario {token!r}",
-        hint=f"did you mean {near[0]!r}?" if near else "the run is empty",
+        hint=f"did you mean {near!r}?" if near else "the run is empty",
     )
 
 
@@ -131,40 +140,30 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
     seed = "" if task["noise"] == "none" else f"  seed {task['seed']}"
     head = f"{task['token']}  {task['scenario_type']}  {task['planner']} {task['noise']}{seed}"
     if task["status"] != "ok":
-        lines = [f"{head}  {task['status']}", f"  {task['error']}"]
-        lines += [f"  hint: {task['hint']}"] if task["hint"] else []
-        return lines + [f"  {line}" for line in (task["traceback"] or "").splitlines()]
-    lines = [f"{head}  CLS {task['cls']:.4f}"]
-    lines.append(f"  {task['why']}")
-    lines.append("  the score is the product of the × rows and the weighted mean of the + rows")
-    scored = [row for row in task["metrics"] if row["metric"] in SHORT_NAMES]
-    scored.sort(key=lambda row: row["metric"] not in MULTIPLIERS)
-    others = [row for row in task["metrics"] if row["metric"] not in SHORT_NAMES]
-    return lines + [f"  {_metric_line(row)}" for row in scored + others]
+        hint = [f"hint: {task['hint']}"] if task["hint"] else []
+        lines = [task["error"], *hint, *(task["traceback"] or "").splitlines()]
+        return [f"{head}  {task['status']}", *(f"  {line}" for line in lines)]
+    rule = "the score is the product of the × rows and the weighted mean of the + rows"
+    rank = ("multiplier", "weighted", "").index
+    rows = sorted(task["metrics"], key=lambda row: rank(row["role"]))
+    lines = [task["why"], rule, *map(_metric_line, rows)]
+    return [f"{head}  CLS {task['cls']:.4f}", *(f"  {line}" for line in lines)]
 
 
 def _metric_line(row: dict[str, Any]) -> str:
-    name = row["metric"]
-    role, weight = " ", ""
-    if name in MULTIPLIERS:
-        role = "×"
-    elif name in WEIGHTS:
-        role, weight = "+", f"weight {WEIGHTS[name]:g}"
+    name, unit = row["metric"], _UNITS.get(row["unit"], row["unit"])
+    unit = f" {unit}" if unit else ""
+    role = {"multiplier": "×", "weighted": "+"}.get(row["role"], " ")
+    weight = "" if row["weight"] is None else f"weight {row['weight']:g}"
     score = "–" if row["score"] is None else f"{row['score']:.4f}"
     parts = [f"{role} {SHORT_NAMES.get(name, ''):3} {name:33} {score:>6}", f"{weight:8}"]
     if row["value"] is not None:
-        parts.append(f"value {row['value']:.4g}{_unit(row)}")
+        parts.append(f"value {row['value']:.4g}{unit}")
     if row["threshold"] is not None:
-        parts.append(f"threshold {row['threshold']:.4g}{_unit(row)}")
+        parts.append(f"threshold {row['threshold']:.4g}{unit}")
     if row["first_violation_iteration"] is not None:
-        partner = f", track {row['partner_token']}" if row["partner_token"] else ""
-        value = f"{row['first_violation_value']:.4g}{_unit(row)}"
+        value = f"{row['first_violation_value']:.4g}{unit}"
         if name == _COLLISIONS:  # its value counts collisions, that of a violation is a speed
             value = f"delta-v {value} m/s"
-        parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{partner}")
+        parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{_partner(row)}")
     return "  ".join(parts).rstrip()
-
-
-def _unit(row: dict[str, Any]) -> str:
-    unit = _UNITS.get(row["unit"], row["unit"])
-    return f" {unit}" if unit else ""

@@ -4,18 +4,17 @@ Planners differ in colour, marker and dash, so that they stay apart without colo
 of groups whose score is withheld.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from shiftsim.errors import MissingExtraError
-from shiftsim.report.groups import COLUMNS, DataSet, Estimate, Group
-from shiftsim.report.palette import Look, looks
-from shiftsim.report.paper import METRICS, distinct_sets, traffics
-from shiftsim.report.statistics import Interval
+from shiftsim.arrays import BoolArray
+from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
+from shiftsim.report.palette import Look, looks, new_figure, save_picture
+from shiftsim.report.paper import METRICS, traffics
+from shiftsim.report.statistics import score_interval
+from shiftsim.report.tables import Estimate
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
@@ -23,8 +22,8 @@ _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 2, 2)), (0, (7, 2, 2, 2, 2, 2)))
 _SIZES = {"*": 1.7, "P": 1.2, "X": 1.2, "D": 0.85}  # markers of equal weight to the eye
 _SPREAD = 0.62  # how much of a place on the axis the planners share
-_DPI = 150
 _GREY = "0.45"
+_BARS = "bars: 95 % bootstrap interval over recordings"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +43,16 @@ class Figure:
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""
         path = folder / f"{self.name}.{ending}"
-        plain = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-        self.drawn.savefig(path, dpi=_DPI, metadata=plain[ending])
+        save_picture(self.drawn, path)
         return path
+
+
+class _Place(NamedTuple):
+    """A place on the axis: its heading, and the score that is drawn there."""
+
+    heading: str
+    column: str = "cls"
+    where: BoolArray | None = None
 
 
 def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Figure]:
@@ -55,22 +61,27 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    try:
-        import matplotlib.figure  # noqa: F401  # to fail here with a hint
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
-        ) from error
     out = []
     styles = looks(dict.fromkeys(group.planner for group in groups))
     for data in _named_apart(distinct_sets(groups)):
         mine = [group for group in groups if group.data.key[1:] == data.key[1:]]
         shown = [g for g in mine if _estimate(g, allow_partial) is not None]
-        out += _robustness(data, shown, styles, allow_partial)
         clean = [group for group in shown if group.noise == "none"]
+        out += _robustness(data, shown, styles, allow_partial)
+        cities = sorted({city for city in data.cities if city})
+        places = [_Place(f"all\n({len(data.tokens)})")]
+        for city in cities:
+            places.append(_Place(f"{city}\n({data.cities.count(city)})", "cls", data.within(city)))
+        if clean and len(cities) > 1:
+            drawn = _dots(clean, places, styles, allow_partial)
+            note = f"{_BARS} (none for a single recording)"
+            _finish(drawn, data, "Score per city", note)
+            out.append(Figure(f"cities_{data.name}", f"Score per city of {data.label}", drawn))
         if clean:
-            out += _cities(data, clean, styles, allow_partial)
-            out.append(_metrics(data, clean, styles, allow_partial))
+            places = [_Place(COLUMNS[name], name) for name in ("cls", *METRICS)]
+            drawn = _dots(clean, places, styles, allow_partial)
+            _finish(drawn, data, "Metrics", _BARS)
+            out.append(Figure(f"metrics_{data.name}", f"Metrics on {data.label}", drawn))
     return out
 
 
@@ -110,42 +121,33 @@ def _robustness(
                     if (group.traffic, group.planner) == (traffic, planner)
                 }
                 style = _line(styles[planner]) | {"linestyle": _DASHES[place % len(_DASHES)]}
-                label = _label(planner, found.values())
-                _curve(axes, found, kind, label, place - len(planners) / 2, style)
+                _curve(axes, planner, found, kind, place - len(planners) / 2, style)
             axes.set_xticks(range(len(LEVELS)), LEVELS)
             axes.set_title(f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
             _score_axis(axes)
-    _finish(
-        figure, panels[0][0], data, "Noise robustness", "error bars: standard deviation over seeds"
-    )
+    _finish(figure, data, "Noise robustness", "error bars: standard deviation over seeds")
     return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
 
 
 def _curve(
     axes: Any,
+    planner: str,
     found: dict[str, Estimate | None],
     kind: str,
-    label: str,
     offset: float,
     style: dict[str, Any],
 ) -> None:
     """One planner's scores by level; shifted a little, so that error bars do not cover others."""
     names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
-    points = [(i, found[name]) for i, name in enumerate(names) if found.get(name) is not None]
+    points = {i: cell for i, name in enumerate(names) if (cell := found.get(name)) is not None}
     if not points:
         return
-    places = [place + 0.02 * offset for place, _ in points]
-    means = [cell.mean for _, cell in points if cell]
-    errors = [(cell.std or 0.0) if cell else 0.0 for _, cell in points]
+    places = [place + 0.02 * offset for place in points]
+    means = [cell.mean for cell in points.values()]
+    errors = [cell.std or 0.0 for cell in points.values()]
+    partial = any(cell and cell.label for cell in found.values())
+    label = f"{planner} (partial)" if partial else planner
     axes.errorbar(places, means, yerr=errors, label=label, capsize=2, **style)
-
-
-def _label(planner: str, found: Iterable[Estimate | None]) -> str:
-    return f"{planner} (partial)" if any(cell and cell.label for cell in found) else planner
-
-
-def _named(group: Group) -> str:
-    return group.planner if group.is_complete else f"{group.planner} (partial)"
 
 
 def _line(look: Look) -> dict[str, Any]:
@@ -159,88 +161,41 @@ def _line(look: Look) -> dict[str, Any]:
     }
 
 
-def _cities(
-    data: DataSet, groups: Sequence[Group], styles: dict[str, Look], allow_partial: bool
-) -> list[Figure]:
-    cities = sorted({city for city in data.cities if city})
-    if len(cities) < 2:
-        return []
-    counts = {city: int(np.sum(np.array(data.cities) == city)) for city in cities}
-    names = [f"all\n({len(data.tokens)})", *(f"{city}\n({counts[city]})" for city in cities)]
-
-    def cell(group: Group, place: int) -> tuple[Estimate | None, Interval | None]:
-        where = None if place == 0 else data.within(cities[place - 1])
-        return _estimate(group, allow_partial, "cls", where), group.interval("cls", where)
-
-    figure = _dots(groups, names, cell, styles)
-    note = "bars: 95 % bootstrap interval over recordings (none for a single recording)"
-    _finish(figure[0], figure[1], data, "Score per city", note)
-    return [Figure(f"cities_{data.name}", f"Score per city of {data.label}", figure[0])]
-
-
-def _metrics(
-    data: DataSet, groups: Sequence[Group], styles: dict[str, Look], allow_partial: bool
-) -> Figure:
-    columns = ["cls", *METRICS]
-
-    def cell(group: Group, place: int) -> tuple[Estimate | None, Interval | None]:
-        name = columns[place]
-        return _estimate(group, allow_partial, name), group.interval(name)
-
-    figure = _dots(groups, [COLUMNS[name] for name in columns], cell, styles)
-    note = "bars: 95 % bootstrap interval over recordings"
-    _finish(figure[0], figure[1], data, "Metrics", note)
-    return Figure(f"metrics_{data.name}", f"Metrics on {data.label}", figure[0])
-
-
 def _dots(
     groups: Sequence[Group],
-    names: Sequence[str],
-    cell: Callable[[Group, int], tuple[Estimate | None, Interval | None]],
+    places: Sequence[_Place],
     styles: dict[str, Look],
-) -> tuple[Any, Any]:
+    allow_partial: bool,
+) -> Any:
     """Planners side by side at every place, one panel per traffic mode."""
     modes = traffics(groups)
     planners = list(dict.fromkeys(group.planner for group in groups))
-    figure, panels = _panels(len(modes), 1, (max(5.5, 1.05 * len(names)), 2.9))
-    for row, traffic in enumerate(modes):
-        axes = panels[row][0]
-        here = [group for group in groups if group.traffic == traffic]
-        for group in here:
-            look = styles[group.planner]
+    figure, panels = _panels(len(modes), 1, (max(5.5, 1.05 * len(places)), 2.9))
+    for (axes,), traffic in zip(panels, modes, strict=True):
+        for group in (group for group in groups if group.traffic == traffic):
+            style = _line(styles[group.planner]) | {"linestyle": "none"}
             shift = _SPREAD * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
-            for place in range(len(names)):
-                label = _named(group) if place == 0 else None
-                _dot(axes, place + shift, cell(group, place), look, label)
-        for place in range(1, len(names)):
-            axes.axvline(place - 0.5, color="0.9", linewidth=0.7, zorder=0)
-        axes.set_xticks(range(len(names)), names)
-        axes.set_xlim(-0.5, len(names) - 0.5)
+            label: str | None = f"{group.planner}{'' if group.is_complete else ' (partial)'}"
+            for x, place in enumerate(places):
+                estimate = _estimate(group, allow_partial, place.column, place.where)
+                interval = score_interval(group, place.column, place.where)
+                if estimate is not None and interval is not None:
+                    low, high = interval.low, interval.high
+                    axes.vlines(x + shift, low, high, color=style["color"], linewidth=1.3)
+                if estimate is not None:
+                    axes.plot([x + shift], [estimate.mean], label=label, **style)
+                label = None
+        for x in range(1, len(places)):
+            axes.axvline(x - 0.5, color="0.9", linewidth=0.7, zorder=0)
+        axes.set_xticks(range(len(places)), [place.heading for place in places])
+        axes.set_xlim(-0.5, len(places) - 0.5)
         axes.set_title(_TRAFFIC.get(traffic, traffic), fontsize=9)
         _score_axis(axes)
-    return figure, panels[0][0]
-
-
-def _dot(
-    axes: Any,
-    x: float,
-    found: tuple[Estimate | None, Interval | None],
-    look: Look,
-    label: str | None,
-) -> None:
-    estimate, interval = found
-    if estimate is None or estimate.mean is None:
-        return
-    if interval is not None:
-        axes.vlines(x, interval.low, interval.high, color=look.colour, linewidth=1.3)
-    style = _line(look) | {"linestyle": "none"}
-    axes.plot([x], [estimate.mean], label=label, **style)
+    return figure
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure as Drawing
-
-    figure = Drawing(figsize=(size[0] * columns + 0.6, size[1] * rows + 1.1), layout="constrained")
+    figure = new_figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 1.1))
     return figure, figure.subplots(rows, columns, squeeze=False, sharey=True)
 
 
@@ -253,8 +208,8 @@ def _score_axis(axes: Any) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _finish(figure: Any, axes: Any, data: DataSet, title: str, note: str) -> None:
-    handles, labels = axes.get_legend_handles_labels()
+def _finish(figure: Any, data: DataSet, title: str, note: str) -> None:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(
         handles,
         labels,

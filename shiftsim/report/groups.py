@@ -5,18 +5,18 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.errors import DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.statistics import Interval, bootstrap_interval, cluster_codes, seed_deviation
+from shiftsim.report.tables import Estimate
 from shiftsim.runs.results import Run
 from shiftsim.sim.noise import NOISE_NAMES
 
@@ -78,21 +78,21 @@ class DataSet:
     @property
     def key(self) -> tuple[str, ...]:
         """Equal for sets whose scores may be compared."""
-        rules = (self.thresholds, self.metric_version, self.controller)
-        return (self.name, token_digest(self.tokens), *rules)
+        return (self.name, token_digest(self.tokens), *self.traits)
 
     @property
-    def is_whole(self) -> bool:
-        """Whether the run holds every scenario of the list."""
-        return len(self.tokens) == self.whole
+    def traits(self) -> tuple[str, ...]:
+        """What tells sets of one name apart, in words."""
+        listed = f"list {token_digest(self.tokens)[:8]}"
+        return (self.thresholds, self.controller, f"metrics v{self.metric_version}", listed)
 
     @property
     def rules(self) -> str:
         """What stands beside every printed score."""
+        thresholds, controller, version, listed = self.traits
         return (
             f"{self.label}: {len(self.tokens)} scenarios of {self.num_recordings} recordings · "
-            f"thresholds {self.thresholds} · metrics v{self.metric_version} · "
-            f"controller {self.controller} · list {token_digest(self.tokens)[:8]}"
+            f"thresholds {thresholds} · {version} · controller {controller} · {listed}"
         )
 
     @property
@@ -103,31 +103,6 @@ class DataSet:
     def within(self, city: str) -> BoolArray:
         """(N,) scenarios of a city, and those that could be because nothing is known of them."""
         return np.array([name in (city, "") for name in self.cities], np.bool_)
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A score times 100, or the reason why there is none.
-
-    Attributes:
-        mean: Mean over scenarios, then over seeds; None when withheld.
-        std: Standard deviation over the seeds' means; None for one seed or when withheld.
-        done: Finished rollouts.
-        expected: Rollouts of a complete group.
-    """
-
-    mean: float | None
-    std: float | None
-    done: int
-    expected: int
-
-    @property
-    def label(self) -> str:
-        """Empty for a complete score."""
-        if self.done == self.expected:
-            return ""
-        count = f"({self.done}/{self.expected})"
-        return f"{'withheld' if self.mean is None else 'partial'} {count}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,23 +144,17 @@ class Group:
         chosen = values if where is None else values[:, where]
         if not chosen.size:
             return None
-        finished = np.isfinite(chosen)
-        done, expected = int(finished.sum()), chosen.size
-        seeds = [row[np.isfinite(row)] for row in chosen]
+        done, expected = int(np.isfinite(chosen).sum()), chosen.size
         if not done or (done < expected and not allow_partial):
             return Estimate(None, None, done, expected)
+        seeds = [row[np.isfinite(row)] for row in chosen]
         means = 100.0 * np.array([row.mean() for row in seeds if len(row)])
         return Estimate(float(means.mean()), seed_deviation(means), done, expected)
 
-    def interval(self, name: str = "cls", where: BoolArray | None = None) -> Interval | None:
-        """Bootstrap interval of the same score; None unless complete and of several recordings."""
-        mask = np.ones(len(self.data.tokens), np.bool_) if where is None else where
-        values = self.column(name)[mask]
-        if not len(values) or not np.isfinite(values).all():
-            return None
-        return bootstrap_interval(
-            100.0 * values, cluster_codes(np.array(self.data.recordings)[mask].tolist())
-        )
+
+def seed_deviation(values: FloatArray) -> float | None:
+    """Sample standard deviation (n - 1) over the seeds' means; None for a single seed."""
+    return float(values.std(ddof=1)) if len(values) > 1 else None
 
 
 def made_up_note(runs: Iterable[Run]) -> str:
@@ -205,6 +174,11 @@ def token_digest(tokens: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(sorted(tokens)).encode()).hexdigest()
 
 
+def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
+    """The data sets of groups, each once."""
+    return list({group.data.key: group.data for group in groups}.values())
+
+
 def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Group]:
     """The groups of runs, in the order of runs, planners and noises.
 
@@ -216,11 +190,13 @@ def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Gro
         DataError: Runs contradict each other, or hold no tasks.
     """
     labels = _planner_labels(runs)
-    seen: dict[tuple[Any, ...], Group] = {}
+    seen: dict[tuple[object, ...], Group] = {}
     for group in (group for run in runs for group in _groups(run, known, labels[run.path])):
         key = (group.data.key, group.traffic, group.planner, group.noise)
         other = seen.setdefault(key, group)
-        if other is not group and not _is_equal(group, other):
+        if group.seeds != other.seeds or not np.array_equal(
+            group.values, other.values, equal_nan=True
+        ):
             raise DataError(
                 f"{group.run.path.name!r} and {other.run.path.name!r} both hold "
                 f"{group.planner} {group.noise} {group.traffic} on {group.data.name}, and differ",
@@ -231,34 +207,26 @@ def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Gro
 
 def _labelled_apart(groups: list[Group]) -> list[Group]:
     """The same groups; sets of one label say what tells them apart, such as their thresholds."""
-    kinds: dict[str, dict[tuple[str, ...], None]] = {}
+    kinds: dict[str, list[tuple[str, ...]]] = {}
     for group in groups:
-        kinds.setdefault(group.data.label, {})[_traits(group.data)] = None
+        kinds.setdefault(group.data.label, []).append(group.data.traits)
     out = []
     for group in groups:
-        traits = list(zip(*kinds[group.data.label], strict=True))
-        own = zip(_traits(group.data), traits, strict=True)
-        telling = [value for value, values in own if len(set(values)) > 1]
+        values = zip(group.data.traits, zip(*kinds[group.data.label], strict=True), strict=True)
+        telling = [own for own, all_values in values if len(set(all_values)) > 1]
         label = ", ".join([group.data.label, *telling])
-        out.append(replace(group, data=replace(group.data, label=label)) if telling else group)
+        out.append(replace(group, data=replace(group.data, label=label)))
     return out
 
 
-def _traits(data: DataSet) -> tuple[str, ...]:
-    listed = f"list {token_digest(data.tokens)[:8]}"
-    return (data.thresholds, data.controller, f"metrics v{data.metric_version}", listed)
-
-
-def _is_equal(one: Group, other: Group) -> bool:
-    return one.seeds == other.seeds and np.array_equal(one.values, other.values, equal_nan=True)
-
-
-def _planner_labels(runs: Sequence[Run]) -> dict[Any, dict[str, str]]:
+def _planner_labels(runs: Sequence[Run]) -> dict[Path, dict[str, str]]:
     """Names of planners by run; a name that means different planners gets its run's name added."""
     prints: dict[str, set[str]] = {}
     for run in runs:
+        determining = run.manifest["determining"]
         for name in run.manifest["config"]["planners"]:
-            prints.setdefault(name, set()).add(_fingerprint(run, name))
+            identity = (determining["planners"].get(name), determining.get("code"))
+            prints.setdefault(name, set()).add(repr(identity))
     return {
         run.path: {
             name: name if len(prints[name]) == 1 else f"{name} @{run.path.name}"
@@ -268,50 +236,41 @@ def _planner_labels(runs: Sequence[Run]) -> dict[Any, dict[str, str]]:
     }
 
 
-def _fingerprint(run: Run, planner: str) -> str:
-    determining = run.manifest["determining"]
-    return repr((determining["planners"].get(planner), determining.get("code")))
-
-
-def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iterable[Group]:
+def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iterator[Group]:
     tasks, scores = run.tasks, run.scores
     if not len(tasks):
         raise DataError(f"run {run.path.name!r} holds no tasks", hint="make the run again")
     data = _data_set(run, known)
-    config = run.manifest["config"]
     traffic = str(run.manifest["determining"]["traffic"])
-    order = {name: i for i, name in enumerate(NOISE_NAMES)}
-    noises = sorted(_distinct(tasks["noise"]), key=lambda n: order.get(n, len(order)))
-    planners = sorted(_distinct(tasks["planner"]), key=lambda n: _place(config["planners"], n))
-    table = _values(scores)
-    row_tokens = _indices(scores["token"], data.tokens)
-    for planner in planners:
-        for noise in noises:
+    # nuPlan rule 570: a metric without a score counts as 0
+    columns = [pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS]
+    table = np.stack(columns, axis=1)
+    places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
+    for planner in _ordered(tasks["planner"], run.manifest["config"]["planners"]):
+        for noise in _ordered(tasks["noise"], NOISE_NAMES):
             mine = _matching(tasks, planner, noise)
             if not mine.any():
                 continue
-            seeds = sorted(set(tasks["seed"].to_numpy()[mine].tolist()))
+            seeds = np.unique(tasks["seed"].to_numpy()[mine])
             values = np.full((len(seeds), len(data.tokens), len(COLUMNS)), np.nan)
             rows = np.flatnonzero(_matching(scores, planner, noise))
-            places = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
-            values[places, row_tokens[rows]] = table[rows]
-            label = labels.get(planner, planner)
+            row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
+            values[row_seeds, places[rows].astype(np.int64)] = table[rows]
             yield Group(
-                run, data, TRAFFIC.get(traffic, traffic), label, noise, tuple(seeds), values
+                run=run,
+                data=data,
+                traffic=TRAFFIC.get(traffic, traffic),
+                planner=labels.get(planner, planner),
+                noise=noise,
+                seeds=tuple(seeds.tolist()),
+                values=values,
             )
 
 
-def _place(names: Sequence[str], name: str) -> int:
-    return names.index(name) if name in names else len(names)
-
-
-def _distinct(column: pa.ChunkedArray) -> list[str]:
-    return list(pc.unique(column).to_pylist())
-
-
-def _indices(column: pa.ChunkedArray, values: Sequence[str]) -> IntArray:
-    found = pc.index_in(column, value_set=pa.array(values, pa.string()))
-    return found.to_numpy().astype(np.int64)
+def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:
+    """The values of a column in the order of the names, others behind them."""
+    rank = {name: place for place, name in enumerate(names)}
+    return sorted(pc.unique(column).to_pylist(), key=lambda name: rank.get(name, len(rank)))
 
 
 def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:
@@ -319,68 +278,53 @@ def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:
     return mask.to_numpy().astype(np.bool_)
 
 
-def _values(scores: pa.Table) -> FloatArray:
-    """(rows, C); a metric without a score counts as 0 (nuplan-metrics.md §12)."""
-    return np.stack(
-        [pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1
-    ).reshape(len(scores), len(COLUMNS))
-
-
 def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
-    tokens = tuple(sorted(_distinct(run.tasks["token"])))
-    described = _labels(run.scores, ("city", "log_name"))
-    types = _labels(run.tasks, ("scenario_type",))
-
-    def label(name: str, known: dict[str, dict[str, Any]] = described) -> tuple[str, ...]:
-        return tuple(known.get(token, {}).get(f"{name}_max") or "" for token in tokens)
-
-    manifest = run.manifest
+    tokens = tuple(sorted(pc.unique(run.tasks["token"]).to_pylist()))
+    manifest, determining = run.manifest, run.manifest["determining"]
     split = str(manifest["split"])
-    name, whole = _known(split, tokens, known)
-    expected = whole.count if whole is not None else 0
-    limit = int(manifest["config"].get("limit") or 0)
+    whole = _published_list(split, tokens, known)
     suffix = ""
     if manifest.get("shard"):
         suffix = f" (shard {manifest['shard']})"
-    elif expected and len(tokens) != expected:
-        suffix = f" ({len(tokens)}/{expected})"
-    elif not expected and limit:
+    elif whole is not None and len(tokens) != whole.count:
+        suffix = f" ({len(tokens)}/{whole.count})"
+    elif whole is None and manifest["config"].get("limit"):
         suffix = f" (first {len(tokens)})"
     elif whole is None and split in {one.name for one in known}:
         suffix = " (not the published list)"
     return DataSet(
-        name=name,
-        label=f"{whole.label if whole is not None else split}{suffix}",
-        known=whole.name if whole is not None else "",
-        whole=expected or len(tokens),
-        thresholds=str(manifest["determining"]["thresholds"]["name"]),
-        metric_version=str(manifest["determining"]["metric_version"]),
-        controller=str(manifest["determining"]["controller"]),
+        name=whole.name if whole else split,
+        label=f"{whole.label if whole else split}{suffix}",
+        known=whole.name if whole else "",
+        whole=whole.count if whole else len(tokens),
+        thresholds=str(determining["thresholds"]["name"]),
+        metric_version=str(determining["metric_version"]),
+        controller=str(determining["controller"]),
         tokens=tokens,
-        cities=label("city"),
-        recordings=label("log_name"),
-        types=label("scenario_type", types),
+        cities=_of_tokens(run.scores, "city", tokens),
+        recordings=_of_tokens(run.scores, "log_name", tokens),
+        types=_of_tokens(run.tasks, "scenario_type", tokens),
     )
 
 
-def _labels(table: pa.Table, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Rows by token of what is the same for all rollouts of a scenario, where it is known."""
-    rows = table.select(["token", *names]).group_by("token")
-    found = rows.aggregate([(name, "max") for name in names]).to_pylist()
-    return {row["token"]: row for row in found}
+def _of_tokens(table: pa.Table, name: str, tokens: Sequence[str]) -> tuple[str, ...]:
+    """A column that is the same for all rollouts of a scenario; empty where nothing is known."""
+    found = table.select(["token", name]).group_by("token").aggregate([(name, "max")]).to_pylist()
+    known = {row["token"]: row[f"{name}_max"] for row in found}
+    return tuple(known.get(token) or "" for token in tokens)
 
 
-def _known(
+def _published_list(
     split: str, tokens: Sequence[str], known: Sequence[KnownSet]
-) -> tuple[str, KnownSet | None]:
-    """Name of a set, and the published list that it is or is a part of."""
+) -> KnownSet | None:
+    """The published list that the scenarios are, or are a part of."""
     digest = token_digest(tokens)
     for one in known:
         if one.sha256 == digest:
-            return one.name, one
+            return one
     for one in known:
         if one.tokens and set(tokens) <= set(one.tokens):
-            return one.name, one
+            return one
         if not one.tokens and split == one.name and len(tokens) < one.count:
-            return one.name, one
-    return split, None
+            return one
+    return None

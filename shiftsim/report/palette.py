@@ -1,4 +1,4 @@
-"""How planners look in every picture: a colour, a marker and a dash of their own.
+"""What all pictures share: matplotlib, and how planners look.
 
 The colours of the known planners were searched for being far apart in every pair: at least 18 in
 CIELAB to normal eyes and under all kinds of colour-blindness, at least 6 in lightness in grey.
@@ -7,11 +7,39 @@ Markers, and dashes where lines are drawn, tell planners apart without any colou
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import MissingExtraError
+
+_PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def new_figure(**settings: Any) -> Any:
+    """An empty figure of matplotlib; ids in SVG files are always the same.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
+        ) from error
+    matplotlib.rcParams["svg.hashsalt"] = "shiftsim"
+    return Figure(layout="constrained", **settings)
+
+
+def save_picture(figure: Any, path: Path) -> None:
+    """Write a figure without time stamps: the same picture has the same bytes."""
+    figure.savefig(path, dpi=150, metadata=_PLAIN.get(path.suffix.lower()))
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How one planner is drawn.
+    """How one planner is drawn: a colour, a marker and a dash of its own.
 
     Attributes:
         colour: As `#rrggbb`.

@@ -1,24 +1,25 @@
 """The paper's tables from own runs: zero-shot generalization and noise robustness."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
 
-from shiftsim.report.groups import DataSet, Estimate, Group
-from shiftsim.report.published import Published
-from shiftsim.report.statistics import FEW_CLUSTERS
-from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
+from shiftsim.report.published import Published, called_alike
+from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
+from shiftsim.report.tables import Cell, Estimate, Number, Table
 from shiftsim.sim.noise import NOISE_NAMES
 
-# the order of the paper's columns
-METRICS = {
-    "drivable_area_compliance": "DAC",
-    "driving_direction_compliance": "DDC",
-    "ego_is_comfortable": "EIC",
-    "ego_is_making_progress": "EMP",
-    "ego_progress_along_expert_route": "PER",
-    "no_ego_at_fault_collisions": "NCR",
-    "speed_limit_compliance": "SLC",
-    "time_to_collision_within_bound": "TTC",
-}
+METRICS = (  # the order of the paper's columns
+    "drivable_area_compliance",
+    "driving_direction_compliance",
+    "ego_is_comfortable",
+    "ego_is_making_progress",
+    "ego_progress_along_expert_route",
+    "no_ego_at_fault_collisions",
+    "speed_limit_compliance",
+    "time_to_collision_within_bound",
+)
 VAL14 = "val14"
 INTERVALS = (
     "95 % CI: cluster bootstrap over recordings, 10 000 draws; it says how much the choice "
@@ -26,6 +27,14 @@ INTERVALS = (
 )
 PUBLISHED = "(published)"
 _SETS = {"val14": "Val14", "all": "DeepPlan", "deepplan": "DeepPlan"}
+
+
+class _Column(NamedTuple):
+    """A column of scores: its heading, its name in the paper, and what makes a group's cell."""
+
+    heading: str
+    published: str
+    cell: Callable[[Group], Cell]
 
 
 def semantic_shift(
@@ -49,16 +58,14 @@ def semantic_shift(
     out = []
     for data in distinct_sets(others or val14):
         mine = [group for group in clean if group.data.key == data.key]
-        out.append(_semantic_table(data, mine, val14, published, beside, allow_partial))
+        compared = val14 if data.known != VAL14 else []
+        columns = _columns(data, compared, published, allow_partial)
+        notes = [data.rules, *(group.data.rules for group in compared[:1]), INTERVALS]
+        out.append(_semantic_table(data, mine, columns, notes, published, beside))
     alike = [one for one in distinct_sets(clean) if published and _is_paper_like(one, published)]
     if published is not None and beside and not alike:
         out.append(published_semantic(published))
     return out
-
-
-def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
-    """The data sets of groups, each once."""
-    return list({group.data.key: group.data for group in groups}.values())
 
 
 def _is_paper_like(data: DataSet, published: Published) -> bool:
@@ -66,40 +73,61 @@ def _is_paper_like(data: DataSet, published: Published) -> bool:
     return all(published.abbreviation(city) for city in data.cities if city)
 
 
+def _columns(
+    data: DataSet, val14: Sequence[Group], published: Published | None, allow_partial: bool
+) -> list[_Column]:
+    """Val14 where it was run, too; the set; its cities; the metrics."""
+    estimate = partial(Group.estimate, allow_partial=allow_partial)
+
+    def on_val14(group: Group) -> Cell:
+        same = (g for g in val14 if (g.traffic, g.planner) == (group.traffic, group.planner))
+        found = next(same, None)
+        return None if found is None else estimate(found)
+
+    columns = [_Column(group.data.label, VAL14, on_val14) for group in val14[:1]]
+    columns.append(_Column(data.label, "all", estimate))
+    columns.append(_Column("95 % CI", "", score_interval))
+    for city, heading in _cities(data, published).items():
+        columns.append(_Column(heading, heading, partial(estimate, where=data.within(city))))
+    for name in METRICS:
+        columns.append(_Column(COLUMNS[name], COLUMNS[name], partial(estimate, name=name)))
+    return columns
+
+
+def _cities(data: DataSet, published: Published | None) -> dict[str, str]:
+    """Names of the columns by city, in the paper's order; none for a single city."""
+    names = sorted({city for city in data.cities if city})
+    if len(names) < 2:
+        return {}
+    shorts = {name: published.abbreviation(name) if published else "" for name in names}
+    order = {short: place for place, short in enumerate(published.cities if published else ())}
+    names.sort(key=lambda name: order.get(shorts[name], len(order)))
+    return {name: shorts[name] or name for name in names}
+
+
 def _semantic_table(
     data: DataSet,
     groups: Sequence[Group],
-    val14: Sequence[Group],
+    columns: Sequence[_Column],
+    notes: list[str],
     published: Published | None,
     beside: bool,
-    allow_partial: bool,
 ) -> Table:
-    cities = _cities(data, published)
-    with_val14 = bool(val14) and data.known != VAL14
-    header = ["traffic", "planner"]
-    if with_val14:
-        header.append(val14[0].data.label)
-    header += [data.label, "95 % CI", *cities.values(), *METRICS.values()]
-    rows: list[tuple[Cell, ...]] = []
     paper = published if published and beside and _is_paper_like(data, published) else None
+    rows: list[tuple[Cell, ...]] = []
     for traffic in traffics(groups):
-        mine = [group for group in groups if group.traffic == traffic]
-        left = dict(paper.semantic_shift.get(traffic, {})) if paper else {}
-        for group in mine:
-            rows.append(_semantic_row(group, val14, with_val14, cities, allow_partial))
-            if paper:
-                for name in paper.planners(group.planner, left):
-                    rows.append(_published_row(paper, traffic, name, header))
-                    left.pop(name)
-        if paper:
-            rows += [_published_row(paper, traffic, name, header) for name in left]
-    notes = [data.rules, *([val14[0].data.rules] if with_val14 else []), INTERVALS]
+        left = paper.scores(traffic) if paper else {}
+        for group in (group for group in groups if group.traffic == traffic):
+            rows.append((traffic, group.planner, *(column.cell(group) for column in columns)))
+            for name in called_alike(group.planner, left):
+                rows.append(_published_row(traffic, name, left.pop(name), columns))
+        rows += [_published_row(traffic, name, left[name], columns) for name in left]
     notes += [_few_note(data), _own_list_note(data, published) if published else ""]
     notes += [f"{PUBLISHED[1:-1]}: {paper.source}"] if paper else []
     return Table(
         f"semantic-shift_{data.name}",
         f"Zero-shot generalization: {data.label}, clean, scores x 100",
-        tuple(header),
+        ("traffic", "planner", *(column.heading for column in columns)),
         tuple(rows),
         2,
         tuple(filter(None, notes)),
@@ -109,56 +137,16 @@ def _semantic_table(
 def traffics(groups: Iterable[Group]) -> list[str]:
     """Traffic modes: NR, R, then others."""
     found = {group.traffic for group in groups}
-    return [name for name in ("NR", "R") if name in found] + sorted(found - {"NR", "R"})
-
-
-def _cities(data: DataSet, published: Published | None) -> dict[str, str]:
-    """Names of the columns by city, in the paper's order."""
-    names = sorted({city for city in data.cities if city})
-    if len(names) < 2:
-        return {}
-    if published is None:
-        return {name: name for name in names}
-    order = list(published.cities)
-
-    def rank(name: str) -> tuple[int, str]:
-        short = published.abbreviation(name)
-        return (order.index(short) if short else len(order), name)
-
-    return {name: published.abbreviation(name) or name for name in sorted(names, key=rank)}
-
-
-def _semantic_row(
-    group: Group,
-    val14: Sequence[Group],
-    with_val14: bool,
-    cities: dict[str, str],
-    allow_partial: bool,
-) -> tuple[Cell, ...]:
-    row: list[Cell] = [group.traffic, group.planner]
-    if with_val14:
-        same = (g for g in val14 if (g.traffic, g.planner) == (group.traffic, group.planner))
-        found = next(same, None)
-        row.append(None if found is None else found.estimate(allow_partial=allow_partial))
-    row += [group.estimate(allow_partial=allow_partial), group.interval()]
-    for city in cities:
-        where = group.data.within(city)
-        row.append(group.estimate("cls", where, allow_partial=allow_partial))
-    row += [group.estimate(name, allow_partial=allow_partial) for name in METRICS]
-    return tuple(row)
+    return sorted(found, key=lambda name: (name not in ("NR", "R"), name))
 
 
 def _published_row(
-    published: Published, traffic: str, planner: str, header: Sequence[str]
+    traffic: str, planner: str, values: Mapping[str, float], columns: Sequence[_Column]
 ) -> tuple[Cell, ...]:
     """A row of the paper under the columns of an own table: `all` stands under the own set."""
-    values = dict(zip(published.columns, published.semantic_shift[traffic][planner], strict=True))
-    own = header.index("95 % CI") - 1
-    row: list[Cell] = [traffic, f"{planner} {PUBLISHED}"]
-    for index, name in enumerate(header[2:], 2):
-        key = "all" if index == own else "val14" if index < own else name
-        row.append(Number(values[key]) if key in values else None)
-    return tuple(row)
+    names = (column.published for column in columns)
+    cells = (Number(values[name]) if name in values else None for name in names)
+    return (traffic, f"{planner} {PUBLISHED}", *cells)
 
 
 def _few_note(data: DataSet) -> str:
@@ -184,12 +172,10 @@ def published_semantic(published: Published) -> Table:
         for traffic, planners in published.semantic_shift.items()
         for planner, values in planners.items()
     ]
-
-    header = ("traffic", "planner", *(_SETS.get(name, name) for name in published.columns))
     return Table(
         "semantic-shift_published",
         "Zero-shot generalization as published",
-        header,
+        ("traffic", "planner", *(_SETS.get(name, name) for name in published.columns)),
         tuple(rows),
         2,
         (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan"),
@@ -215,33 +201,21 @@ def noise_robustness(
     sets = distinct_sets(groups)
     for data in sets:
         mine = [group for group in groups if group.data.key == data.key]
+        cells = {
+            (group.traffic, group.planner, group.noise): group.estimate(allow_partial=allow_partial)
+            for group in mine
+        }
         for traffic in traffics(mine):
-            here = [group for group in mine if group.traffic == traffic]
-            for planner in dict.fromkeys(group.planner for group in here):
-                cells = {g.noise: g for g in here if g.planner == planner}
-                rows.append(
-                    (
-                        data.label,
-                        traffic,
-                        planner,
-                        *(
-                            cells[n].estimate(allow_partial=allow_partial) if n in cells else None
-                            for n in noises
-                        ),
-                    )
-                )
+            for planner in dict.fromkeys(g.planner for g in mine if g.traffic == traffic):
+                scores = (cells.get((traffic, planner, noise)) for noise in noises)
+                rows.append((data.label, traffic, planner, *scores))
     notes = [*(data.rules for data in sets), _seeds_note(groups)]
     if published is not None:
         rows += _published_robustness(published, noises)
         notes.append(f"published: {published.source}")
-    return Table(
-        "noise-robustness",
-        "Noise robustness: CLS x 100",
-        ("set", "traffic", "planner", *noises),
-        tuple(rows),
-        3,
-        tuple(notes),
-    )
+    header = ("set", "traffic", "planner", *noises)
+    title = "Noise robustness: CLS x 100"
+    return Table("noise-robustness", title, header, tuple(rows), 3, tuple(notes))
 
 
 def _seeds_note(groups: Sequence[Group]) -> str:
@@ -254,16 +228,13 @@ def _seeds_note(groups: Sequence[Group]) -> str:
 
 def _published_robustness(published: Published, noises: Sequence[str]) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
-    for traffic in published.robustness:
-        for name, planners in published.robustness[traffic].items():
+    for traffic, sets in published.robustness.items():
+        for name, planners in sets.items():
             for planner, values in planners.items():
-                cells = dict(zip(published.noises, values, strict=True))
-                estimates = (_published_cell(cells.get(noise)) for noise in noises)
-                rows.append((f"{_SETS[name]} {PUBLISHED}", traffic, planner, *estimates))
+                cells = {
+                    noise: Estimate(cell[0], cell[1] if len(cell) > 1 else None, 1, 1)
+                    for noise, cell in zip(published.noises, values, strict=True)
+                }
+                scores = (cells.get(noise) for noise in noises)
+                rows.append((f"{_SETS[name]} {PUBLISHED}", traffic, planner, *scores))
     return rows
-
-
-def _published_cell(values: tuple[float, ...] | None) -> Estimate | None:
-    if values is None:
-        return None
-    return Estimate(values[0], values[1] if len(values) > 1 else None, 1, 1)

@@ -1,9 +1,7 @@
 """Figures of the published benchmark, to be shown beside own ones."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-
-TRAFFIC = ("NR", "R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +21,14 @@ class Published:
     """
 
     source: str
-    cities: Mapping[str, tuple[str, ...]]
+    cities: Mapping[str, Sequence[str]]
     scenarios: Mapping[str, int]
-    columns: tuple[str, ...]
-    semantic_shift: Mapping[str, Mapping[str, tuple[float, ...]]]
-    noises: tuple[str, ...]
-    robustness: Mapping[str, Mapping[str, Mapping[str, tuple[tuple[float, ...], ...]]]]
-    sets: tuple[str, ...]
-    comparison: Mapping[str, tuple[str, ...]]
+    columns: Sequence[str]
+    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]
+    noises: Sequence[str]
+    robustness: Mapping[str, Mapping[str, Mapping[str, Sequence[Sequence[float]]]]]
+    sets: Sequence[str]
+    comparison: Mapping[str, Sequence[str]]
 
     def abbreviation(self, city: str) -> str:
         """The paper's abbreviation of a city; empty for other cities."""
@@ -38,9 +36,17 @@ class Published:
         found = (s for s, names in self.cities.items() if plain in map(_plain, (s, *names)))
         return next(found, "")
 
-    def planners(self, name: str, listed: Mapping[str, object]) -> list[str]:
-        """Planners of a published table that are called like one of ours: one or none."""
-        return [other for other in listed if _plain(other) == _plain(name)]
+    def scores(self, traffic: str) -> dict[str, dict[str, float]]:
+        """Values of `semantic_shift` under one traffic mode, by planner and column."""
+        return {
+            planner: dict(zip(self.columns, values, strict=True))
+            for planner, values in self.semantic_shift.get(traffic, {}).items()
+        }
+
+
+def called_alike(name: str, listed: Iterable[str]) -> list[str]:
+    """Planners of a published table that are called like one of ours: one or none."""
+    return [other for other in listed if _plain(other) == _plain(name)]
 
 
 def _plain(text: str) -> str:

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.report.groups import Group
+from shiftsim.report.tables import Interval
 
 DRAWS = 10_000
 SEED = 20_260_101  # of every draw here, so that a report can be repeated to the digit
@@ -19,12 +21,16 @@ _BLOCK = 500  # draws held in memory at once
 _EXACT_CLUSTERS = 13  # up to here all 2^G sign patterns are fewer than DRAWS
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Where a mean lies with confidence `CONFIDENCE`."""
-
-    low: float
-    high: float
+def score_interval(
+    group: Group, name: str = "cls", where: BoolArray | None = None
+) -> Interval | None:
+    """Bootstrap interval of a group's score; None unless complete and of several recordings."""
+    mask = np.ones(len(group.data.tokens), np.bool_) if where is None else where
+    values = group.column(name)[mask]
+    if not len(values) or not np.isfinite(values).all():
+        return None
+    recordings = np.array(group.data.recordings)[mask].tolist()
+    return bootstrap_interval(100.0 * values, cluster_codes(recordings))
 
 
 def cluster_codes(clusters: Sequence[str]) -> IntArray:
@@ -161,8 +167,3 @@ def holm(p_values: Sequence[float]) -> list[float]:
         worst = max(worst, min(1.0, (len(order) - rank) * p_values[index]))
         out[index] = worst
     return out.tolist()
-
-
-def seed_deviation(values: FloatArray) -> float | None:
-    """Sample standard deviation (n - 1) over the seeds' means; None for a single seed."""
-    return float(values.std(ddof=1)) if len(values) > 1 else None

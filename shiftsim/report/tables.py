@@ -1,11 +1,10 @@
-"""A table as data, with cells that know how they are printed."""
+"""A table as data, its cells, and its plain text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from shiftsim.report.groups import Estimate
-from shiftsim.report.statistics import Interval
+_GAP = 2  # blanks between columns of text
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +18,51 @@ class Number:
 
     value: float
     digits: int = 2
+
+    def __str__(self) -> str:
+        return f"{self.value:.{self.digits}f}"
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Where a mean lies, with a confidence of 95 %."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"[{self.low:.2f}, {self.high:.2f}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A score times 100, or the reason why there is none.
+
+    Attributes:
+        mean: Mean over scenarios, then over seeds; None when withheld.
+        std: Standard deviation over the seeds' means; None for one seed or when withheld.
+        done: Finished rollouts.
+        expected: Rollouts of a complete group.
+    """
+
+    mean: float | None
+    std: float | None
+    done: int
+    expected: int
+
+    @property
+    def label(self) -> str:
+        """Empty for a complete score."""
+        if self.done == self.expected:
+            return ""
+        count = f"({self.done}/{self.expected})"
+        return f"{'withheld' if self.mean is None else 'partial'} {count}"
+
+    def __str__(self) -> str:
+        if self.mean is None:
+            return f"– ({self.done}/{self.expected})"
+        spread = "" if self.std is None else f" ± {self.std:.2f}"
+        return f"{self.mean:.2f}{spread}{f' {self.label}' if self.label else ''}"
 
 
 Cell: TypeAlias = str | Number | Estimate | Interval | None
@@ -51,73 +95,47 @@ class Table:
             if len(row) != len(self.header):
                 raise ValueError(f"table {self.name}: {len(row)} cells, {len(self.header)} columns")
 
+    @property
+    def lines(self) -> list[list[str]]:
+        """Header and rows as people read them."""
+        return [[*self.header], *([shown(cell) for cell in row] for row in self.rows)]
+
 
 def shown(cell: Cell) -> str:
     """A cell as people read it."""
-    if cell is None:
-        return ""
-    if isinstance(cell, str):
-        return cell
-    if isinstance(cell, Number):
-        return f"{cell.value:.{cell.digits}f}"
-    if isinstance(cell, Interval):
-        return f"[{cell.low:.2f}, {cell.high:.2f}]"
-    if cell.mean is None:
-        return f"– ({cell.done}/{cell.expected})"
-    spread = "" if cell.std is None else f" ± {cell.std:.2f}"
-    return f"{cell.mean:.2f}{spread}{f' {cell.label}' if cell.label else ''}"
+    return "" if cell is None else str(cell)
 
 
-def plain_columns(table: Table) -> tuple[list[str], list[list[str]]]:
-    """Header and rows with every number in full and in a column of its own, for machines.
-
-    What stands below a printed table is the last column of every row.
-    """
-    if table.full is not None:
-        return plain_columns(table.full)
-    header: list[str] = []
-    columns: list[list[str]] = []
-    for index, name in enumerate(table.header):
-        cells = [row[index] for row in table.rows]
-        for ending, values in _parts(cells):
-            header.append(f"{name}{ending}")
-            columns.append(values)
-    labels = [_labels(row, table.header) for row in table.rows]
-    if any(labels):
-        header.append("label")
-        columns.append(labels)
-    if table.notes:
-        header.append("notes")
-        columns.append([" | ".join(table.notes)] * len(table.rows))
-    return header, [list(line) for line in zip(*columns, strict=True)]
+def text(table: Table, width: int = 0) -> str:
+    """A table in plain text; wider than `width` it is printed in pieces, 0 for any."""
+    lines = table.lines
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    out = [table.title] if table.title else []
+    for piece, columns in enumerate(_pieces(widths, table.num_labels, width)):
+        out += [""] if piece else []
+        chosen = [[line[i] for i in columns] for line in lines]
+        out += [f" {line}".rstrip() for line in aligned(chosen, table.num_labels)]
+    return "\n".join([*out, *(f" {note}" for note in table.notes)])
 
 
-def _parts(cells: Sequence[Cell]) -> list[tuple[str, list[str]]]:
-    """One or several columns, by what the cells hold."""
-    if any(isinstance(cell, Interval) for cell in cells):
-        ends = [(c.low, c.high) if isinstance(c, Interval) else (None, None) for c in cells]
-        return [(" low", [_full(e[0]) for e in ends]), (" high", [_full(e[1]) for e in ends])]
-    out = [("", [_plain(cell) for cell in cells])]
-    spreads = [cell.std if isinstance(cell, Estimate) else None for cell in cells]
-    if any(spread is not None for spread in spreads):
-        out.append((" std", [_full(spread) for spread in spreads]))
-    return out
+def aligned(lines: Sequence[Sequence[str]], num_labels: int) -> list[str]:
+    """Lines of cells with columns of equal width, the leading `num_labels` to the left."""
+    columns = []
+    for index, cells in enumerate(zip(*lines, strict=True)):
+        width = max(map(len, cells))
+        columns.append([c.ljust(width) if index < num_labels else c.rjust(width) for c in cells])
+    return [(" " * _GAP).join(cells) for cells in zip(*columns, strict=True)]
 
 
-def _plain(cell: Cell) -> str:
-    if cell is None or isinstance(cell, str):
-        return cell or ""
-    if isinstance(cell, Number):
-        return f"{cell.value:.0f}" if cell.digits == 0 else _full(cell.value)
-    assert isinstance(cell, Estimate)
-    return _full(cell.mean)
-
-
-def _full(value: float | None) -> str:
-    return "" if value is None else repr(float(value))
-
-
-def _labels(row: Sequence[Cell], header: Sequence[str]) -> str:
-    named = zip(header, row, strict=True)
-    found = [f"{n} {c.label}" for n, c in named if isinstance(c, Estimate) and c.label]
-    return "; ".join(found)
+def _pieces(widths: Sequence[int], num_labels: int, width: int) -> list[list[int]]:
+    """Column numbers of each piece; the labels are repeated."""
+    labels = list(range(num_labels))
+    start = used = 1 + sum(widths[i] + _GAP for i in labels)
+    pieces = [[*labels]]
+    for column in range(num_labels, len(widths)):
+        if width and used + widths[column] > width and len(pieces[-1]) > num_labels:
+            pieces.append([*labels])
+            used = start
+        pieces[-1].append(column)
+        used += widths[column] + _GAP
+    return pieces

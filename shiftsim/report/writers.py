@@ -4,14 +4,13 @@ import csv
 import html
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from shiftsim.errors import one_of
-from shiftsim.report.tables import Table, plain_columns, shown
+from shiftsim.report.tables import Cell, Estimate, Interval, Number, Table, text
 
 ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
 FORMATS = tuple(ENDINGS)
-_GAP = 2  # blanks between columns of text
 
 
 def render(table: Table, style: str, *, width: int = 0) -> str:
@@ -23,64 +22,75 @@ def render(table: Table, style: str, *, width: int = 0) -> str:
         width: Longest line of text; wider tables are printed in pieces. 0 for any.
     """
     one_of("format", style, FORMATS)
-    if style == "text":
-        return _text(table, width)
-    return _WRITERS[style](table)
-
-
-def _text(table: Table, width: int) -> str:
-    lines = [list(table.header), *([shown(cell) for cell in row] for row in table.rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(table.header))]
-    out = [table.title] if table.title else []
-    for piece, columns in enumerate(_pieces(widths, table.num_labels, width)):
-        out += [""] if piece else []
-        for line in lines:
-            cells = [
-                line[i].ljust(widths[i]) if i < table.num_labels else line[i].rjust(widths[i])
-                for i in columns
-            ]
-            out.append(f" {(' ' * _GAP).join(cells)}".rstrip())
-    return "\n".join([*out, *(f" {note}" for note in table.notes)])
-
-
-def _pieces(widths: Sequence[int], num_labels: int, width: int) -> list[list[int]]:
-    """Column numbers of each piece; the labels are repeated."""
-    labels = list(range(num_labels))
-    start = 1 + sum(widths[i] + _GAP for i in labels)
-    pieces: list[list[int]] = [[*labels]]
-    used = start
-    for column in range(num_labels, len(widths)):
-        if width and used + widths[column] > width and len(pieces[-1]) > num_labels:
-            pieces.append([*labels])
-            used = start
-        pieces[-1].append(column)
-        used += widths[column] + _GAP
-    return pieces
+    return text(table, width) if style == "text" else _WRITERS[style](table)
 
 
 def _markdown(table: Table) -> str:
     rule = ["---"] * table.num_labels + ["---:"] * (len(table.header) - table.num_labels)
-    lines = [
-        [markdown_escape(name) for name in table.header],
-        rule,
-        *([markdown_escape(shown(cell)) for cell in row] for row in table.rows),
-    ]
-    body = [f"| {' | '.join(line)} |" for line in lines]
+    head, *rows = ([markdown_escape(cell) for cell in line] for line in table.lines)
+    body = [f"| {' | '.join(line)} |" for line in (head, rule, *rows)]
     title = [f"### {markdown_escape(table.title)}", ""] if table.title else []
     notes = [line for note in table.notes for line in ("", markdown_escape(note))]
     return "\n".join([*title, *body, *notes])
 
 
-def markdown_escape(text: str) -> str:
+def markdown_escape(value: str) -> str:
     """Text that Markdown prints as it is, also inside a table."""
-    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(value.split()))
 
 
 def _csv(table: Table) -> str:
-    header, rows = plain_columns(table)
+    """Every number in full and in a column of its own; notes are the last column of every row."""
+    table = table.full or table
+    columns = [
+        [f"{name}{ending}", *values]
+        for index, name in enumerate(table.header)
+        for ending, values in _parts([row[index] for row in table.rows]).items()
+    ]
+    labels = [_labels(row, table.header) for row in table.rows]
+    if any(labels):
+        columns.append(["label", *labels])
+    if table.notes:
+        columns.append(["notes", *[" | ".join(table.notes)] * len(table.rows)])
+    return csv_text(zip(*columns, strict=True))
+
+
+def csv_text(rows: Iterable[Sequence[str]]) -> str:
+    """Rows as CSV, without a line end behind the last one."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([header, *rows])
+    csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue().rstrip("\n")
+
+
+def _parts(cells: Sequence[Cell]) -> dict[str, list[str]]:
+    """One or several columns, by what the cells hold; keys are added to the column's name."""
+    if any(isinstance(cell, Interval) for cell in cells):
+        ends = [(c.low, c.high) if isinstance(c, Interval) else (None, None) for c in cells]
+        return {" low": [_full(low) for low, _ in ends], " high": [_full(high) for _, high in ends]}
+    out = {"": [_plain(cell) for cell in cells]}
+    spreads = [cell.std if isinstance(cell, Estimate) else None for cell in cells]
+    if any(spread is not None for spread in spreads):
+        out[" std"] = [_full(spread) for spread in spreads]
+    return out
+
+
+def _plain(cell: Cell) -> str:
+    if cell is None or isinstance(cell, str):
+        return cell or ""
+    if isinstance(cell, Number):
+        return f"{cell.value:.0f}" if cell.digits == 0 else _full(cell.value)
+    assert isinstance(cell, Estimate)
+    return _full(cell.mean)
+
+
+def _full(value: float | None) -> str:
+    return "" if value is None else repr(float(value))
+
+
+def _labels(row: Sequence[Cell], header: Sequence[str]) -> str:
+    named = zip(header, row, strict=True)
+    found = [f"{n} {c.label}" for n, c in named if isinstance(c, Estimate) and c.label]
+    return "; ".join(found)
 
 
 _LATEX = {
@@ -108,9 +118,9 @@ _LATEX = {
 _LATEX_TABLE = str.maketrans(_LATEX)
 
 
-def latex_escape(text: str) -> str:
+def latex_escape(value: str) -> str:
     """Text that LaTeX prints as it is."""
-    return " ".join(text.split()).translate(_LATEX_TABLE)
+    return " ".join(value.split()).translate(_LATEX_TABLE)
 
 
 def _latex(table: Table) -> str:
@@ -121,6 +131,7 @@ def _latex(table: Table) -> str:
         safe = (f"{{{cell}}}" if cell.startswith("[") else cell for cell in cells)
         return f"  {' & '.join(safe)} \\\\"
 
+    head, *rows = (line([latex_escape(cell) for cell in cells]) for cells in table.lines)
     notes = "; ".join(latex_escape(note) for note in table.notes)
     caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
     return "\n".join(
@@ -131,9 +142,9 @@ def _latex(table: Table) -> str:
             f"\\label{{tab:{table.name}}}",
             f"\\begin{{tabular}}{{{columns}}}",
             r"\toprule",
-            line([latex_escape(name) for name in table.header]),
+            head,
             r"\midrule",
-            *(line([latex_escape(shown(cell)) for cell in row]) for row in table.rows),
+            *rows,
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{table}",
@@ -149,14 +160,15 @@ def _html(table: Table) -> str:
         )
         return f"<tr>{''.join(parts)}</tr>"
 
+    head, *rows = table.lines
     return "\n".join(
         [
             f'<section id="{html.escape(table.name)}">',
             f"<h2>{html.escape(table.title)}</h2>",
             "<div class=wide><table>",
-            f"<thead>{row(table.header, 'th')}</thead>",
+            f"<thead>{row(head, 'th')}</thead>",
             "<tbody>",
-            *(row([shown(cell) for cell in cells], "td") for cells in table.rows),
+            *(row(cells, "td") for cells in rows),
             "</tbody></table></div>",
             *(f"<p>{html.escape(note)}</p>" for note in table.notes),
             "</section>",

@@ -2,109 +2,141 @@
 
 A setting is wrong at the moment it is read, not an hour later: types, ranges and names that are
 known here are checked by the constructor; planners, stores and splits are checked by the runner.
+The options of the command line are made from the fields, too.
 """
 
-import json
 import math
-import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, get_args, get_origin
 
 from shiftsim.errors import ConfigError, one_of
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
-SAVE_ROLLOUTS = ("all", "failed", "none")
-EXECUTORS = ("processes", "dask")
-DEVICES = ("cpu", "cuda", "auto")
 DEFAULT_STORE = "demo"
 MAX_SEED = 2**63 - 1
 
 
-@dataclass(frozen=True, slots=True)
-class RunConfig:
-    """Everything that one run depends on.
+def parse_seeds(text: str) -> list[int]:
+    """Seeds as given on the command line, such as `0,1,2`.
+
+    Raises:
+        ConfigError: They are no integers.
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(
+            f"seeds {text!r} are not integers", hint="for example --seeds 0,1,2"
+        ) from error
+
+
+def parse_workers(text: str) -> int:
+    """Worker processes as given on the command line; 0, or `auto` there, chooses from the cores.
+
+    Raises:
+        ConfigError: It is neither a number from 1 on nor `auto`.
+    """
+    if text == "auto":
+        return 0
+    if not text.isdecimal() or int(text) < 1:
+        raise ConfigError(
+            f"workers {text!r} is neither auto nor a number from 1 on", hint="--workers auto"
+        )
+    return int(text)
+
+
+class Option(NamedTuple):
+    """A setting on the command line, and what its values may be.
 
     Attributes:
-        planners: Names, `package.module:Class`, or names with a checkpoint.
-        planner_args: Arguments of the planners, by planner as named in `planners`.
-        noise: Names of noise models; `all` stands for the seven of the benchmark.
-        seeds: Seeds of the noise; ignored for `none`.
-        traffic: Traffic mode.
-        controller: How a plan moves the ego.
-        thresholds: Threshold profile of the metrics.
-        metrics: Own metrics as `module:attribute`, reported beside the official ones.
-        store: Name or path of the scenario store.
-        split: Name or file of a split; empty for all scenarios of the store.
-        limit: Use only the first scenarios of the split, 0 for all.
-        all_scenarios: Also use what the filter dropped, where a whole store is run.
-        checkpoints: Checkpoints of learned planners, as a path or `planner=path`.
-        device: Where learned planners compute: `cpu`, `cuda`, or `auto` for what there is.
-        batch_size: Scenarios that advance together, for planners that can; results of another
-            batch size may differ in the last digits.
-        strict: Fail where a planner falls back to a makeshift instead of counting the step.
-        workers: Worker processes; 0 chooses from cores and memory.
-        timeout: Time that one scenario may take [s]; 0 for any.
-        executor: `processes` of this machine, or `dask` for a cluster.
-        scheduler: Address of the cluster's scheduler.
-        shard: The part `i/n` of all tasks; empty for all.
-        out: Run folder; empty for `runs/<id>`.
-        resume: Go on with a run that was interrupted, instead of refusing to replace it.
-        retry_failed: Go on with a run, and do again what failed.
-        save_rollouts: `all`, `failed` for those with a score of 0, or `none`.
-        bundle: Copy the scenarios and maps that were used into the run folder.
-        allow_partial: Print a labelled mean over the survivors when tasks fail or are missing.
+        help: What the option is for.
+        flags: Its names, where they are not the name of the setting.
+        choices: The values there are; empty for any.
+        least: Smallest value; None for any.
+        parse: Makes the value from the text of the command line.
     """
 
-    planners: tuple[str, ...]
-    planner_args: dict[str, dict[str, Value]] = field(default_factory=dict)
-    noise: tuple[str, ...] = ("none",)
-    seeds: tuple[int, ...] = (0,)
-    traffic: str = "nonreactive"
-    controller: str = "lqr"
-    thresholds: str = "nuplan"
-    metrics: tuple[str, ...] = ()
-    store: str = DEFAULT_STORE
-    split: str = ""
-    limit: int = 0
-    all_scenarios: bool = False
-    checkpoints: tuple[str, ...] = ()
-    device: str = "cpu"
-    batch_size: int = 1
-    strict: bool = False
-    workers: int = 0
-    timeout: float = 0.0
-    executor: str = "processes"
-    scheduler: str = ""
-    shard: str = ""
-    out: str = ""
-    resume: bool = False
-    retry_failed: bool = False
-    save_rollouts: str = "all"
-    bundle: bool = False
-    allow_partial: bool = False
+    help: str
+    flags: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()
+    least: int | None = None
+    parse: Callable[[str], Any] | None = None
+
+
+def _setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
+    return field(default=default, metadata={"option": Option(help, flags, **more)})
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """Everything that one run depends on; the text of each setting is that of its option.
+
+    `planner_args` holds arguments of the planners, by planner as named in `planners`. A `limit` or
+    `timeout` of 0 is none, `workers` of 0 chooses from cores and memory. Results of another
+    `batch_size` may differ in the last digits.
+    """
+
+    planners: tuple[str, ...] = _setting(
+        (), "Name or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
+    )
+    noise: tuple[str, ...] = _setting(
+        ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
+    )
+    seeds: tuple[int, ...] = _setting((0,), "Noise seeds, such as 0,1,2. [0]", parse=parse_seeds)
+    store: str = _setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
+    split: str = _setting("", "Name or file (.toml, .txt). [whole store]")
+    limit: int = _setting(0, "Only the first N scenarios.", least=0)
+    all_scenarios: bool = _setting(False, "Also the scenarios that the filter dropped.", "--all")
+    traffic: str = _setting(
+        "nonreactive",
+        "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
+    )
+    controller: str = _setting("lqr", "lqr, perfect or log-playback. [lqr]")
+    thresholds: str = _setting("nuplan", "nuplan or deepplan. [nuplan]")
+    planner_args: dict[str, dict[str, Value]] = field(
+        default_factory=dict,
+        metadata={
+            "option": Option("key=value, or PLANNER.key=value; repeatable.", ("--planner-arg",))
+        },
+    )
+    metrics: tuple[str, ...] = _setting(
+        (), "Own metric as package.module:function; repeatable.", "--metric"
+    )
+    checkpoints: tuple[str, ...] = _setting(
+        (), "PATH, or PLANNER=PATH; repeatable.", "--checkpoint"
+    )
+    device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
+    batch_size: int = _setting(1, "Scenarios per forward pass of a learned planner. [1]", least=1)
+    strict: bool = _setting(False, "Fail where a planner falls back.")
+    out: str = _setting("", "Run folder. [runs/<id>]")
+    workers: int = _setting(0, "Worker processes. [auto]", least=0, parse=parse_workers)
+    timeout: float = _setting(
+        0.0, "Seconds that one scenario may take; a hung one is killed.", least=0
+    )
+    resume: bool = _setting(False, "Finish an interrupted or killed run.")
+    retry_failed: bool = _setting(False, "Finish a run, and do again what failed.")
+    shard: str = _setting("", "Only the part i/n of the tasks; see merge.")
+    executor: str = _setting(
+        "processes", "processes or dask. [processes]", choices=("processes", "dask")
+    )
+    scheduler: str = _setting("", "Address of the dask scheduler.")
+    save_rollouts: str = _setting(
+        "all", "all, failed (score 0) or none. [all]", choices=("all", "failed", "none")
+    )
+    bundle: bool = _setting(False, "Copy the scenarios used into the run folder.")
+    allow_partial: bool = _setting(False, "Print a labelled mean over what finished.")
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            _check_type(item.name, getattr(self, item.name))
-        _not_empty("planners", self.planners)
-        _not_empty("noise", self.noise)
-        _not_empty("seeds", self.seeds)
-        for name in _LISTS:
-            _no_repeats(name, getattr(self, name))
+            _check(item.name, getattr(self, item.name), item.type, item.metadata["option"])
+        for name in ("planners", "noise", "seeds"):
+            if not getattr(self, name):
+                raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
             raise ConfigError(f"seeds {list(self.seeds)!r}: a seed is an integer from 0 on")
-        for name in ("limit", "workers", "timeout"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} is {getattr(self, name)!r}; it cannot be negative")
-        if self.batch_size < 1:
-            raise ConfigError(f"batch_size is {self.batch_size!r}; it must be at least 1")
-        one_of("save_rollouts", self.save_rollouts, SAVE_ROLLOUTS)
-        one_of("executor", self.executor, EXECUTORS)
-        one_of("device", self.device.partition(":")[0], DEVICES)
         if self.executor == "dask" and not self.scheduler:
             raise ConfigError(
                 "executor 'dask' needs a scheduler", hint="for example --scheduler tcp://head:8786"
@@ -114,53 +146,42 @@ class RunConfig:
         for planner in self.planner_args:
             one_of("planner in planner_args", planner, self.planners)
 
+    @property
+    def resumes(self) -> bool:
+        """Whether what is finished is kept."""
+        return self.resume or self.retry_failed
+
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON or TOML values."""
         out = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
 
 
-_LISTS = {"planners": str, "noise": str, "seeds": int, "metrics": str, "checkpoints": str}
-_SCALARS = {
-    "limit": int,
-    "workers": int,
-    "batch_size": int,
-    "timeout": float,
-    **dict.fromkeys(
-        ("allow_partial", "all_scenarios", "strict", "resume", "retry_failed", "bundle"), bool
-    ),
-}
-
-
-def _check_type(name: str, value: object) -> None:
+def _check(name: str, value: Any, kind: Any, option: Option) -> None:
     """Types are checked strictly: TOML and Python callers get the same message."""
-    if name in _LISTS:
-        kind = _LISTS[name]
+    if get_origin(kind) is tuple:
+        kind = get_args(kind)[0]
         good = isinstance(value, tuple) and all(_is_a(item, kind) for item in value)
         wanted = f"a list of {kind.__name__}"
-    elif name == "planner_args":
+    elif get_origin(kind) is dict:
         good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
         wanted = "a table of arguments per planner"
     else:
-        kind = _SCALARS.get(name, str)
         good, wanted = _is_a(value, kind), kind.__name__
     if not good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+    if isinstance(value, tuple) and len(set(value)) != len(value):
+        raise ConfigError(f"{name} {list(value)!r}: a value is listed twice")
+    if option.choices:
+        one_of(name, value.partition(":")[0], option.choices)
+    if option.least is not None and not option.least <= value < math.inf:
+        wrong = "it cannot be negative" if option.least == 0 else "it must be at least 1"
+        raise ConfigError(f"{name} is {value!r}; {wrong}")
 
 
 def _is_a(value: object, kind: type) -> bool:
     kinds = (int, float) if kind is float else (kind,)
     return isinstance(value, kinds) and (kind is bool or not isinstance(value, bool))
-
-
-def _not_empty(name: str, values: tuple[object, ...]) -> None:
-    if not values:
-        raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
-
-
-def _no_repeats(name: str, values: tuple[object, ...]) -> None:
-    if len(set(values)) != len(values):
-        raise ConfigError(f"{name} {list(values)!r}: a value is listed twice")
 
 
 def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
@@ -177,35 +198,13 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
             raise ConfigError(f"{where}: {error}", hint=error.hint) from error
     if "planners" not in values:
         raise ConfigError(f"{where}: no planner", hint="name one, for example --planner idm")
-    plain: dict[str, Any] = dict(values)
-    for name in _LISTS:
-        if isinstance(plain.get(name), list):
-            plain[name] = tuple(plain[name])
+    plain: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in values.items()
+    }
     try:
         return RunConfig(**plain)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}", hint=error.hint) from error
-
-
-def write_toml(config: RunConfig) -> str:
-    """The settings as the text of a TOML file that `read_toml` and `make_config` take back."""
-    values = config.to_dict()
-    arguments = values.pop("planner_args")
-    lines = [f"{name} = {_toml(value)}" for name, value in values.items()]
-    for planner, table in arguments.items():
-        lines += ["", f"[planner_args.{_toml(planner)}]"]
-        lines += [f"{_toml(name)} = {_toml(value)}" for name, value in table.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Value) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return repr(value)
 
 
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
@@ -246,44 +245,3 @@ def parse_shard(text: str) -> tuple[int, int]:
     if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)
     raise ConfigError(f"shard {text!r} is not i/n with i from 1 to n", hint="for example 2/16")
-
-
-def default_workers(memory_each: float = 0.5e9) -> int:
-    """Worker processes when nothing is said: one per core, as long as they fit into the memory.
-
-    Args:
-        memory_each: Memory that each of them needs [bytes].
-    """
-    free = _free_memory()
-    fitting = int(free // memory_each) if free else _cores()
-    return max(1, min(_cores(), fitting))
-
-
-def _cores() -> int:
-    """Cores that this process may use, also in a container that gets only a share of them."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    quota, _, period = _first_line("/sys/fs/cgroup/cpu.max").partition(" ")
-    if quota.isdecimal() and period.isdecimal():
-        return max(1, min(cores or 1, int(quota) // int(period)))
-    return cores or 1
-
-
-def _free_memory() -> float:
-    """Memory that this process could still take [bytes], 0 where unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return 0.0
-    free = next((float(x.split()[1]) * 1024 for x in lines if x.startswith("MemAvailable")), 0.0)
-    limit = _first_line("/sys/fs/cgroup/memory.max")
-    used = _first_line("/sys/fs/cgroup/memory.current")
-    if limit.isdecimal() and used.isdecimal():
-        free = min(free, float(limit) - float(used))
-    return free
-
-
-def _first_line(path: str) -> str:
-    try:
-        return Path(path).read_text().partition("\n")[0]
-    except OSError:
-        return ""

@@ -8,24 +8,22 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 from shiftsim.errors import DataError
-from shiftsim.runs.bundle import write_bundle
+from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
-from shiftsim.runs.planners import planner_name
-from shiftsim.runs.prepare import RUNS as RUNS
-from shiftsim.runs.prepare import Prepared as Prepared
-from shiftsim.runs.prepare import open_named_store as open_named_store
-from shiftsim.runs.prepare import prepare as prepare
-from shiftsim.runs.prepare import run_name as run_name
+from shiftsim.runs.prepare import Prepared, prepare
 from shiftsim.runs.results import FAILED, OK, TIMEOUT, Run, TaskResult, open_run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.task import TaskRunner, Unit
+from shiftsim.runs.scenarios import open_named_store, write_bundle
+from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.runs.workers import Outcome, map_unordered
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+
+Outcomes: TypeAlias = Generator[Outcome[Batch, list[TaskResult]], None, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +42,26 @@ class Progress:
     failed: int
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def after(self, result: TaskResult) -> "Progress":
+        """The progress after one more result."""
+        failed = result.status != OK
+        return self + Progress(1, 0, int(failed), result.seconds)
+
+    def __add__(self, other: "Progress") -> "Progress":
+        names = {**self.seconds, **other.seconds}
+        seconds = {n: self.seconds.get(n, 0.0) + other.seconds.get(n, 0.0) for n in names}
+        return Progress(
+            self.done + other.done, self.total + other.total, self.failed + other.failed, seconds
+        )
+
+
+Watch: TypeAlias = Callable[[Progress], None]
+
 
 def execute(
     prepared: Prepared,
     *,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: Watch = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
     """Do all tasks and write the run folder.
@@ -65,13 +78,13 @@ def execute(
     Raises:
         DataError: The folder cannot be written.
     """
-    if prepared.resumes and prepared.before == "complete":
+    if prepared.config.resumes and prepared.before == "complete":
         return open_run(prepared.folder)
     manifest = make_manifest(
         prepared.folder,
         config=prepared.config,
         split=prepared.split,
-        store=prepared.runner.store,
+        store=prepared.store,
         determining=prepared.determining,
         argv=argv,
     )
@@ -87,26 +100,24 @@ def execute(
         ) from error
 
 
-def _execute(
-    prepared: Prepared, manifest: dict[str, Any], on_progress: Callable[[Progress], None]
-) -> Run:
-    writer = RunWriter(prepared.folder, manifest, resume=prepared.resumes)
+def _execute(prepared: Prepared, manifest: dict[str, Any], on_progress: Watch) -> Run:
+    writer = RunWriter(prepared.folder, manifest, resume=prepared.config.resumes)
     try:
-        interrupted = _do_units(prepared, writer, on_progress)
+        interrupted = _do_batches(prepared, writer, on_progress)
         if interrupted and prepared.before == "complete":
             raise KeyboardInterrupt
         state = "interrupted" if interrupted else "finished"
         if prepared.config.bundle:
-            store = open_named_store(prepared.runner.store)
+            store = open_named_store(prepared.store)
             tokens = {task.token for task in prepared.tasks}
             manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
-        lacking = set(prepared.missing)
+        missing = set(prepared.missing)
         run = writer.finish(
             {**manifest, "state": state, "ended": now()},
             (*prepared.tasks, *prepared.missing),
             lambda task: (
                 "the store does not hold this scenario"
-                if task in lacking
+                if task in missing
                 else "the run was interrupted"
             ),
         )
@@ -117,101 +128,95 @@ def _execute(
     return run
 
 
-def _do_units(
-    prepared: Prepared, writer: RunWriter, on_progress: Callable[[Progress], None]
-) -> bool:
+def _do_batches(prepared: Prepared, writer: RunWriter, on_progress: Watch) -> bool:
     """Do what is not finished; returns whether the user interrupted."""
-    statuses = {task: line.status for task, line in writer.ended.items()}
-    todo = remaining(prepared.units, statuses, retry=prepared.config.retry_failed)
+    statuses = {task: ended.status for task, ended in writer.ended.items()}
+    todo = remaining(prepared.batches, statuses, retry=prepared.config.retry_failed)
     total = len(prepared.tasks)
-    progress = Progress(total - sum(map(len, todo)), total, 0)
+    progress = Progress(total - sum(len(batch.tasks) for batch in todo), total, 0)
     try:
         with closing(_outcomes(prepared, todo)) as outcomes:
-            for outcome in outcomes:
-                for result in ended(outcome):
-                    writer.add(result)
-                    progress = advanced(progress, result)
-                on_progress(progress)
+            record(outcomes, writer.add, progress, on_progress)
     except KeyboardInterrupt:
         return True
     return False
 
 
-def remaining(units: Iterable[Unit], ended: Mapping[Task, str], *, retry: bool) -> list[Unit]:
+def record(
+    outcomes: Outcomes, add: Callable[[TaskResult], None], progress: Progress, on_progress: Watch
+) -> None:
+    """Put results on disk as they come.
+
+    Args:
+        outcomes: What workers give back.
+        add: Puts one result on disk.
+        progress: How far the run was before.
+        on_progress: Called after every batch.
+    """
+    for outcome in outcomes:
+        for result in ended(outcome):
+            add(result)
+            progress = progress.after(result)
+        on_progress(progress)
+
+
+def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
     """What is left to do of a run.
 
     Args:
-        units: All of it. A unit that is not finished is done as a whole again: its results may
+        batches: All of it. A batch that is not finished is done as a whole again: its results may
             depend on one another in the last digits.
         ended: Status of the tasks that have ended.
         retry: Whether those that failed are done again.
     """
-    out: list[Unit] = []
-    for unit in units:
-        failed = tuple(task for task in unit if ended.get(task) in (FAILED, TIMEOUT))
-        if not all(task in ended for task in unit):
-            out.append(unit)
+    out: list[Batch] = []
+    for batch in batches:
+        failed = tuple(task for task in batch.tasks if ended.get(task) in (FAILED, TIMEOUT))
+        if not all(task in ended for task in batch.tasks):
+            out.append(batch)
         elif retry and failed:
-            out.append(failed)
+            out.append(Batch(failed))
     return out
 
 
-def _outcomes(
-    prepared: Prepared, units: Sequence[Unit]
-) -> Generator[Outcome[Unit, list[TaskResult]], None, None]:
+def _outcomes(prepared: Prepared, batches: Sequence[Batch]) -> Outcomes:
     config = prepared.config
-    make = partial(_runner, prepared.runner)
-    leading = min(len(prepared.runner.planners), len(units))
+    make = partial(TaskRunner, config, prepared.store, prepared.planners, prepared.noises)
+    leading = min(len(prepared.planners), len(batches))
     if config.executor == "dask":
         from shiftsim.runs.cluster import map_on_cluster
 
         return map_on_cluster(
             make,
-            units,
+            batches,
             scheduler=config.scheduler,
             alone=leading,
             limit=config.timeout,
-            pieces=_pieces,
+            pieces=Batch.split,
         )
     return map_unordered(
         make,
-        units,
+        batches,
         workers=prepared.workers,
         alone=leading,
         limit=config.timeout,
-        pieces=_pieces,
-        group=_scenario,
+        pieces=Batch.split,
+        group=scenario_of,
     )
 
 
-def _scenario(unit: Unit) -> str:
-    return unit[0].token
+def scenario_of(batch: Batch) -> str:
+    """What a worker stays with, as it has read it already."""
+    return batch.token
 
 
-def _runner(runner: TaskRunner) -> TaskRunner:
-    return runner
-
-
-def _pieces(unit: Unit) -> list[Unit]:
-    return [(task,) for task in unit]
-
-
-def ended(outcome: Outcome[Unit, list[TaskResult]]) -> list[TaskResult]:
-    """The results of a unit, whose worker may have died."""
+def ended(outcome: Outcome[Batch, list[TaskResult]]) -> list[TaskResult]:
+    """The results of a batch, whose worker may have died."""
     if outcome.result is not None:
         return outcome.result
     status = TIMEOUT if outcome.is_late else FAILED
     hint = "run this scenario alone with --workers 1 to see why"
-    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task]
-
-
-def advanced(progress: Progress, result: TaskResult) -> Progress:
-    """The progress after one more result."""
-    seconds = dict(progress.seconds)
-    for name, value in result.seconds.items():
-        seconds[name] = seconds.get(name, 0.0) + value
-    failed = progress.failed + (result.status != OK)
-    return Progress(progress.done + 1, progress.total, failed, seconds)
+    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task.tasks]
 
 
 def run(
@@ -219,7 +224,7 @@ def run(
     *,
     noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
     seeds: int | Iterable[int] = 0,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: Watch = lambda progress: None,
     **settings: Any,
 ) -> Run:
     """Simulate and score planners on scenarios, as `shiftsim run` does.

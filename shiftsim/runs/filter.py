@@ -1,15 +1,14 @@
 """The automatic filter: drive scenarios as recorded, drop those that cannot be driven so.
 
-Rules and thresholds are those of deepplan-conversion.md §10. The verdicts lie beside the scenarios,
-in `filter/verdicts.parquet` of the store; the scenarios themselves stay as they are. Runs over a
-whole store use the accepted ones.
+The verdicts lie beside the scenarios, in `filter/verdicts.parquet` of the store; the scenarios
+themselves stay as they are. Runs over a whole store use the accepted ones.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,21 +16,21 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.store.files import Table, digest, write_blocks
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
-from shiftsim.runs.config import default_workers
+from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.task import attempt
-from shiftsim.runs.workers import map_unordered
+from shiftsim.runs.task import Scenarios, attempt
+from shiftsim.runs.workers import default_workers, map_unordered
 from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
 VERDICTS = "filter/verdicts.parquet"
-_UNFINISHED = "filter/unfinished.jsonl"
+_UNFINISHED = "filter/unfinished.sqlite"
 ACCEPTED, DROPPED, FAILED = "accepted", "dropped", "failed"
 COLLISION, AREA = "at-fault collision", "drivable area"
 STANDING, OFF_ROUTE = "path too short", "progress along the route"
@@ -115,27 +114,20 @@ class Verdicts:
         return out
 
 
-@dataclass
 class Playback:
-    """Judges one scenario after the other.
+    """Finds the verdict on one scenario after the other."""
 
-    Attributes:
-        store: Folder of the store.
-        config: What a scenario must satisfy.
-    """
+    def __init__(self, store: Path, config: FilterConfig) -> None:
+        self.config = config
+        self._scenarios = Scenarios(str(store))
 
-    store: Path
-    config: FilterConfig
-    _open: Any = field(default=None, init=False)
+    def __call__(self, token: str) -> dict[str, Any]:
+        """The row of the verdict, also where the scenario cannot be driven."""
+        found = attempt(Task("log-playback", "none", 0, token), partial(self._verdict, token))
+        return _failed(token, found.error) if isinstance(found, TaskResult) else found
 
-    def __call__(self, token: str) -> TaskResult:
-        """The verdict, as the scores of the result."""
-        return attempt(Task("log-playback", "none", 0, token), partial(self._judge, token))
-
-    def _judge(self, token: str, seconds: dict[str, float], result: TaskResult) -> TaskResult:
-        if self._open is None:
-            self._open = open_store(self.store)
-        return replace(result, scores=judge_scenario(self._open.read(token), self.config))
+    def _verdict(self, token: str) -> dict[str, Any]:
+        return judge_scenario(self._scenarios.read(token), self.config)
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
@@ -205,21 +197,26 @@ def filter_store(
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
-    done = {
-        row["token"]: row
-        for row in (*_finished(path, conditions), *_unfinished(path, conditions))
-        if row["verdict"] != FAILED
-    }
-    waiting = [token for token in opened.tokens if token not in done]
-    on_progress(len(done), len(opened))
-    if waiting:
-        number = max(1, min(workers or default_workers(), len(waiting)))
-        for row in _judged(path, conditions, config, waiting, number):
-            done[row["token"]] = row
-            on_progress(len(done), len(opened))
-    rows = [done[token] for token in opened.tokens]
-    _write(path, rows, conditions)
-    (path / _UNFINISHED).unlink(missing_ok=True)
+    number = max(1, min(workers or default_workers(), len(opened)))
+    (path / _UNFINISHED).parent.mkdir(exist_ok=True)
+    journal = Journal(path / _UNFINISHED, keep=True)
+    try:
+        unfinished = [row for key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        rows = (*_finished(path, conditions), *unfinished)
+        done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
+        waiting = [token for token in opened.tokens if token not in done]
+        on_progress(len(done), len(opened))
+        make = partial(Playback, path.resolve(), config)
+        with closing(map_unordered(make, waiting, workers=number, alone=1)) as outcomes:
+            for outcome in outcomes:
+                row = outcome.result or _failed(outcome.task, outcome.death)
+                journal.put(f"{conditions['hash']} {outcome.task}", row)
+                done[outcome.task] = row
+                on_progress(len(done), len(opened))
+        _write(path, [done[token] for token in opened.tokens], conditions)
+        journal.remove()
+    finally:
+        journal.close()
     return _read(path)
 
 
@@ -237,56 +234,8 @@ def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[
     return out | {"hash": hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}
 
 
-def _judged(
-    path: Path,
-    conditions: Mapping[str, Any],
-    config: FilterConfig,
-    tokens: Iterable[str],
-    workers: int,
-) -> Iterator[dict[str, Any]]:
-    """Judge scenarios; each verdict is on disk before it is yielded."""
-    make = partial(Playback, path.resolve(), config)
-    unfinished = path / _UNFINISHED
-    unfinished.parent.mkdir(exist_ok=True)
-    kept = list(_unfinished(path, conditions))  # without a line that was cut off
-    with unfinished.open("w", encoding="utf-8") as file:
-        for row in (conditions, *kept):
-            file.write(json.dumps(row) + "\n")
-        outcomes = map_unordered(make, tokens, workers=workers, alone=1)
-        with closing(outcomes):
-            for outcome in outcomes:
-                row = _row(outcome.task, outcome.result, outcome.death)
-                file.write(json.dumps(row) + "\n")
-                file.flush()
-                yield row
-
-
-def _row(token: str, result: TaskResult | None, death: str) -> dict[str, Any]:
-    if result is not None and result.status == "ok":
-        return result.scores
-    reason = death if result is None else result.error
+def _failed(token: str, reason: str) -> dict[str, Any]:
     return dict.fromkeys(_SCHEMA.names) | {"token": token, "verdict": FAILED, "reason": reason}
-
-
-def _unfinished(store: Path, conditions: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Verdicts of an interrupted filter with the same conditions."""
-    path = store / _UNFINISHED
-    if not path.is_file():
-        return
-    with path.open(encoding="utf-8", errors="replace") as file:
-        if _json(next(file, "")) != conditions:
-            return
-        for line in file:
-            row = _json(line)
-            if isinstance(row, dict) and set(row) == set(_SCHEMA.names):
-                yield row
-
-
-def _json(line: str) -> Any:
-    try:
-        return json.loads(line)
-    except ValueError:
-        return None  # the last line of a killed filter may be cut off
 
 
 def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:

@@ -1,26 +1,27 @@
 """Writing a run folder: results go to a journal one by one, the tables are made at the end.
 
-`finish` writes the rollouts of the journal into Parquet files, and reads its lines in the order of
-the tables, both one by one, so that memory does not grow with the run.
+`finish` writes the rollouts of the journal into Parquet files, and reads its entries in the order
+of the tables, both one by one, so that memory does not grow with the run.
 """
 
 import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import whole_file
-from shiftsim.runs.journal import Journal, Line
+from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import (
+    JOURNAL,
     MISSING,
     OK,
     PLACE,
@@ -30,18 +31,20 @@ from shiftsim.runs.results import (
     Run,
     TaskResult,
     open_run,
+    stored_results,
 )
-from shiftsim.runs.rollout_files import (
+from shiftsim.runs.rollouts import (
     FOLDER,
     PartWriter,
     Place,
     RolloutReader,
+    Task,
+    decode_rows,
     next_number,
     num_rows,
     part_name,
     without_key,
 )
-from shiftsim.runs.rollouts import Task
 
 WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
@@ -55,12 +58,27 @@ ROW_GROUP = 1 << 16  # rows
 _CHUNK = 256  # results turned into tables at once
 
 
+class Ended(NamedTuple):
+    """A task that has ended.
+
+    Attributes:
+        status: What became of it.
+        place: Where its rollout is, where a Parquet file has it already.
+        has_rollout: Whether the journal has its rollout.
+    """
+
+    status: str
+    place: Place | None
+    has_rollout: bool
+
+
 class RunWriter:
     """The folder of a run under way.
 
     Attributes:
         path: The folder.
         rollouts: The folder of its rollouts.
+        ended: What has ended so far, in an earlier attempt included.
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
@@ -78,17 +96,24 @@ class RunWriter:
         self.path = path
         self.rollouts = path / FOLDER
         path.mkdir(parents=True, exist_ok=True)
-        self._journal = Journal(path, resume=resume)
-        if not _is_complete(path):
+        self._journal = Journal(path / JOURNAL, keep=resume)
+        self.ended = dict(self._entries())
+        before = _finished(path)
+        if before is not None and resume and not self.ended:
+            self._journal.put_all(map(_entry, stored_results(path)))
+            self.ended = dict(self._entries())
+        if before is None or not before.is_complete:
             self._write_manifest(manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
         self._number = next_number(self.rollouts)  # of the next file that is linked to
-        self._linked: dict[Path, str] = {}
+        self._linked: dict[Path, Path] = {}
 
-    @property
-    def ended(self) -> Mapping[Task, Line]:
-        """What has ended so far, in an earlier attempt included."""
-        return self._journal.lines
+    def _entries(self) -> Iterator[tuple[Task, Ended]]:
+        for key, values, has_rollout in self._journal.items():
+            place = values["place"] and Place(
+                self.rollouts / values["place"][0], *values["place"][1:]
+            )
+            yield Task(*json.loads(key)), Ended(values["status"], place, has_rollout)
 
     def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
         """Put one result on disk.
@@ -96,16 +121,20 @@ class RunWriter:
         Args:
             result: The result.
             stored: Where its rollout is, if another run has it already.
-        """
-        place = (self._link(stored.file), stored.row, stored.rows) if stored else ()
-        self._journal.add(result, place)
 
-    def _link(self, file: Path) -> str:
-        """Have a file of another run in this one, too; returns its name here."""
+        Raises:
+            OSError: The disk is full; what is there already stays.
+        """
+        place = stored and stored._replace(file=self._link(stored.file))
+        self._journal.put(*_entry((result, place)), result.rollout)
+        self.ended[result.task] = Ended(result.status, place, bool(result.rollout))
+
+    def _link(self, file: Path) -> Path:
+        """Have a file of another run in this one, too; returns where it is here."""
         if file not in self._linked:
-            name = part_name(self._number)
-            _link(file, self.rollouts / name)
-            self._linked[file], self._number = name, self._number + 1
+            target = self.rollouts / part_name(self._number)
+            _link(file, target)
+            self._linked[file], self._number = target, self._number + 1
         return self._linked[file]
 
     def finish(
@@ -124,7 +153,7 @@ class RunWriter:
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
         try:
-            places = _write_rollouts(self.rollouts, self._journal)
+            places = self._write_rollouts()
             tasks = iter(sorted(expected))
             while chunk := list(islice(tasks, _CHUNK)):
                 rows = [self._values(task, places.get(task), absent) for task in chunk]
@@ -154,51 +183,57 @@ class RunWriter:
         self, task: Task, place: Place | None, absent: Callable[[Task], str]
     ) -> dict[str, Any]:
         """What the tables say of a task beyond its key."""
-        line = self.ended.get(task)
-        if line is None:
+        if task not in self.ended:
             texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
             return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
         columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
-        return {**self._journal.read(line), **dict(zip(PLACE, columns, strict=True))}
+        return {**self._journal.values(_key(task)), **dict(zip(PLACE, columns, strict=True))}
+
+    def _write_rollouts(self) -> dict[Task, Place]:
+        """Put the rollouts of a run that ends into files, those of a scenario together.
+
+        A file from an earlier attempt stays as it is, unless some of its rollouts have been made
+        again: then the others move.
+
+        Returns:
+            Where they are.
+        """
+        kept: Counter[Path] = Counter()
+        for ended in self.ended.values():
+            if ended.place:
+                kept[ended.place.file] += ended.place.rows
+        whole = {file for file, rows in kept.items() if rows == num_rows(file)}
+        places: dict[Task, Place] = {}
+        writer, reader = PartWriter(self.rollouts), RolloutReader()
+        try:
+            for task in sorted(self.ended, key=lambda task: (task.token, task)):
+                _, place, has_rollout = self.ended[task]
+                if place and place.file in whole:
+                    places[task] = place
+                elif place:
+                    places[task] = writer.add(task, without_key(reader.read(place)))
+                elif has_rollout:
+                    places[task] = writer.add(task, decode_rows(self._journal.data(_key(task))))
+            writer.close()
+        finally:
+            writer.discard()
+        return places
 
     def _write_manifest(self, manifest: dict[str, Any]) -> None:
         with whole_file(self.path / "manifest.json") as partial:
             partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
 
 
-def _write_rollouts(folder: Path, journal: Journal) -> dict[Task, Place]:
-    """Put the rollouts of a run that ends into files, those of a scenario together.
+def _key(task: Task) -> str:
+    return json.dumps(task)
 
-    A file from an earlier attempt stays as it is, unless some of its rollouts have been made again:
-    then the others move.
 
-    Returns:
-        Where they are.
-    """
-    lines = {task: line for task, line in journal.lines.items() if line.rollout}
-    kept: Counter[str] = Counter()
-    for line in lines.values():
-        if line.has_place:
-            name, _, rows = line.rollout
-            kept[name] += rows
-    whole = {name for name, rows in kept.items() if rows == num_rows(folder / name)}
-    places: dict[Task, Place] = {}
-    writer, reader = PartWriter(folder), RolloutReader()
-    try:
-        for task in sorted(lines, key=lambda task: (task.token, task)):
-            line = lines[task]
-            if line.has_place:
-                name, row, rows = line.rollout
-                place = Place(folder / name, row, rows)
-                if name not in whole:
-                    place = writer.add(task, without_key(reader.read(place)))
-            else:
-                place = writer.add(task, journal.rollout(line))
-            places[task] = place
-        writer.close()
-    finally:
-        writer.discard()
-    return places
+def _entry(found: tuple[TaskResult, Place | None]) -> tuple[str, dict[str, Any]]:
+    """A result as the journal has it, without its rollout."""
+    result, place = found
+    values = {name: getattr(result, name) for name in (*TEXTS, "seconds", "scores", "metrics")}
+    values["place"] = place and (place.file.name, place.row, place.rows)
+    return _key(result.task), values
 
 
 def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
@@ -262,8 +297,9 @@ def _link(source: Path, target: Path) -> None:
             shutil.copyfile(source, partial)
 
 
-def _is_complete(path: Path) -> bool:
+def _finished(path: Path) -> Run | None:
+    """The run in a folder, if there is one that has ended."""
     try:
-        return open_run(path).is_complete
+        return open_run(path)
     except (ConfigError, DataError):
-        return False
+        return None

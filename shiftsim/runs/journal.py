@@ -1,203 +1,147 @@
-"""The journal of a run under way: every result is on disk when it ends.
+"""A journal of work under way: what was put into it survives the process, whatever ends it.
 
-A result is one line of text; its rollout is appended to a second file before that line is written.
-So a run can be killed at any moment: the lines, without a last one that was cut off, are what is
-finished. Both files go when the tables are written.
+It is one SQLite file and one transaction per entry. SQLite appends transactions to a second file,
+`….sqlite-wal`, with a checksum each, and never copies them back here: that would write everything
+twice. The lock is ours, as file systems of clusters often lack those that SQLite wants.
 """
 
 import errno
 import json
 import os
+import sqlite3
 import sys
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-
-import pyarrow as pa
+from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file
-from shiftsim.runs.results import PLACE, TEXTS, TaskResult, open_run, stored_results
-from shiftsim.runs.rollouts import Task, decode_rollout
+from shiftsim.files import locked
 
-JOURNAL = "unfinished.jsonl"
-ROLLOUTS = "unfinished.rollouts"  # encoded, one after the other
-_FIELDS = (*TEXTS, "seconds", "scores", "metrics")
-
-
-class Line(NamedTuple):
-    """A line of the journal.
-
-    Attributes:
-        offset: Its first byte.
-        length: Its bytes.
-        status: What became of the task.
-        rollout: Where its rollout is, empty where none is stored: `offset, length` in the second
-            file; or file, row and number of rows where a Parquet file has it already.
-    """
-
-    offset: int
-    length: int
-    status: str
-    rollout: tuple[Any, ...]
-
-    @property
-    def has_place(self) -> bool:
-        """Whether a Parquet file has the rollout."""
-        return len(self.rollout) == len(PLACE)
+_SETTINGS = (
+    "locking_mode = exclusive",  # no third file, whose memory is shared between processes
+    "journal_mode = wal",
+    "synchronous = normal",  # a power failure takes the last entries, and nothing else
+    "wal_autocheckpoint = 0",
+)
 
 
 class Journal:
-    """What is finished of a run.
+    """Entries by key: JSON values, and bytes beside them."""
 
-    Attributes:
-        lines: The last line of every task that has ended.
-    """
-
-    def __init__(self, folder: Path, *, resume: bool) -> None:
-        """Begin a journal, or go on with one.
+    def __init__(self, path: Path, *, keep: bool) -> None:
+        """Begin a journal, or go on with one; nothing is in the file before the first entry.
 
         Args:
-            folder: The run folder.
-            resume: Keep what is in it; the tables of a run that has ended become a journal again.
+            path: The file.
+            keep: Keep what is in it.
 
         Raises:
-            ConfigError: Another process works on this folder.
+            ConfigError: Another process works with it.
         """
-        self.folder = folder
-        if resume:
-            _restore(folder)
-        self._text = _Appended(_locked(folder / JOURNAL))
-        self._rollouts = _Appended((folder / ROLLOUTS).open("a+b", buffering=0))
-        self.lines: dict[Task, Line] = {}
-        if resume:
-            self._scan()
-        self._text.cut(max((sum(line[:2]) for line in self.lines.values()), default=0))
-        spooled = (x.rollout for x in self.lines.values() if x.rollout and not x.has_place)
-        self._rollouts.cut(max(map(sum, spooled), default=0))
+        self.path = path
+        self._appended = path.with_name(f"{path.name}-wal")
+        try:
+            self._lock = locked(path)
+        except BlockingIOError as error:
+            raise ConfigError(
+                f"another process is working on {str(path.parent)!r}",
+                hint="wait until it has finished",
+            ) from error
+        if not keep:
+            self._appended.unlink(missing_ok=True)
+            self._lock.truncate(0)
 
-    def _scan(self) -> None:
-        """Read the lines up to one that was cut off, or whose rollout a power failure took."""
-        end, stored = 0, os.fstat(self._rollouts.file.fileno()).st_size
-        self._text.file.seek(0)
-        with open(self._text.file.fileno(), "rb", closefd=False) as reader:
-            for text in reader:
-                try:
-                    values = json.loads(text)
-                    line = Line(end, len(text), values["status"], tuple(values["rollout"]))
-                    task = Task(*values["task"])
-                except (ValueError, KeyError, TypeError):
-                    break
-                lost = not line.has_place and sum(line.rollout) > stored
-                if lost or not text.endswith(b"\n"):
-                    break
-                self.lines[task] = line
-                end += len(text)
+    @cached_property
+    def _database(self) -> sqlite3.Connection:
+        vfs = "" if sys.platform == "win32" else "?vfs=unix-none"
+        address = f"{self.path.absolute().as_uri()}{vfs}"
+        database = sqlite3.connect(address, uri=True, isolation_level=None)
+        with self._explained():
+            for setting in _SETTINGS:
+                database.execute(f"pragma {setting}")
+            database.execute(
+                "create table if not exists entries (key text primary key, content text, data blob)"
+            )
+        return database
 
-    def add(self, result: TaskResult, place: tuple[str, int, int] | tuple[()] = ()) -> None:
-        """Put a result on disk.
-
-        Args:
-            result: The result.
-            place: File, row and number of rows of its rollout, where a file has it already.
+    def put(self, key: str, values: Mapping[str, Any], data: bytes = b"") -> None:
+        """Put an entry on disk, in place of the one with this key.
 
         Raises:
             OSError: The disk is full; what is there already stays.
         """
-        rollout = self._rollouts.append(result.rollout) if result.rollout else place
-        span = self._text.append(_text(result, rollout))
-        self.lines[result.task] = Line(*span, result.status, rollout)
+        content = json.dumps(values, default=_plain)
+        with self._explained():
+            self._database.execute(
+                "insert or replace into entries values (?, ?, ?)", (key, content, data)
+            )
 
-    def read(self, line: Line) -> dict[str, Any]:
-        """A line: the fields of a result, but of the rollout only where it is."""
-        values: dict[str, Any] = json.loads(self._text.read(line.offset, line.length))
-        return values
+    def put_all(self, entries: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+        """Put entries on disk: all of them or, where the process is ended, none."""
+        with self._explained():
+            self._database.execute("begin")
+            for key, values in entries:
+                self.put(key, values)
+            self._database.execute("commit")
 
-    def rollout(self, line: Line) -> pa.RecordBatch:
-        """The rollout of a line that has no place in a Parquet file yet, a row per sample."""
-        offset, length = line.rollout
-        return decode_rollout(self._rollouts.read(offset, length))
+    def items(self) -> Iterator[tuple[str, dict[str, Any], bool]]:
+        """Key, values and whether there are bytes, of all entries."""
+        if self._lock.seek(0, os.SEEK_END) == 0:
+            return
+        with self._explained():
+            for key, content, size in self._database.execute(
+                "select key, content, length(data) from entries"
+            ):
+                yield key, json.loads(content), size > 0
+
+    def values(self, key: str) -> dict[str, Any]:
+        """The values of an entry."""
+        found: dict[str, Any] = json.loads(self._select("content", key))
+        return found
+
+    def data(self, key: str) -> bytes:
+        """The bytes of an entry."""
+        found: bytes = self._select("data", key)
+        return found
+
+    def _select(self, column: str, key: str) -> Any:
+        with self._explained():
+            query = f"select {column} from entries where key = ?"
+            return self._database.execute(query, (key,)).fetchone()[0]
 
     def close(self) -> None:
-        """Let another process work on the folder."""
-        self._rollouts.file.close()
-        self._text.file.close()
+        """Let another process work with it."""
+        if "_database" in vars(self):
+            self._database.close()
+        self._lock.close()
 
     def remove(self) -> None:
-        """Close it, and remove it from disk; first the file without which the other is nothing."""
-        (self.folder / JOURNAL).unlink()
-        (self.folder / ROLLOUTS).unlink()
+        """Close it, and remove it from disk."""
+        with suppress(FileNotFoundError):
+            os.truncate(self._appended, 0)  # else closing copies all of it
         self.close()
+        self.path.unlink()
+        self._appended.unlink(missing_ok=True)
 
-
-class _Appended:
-    """A file that grows at its end, by a piece as a whole or not at all."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file = file
-        self._end = 0
-
-    def append(self, data: bytes) -> tuple[int, int]:
-        """Write a piece; returns its offset and length."""
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
         try:
-            if self.file.write(data) != len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError:  # without half a piece, the next attempt can go on
-            with suppress(OSError):
-                self.file.truncate(self._end)
-            raise
-        self._end += len(data)
-        return self._end - len(data), len(data)
-
-    def read(self, offset: int, length: int) -> bytes:
-        self.file.seek(offset)
-        return self.file.read(length)
-
-    def cut(self, end: int) -> None:
-        """Drop what follows."""
-        self.file.truncate(end)
-        self._end = end
+            yield
+        except sqlite3.DatabaseError as error:
+            if error.sqlite_errorcode == sqlite3.SQLITE_FULL:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path)) from error
+            raise DataError(
+                f"{str(self.path)!r} is damaged: {error}", hint="remove it, and start again"
+            ) from error
 
 
-def _text(result: TaskResult, rollout: tuple[Any, ...]) -> bytes:
-    values = {field: getattr(result, field) for field in _FIELDS}
-    line = {"task": result.task, "rollout": rollout, **values}
-    return (json.dumps(line, default=_plain) + "\n").encode()
+def has_entries(path: Path) -> bool:
+    """Whether there is a journal with something in it; another process may be working with it."""
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _plain(value: Any) -> Any:
     """NumPy scalars as Python's."""
     return value.item()
-
-
-def _locked(path: Path) -> BinaryIO:
-    file = path.open("a+b", buffering=0)
-    if sys.platform == "win32":
-        return file
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise ConfigError(
-            f"another process is working on {str(path.parent)!r}",
-            hint="wait for it, or choose another --out",
-        ) from error
-    except OSError:
-        pass  # a file system without locks
-    return file
-
-
-def _restore(folder: Path) -> None:
-    """Turn the tables of a finished or interrupted run into a journal again."""
-    journal = folder / JOURNAL
-    if journal.is_file() and journal.stat().st_size:
-        return
-    try:
-        open_run(folder)
-    except (ConfigError, DataError):
-        return
-    with whole_file(journal) as partial, partial.open("wb") as file:
-        for result, place in stored_results(folder):
-            file.write(_text(result, (place.file.name, place.row, place.rows) if place else ()))

@@ -1,8 +1,9 @@
-"""The manifest of a run: how its results were made."""
+"""The manifest of a run: how its results were made, and whether a folder holds the same run."""
 
 import hashlib
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -11,16 +12,25 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 from shiftsim._version import __version__
+from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import PACKAGE, sources
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.results import FORMAT_VERSION
+from shiftsim.runs.journal import has_entries
+from shiftsim.runs.results import FORMAT_VERSION, JOURNAL, read_manifest
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
 # what computes a result: a task, and everything that may be named by a setting
 _ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
+
+State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
+_EARLIER_JOURNAL = "unfinished.jsonl"
+_MAX_MESSAGE = 600  # characters
+# on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
+_BYTES_PER_TASK = 6e3
+_BYTES_PER_ROLLOUT = 70e3
 
 
 def make_manifest(
@@ -89,3 +99,133 @@ def _git_state() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip()
+
+
+def state_of(folder: Path) -> State:
+    """How far the run in a folder is.
+
+    Returns:
+        `new` when there is nothing to lose, `unfinished` when it was interrupted or killed,
+        `failed` when it ended with failed or missing tasks, else `complete`.
+
+    Raises:
+        DataError: The folder holds something else.
+        ConfigError: It holds an unfinished run of an earlier version.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(_visible(folder))):
+        return "new"
+    manifest = read_manifest(folder)
+    if has_entries(folder / _EARLIER_JOURNAL):
+        raise ConfigError(
+            f"{str(folder)!r} holds an unfinished run of an earlier version of shiftsim",
+            hint="it cannot be finished: remove the folder and run again",
+        )
+    has_results = has_entries(folder / JOURNAL)
+    if manifest["state"] == "running" and not has_results:
+        return "new"
+    if manifest["state"] != "finished" or has_results:
+        return "unfinished"
+    counts = manifest["counts"]
+    return "complete" if counts["ok"] == counts["expected"] else "failed"
+
+
+def _visible(folder: Path) -> list[Path]:
+    """Without the halves of files that a killed process leaves."""
+    return [path for path in folder.iterdir() if not path.name.startswith(".")]
+
+
+def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") -> State:
+    """Whether a run may be written to a folder: a new one, or one with the same run.
+
+    Args:
+        folder: The folder.
+        determining: Everything that the results depend on.
+        shard: The part `i/n` of the tasks.
+
+    Returns:
+        How far the run there is.
+
+    Raises:
+        ConfigError: The folder holds something else; the message says what differs.
+    """
+    try:
+        state = state_of(folder)
+    except (DataError, KeyError) as error:
+        raise ConfigError(
+            f"{str(folder)!r} exists and is not a run folder", hint="choose another --out"
+        ) from error
+    if state == "new":
+        return state
+    different = difference(read_manifest(folder), determining, shard)
+    if different:
+        raise ConfigError(
+            f"{str(folder)!r} holds another run: {different}"[:_MAX_MESSAGE],
+            hint="choose another --out, or remove that folder",
+        )
+    return state
+
+
+def difference(manifest: dict[str, Any], determining: dict[str, Any], shard: str = "") -> str:
+    """What tells a run from the one of a manifest, in words; empty when nothing does."""
+    before = {**manifest.get("determining", {}), "shard": manifest.get("shard", "")}
+    after = {**determining, "shard": shard}
+    names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
+    if not names:
+        return ""
+    old, new = before.get(names[0]), after.get(names[0])
+    if isinstance(old, dict) and isinstance(new, dict):
+        inner = next(n for n in sorted({*old, *new}, key=str) if old.get(n) != new.get(n))
+        old, new = {inner: old.get(inner)}, {inner: new.get(inner)}
+    return f"{', '.join(names)} differ ({names[0]}: {old!r}, not {new!r})"
+
+
+def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "") -> None:
+    """Refuse to begin anew where an unfinished run with other settings seems to be meant.
+
+    Args:
+        folder: The folder of the run, where there is nothing yet.
+        determining: Everything that its results depend on.
+        shard: The part `i/n` of the tasks.
+
+    Raises:
+        ConfigError: There is one; the message says what differs.
+    """
+    prefix = folder.name.rpartition("_")[0]
+    for other in sorted(folder.parent.glob(f"{prefix}_*")) if prefix else ():
+        try:
+            manifest = read_manifest(other)
+            if state_of(other) != "unfinished" or manifest.get("shard", "") != shard:
+                continue
+        except (DataError, KeyError):
+            continue
+        different = difference(manifest, determining, shard)
+        raise ConfigError(
+            f"no unfinished run with these settings; {str(other)!r} is another one: {different}"[
+                :_MAX_MESSAGE
+            ],
+            hint="give its settings, or leave out --resume to begin anew",
+        )
+
+
+def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
+    """Refuse a run that cannot end where it is to be.
+
+    Args:
+        folder: The folder of the run, which need not exist.
+        num_tasks: Its tasks.
+        with_rollouts: Whether all rollouts are kept.
+
+    Raises:
+        ConfigError: The disk has too little space.
+    """
+    place = folder.absolute()
+    while not place.exists():
+        place = place.parent
+    needed = num_tasks * (_BYTES_PER_TASK + _BYTES_PER_ROLLOUT * with_rollouts)
+    free = shutil.disk_usage(place).free
+    if needed > free:
+        raise ConfigError(
+            f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, "
+            f"{str(place)!r} has {free / 1e9:.1f} GB free",
+            hint="choose another --out" + ", or --save-rollouts failed" * with_rollouts,
+        )

@@ -1,31 +1,39 @@
 """Everything that is checked before the first simulated step of a run.
 
-What was checked is what is run: `prepare` resolves the settings to units of work, which
+What was checked is what is run: `prepare` resolves the settings to batches of tasks, which
 `shiftsim.runs.execute` then does.
 """
 
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shiftsim._version import __version__
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
-from shiftsim.files import store_path
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.runs.config import DEFAULT_STORE, RunConfig, Value, default_workers, parse_shard
-from shiftsim.runs.filter import Verdicts, read_verdicts
-from shiftsim.runs.manifest import code_digest
-from shiftsim.runs.planners import PlannerEntry, can_travel, planner_entry, takes_argument
-from shiftsim.runs.resume import State, check_resumable, check_room, check_target
+from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
+from shiftsim.runs.config import RunConfig, Value, parse_shard
+from shiftsim.runs.manifest import (
+    State,
+    check_resumable,
+    check_space,
+    check_target,
+    code_digest,
+)
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.splits import find_split, token_hash
-from shiftsim.runs.task import TaskRunner, Unit
+from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
+from shiftsim.runs.task import Batch
+from shiftsim.runs.workers import default_workers
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import make_traffic, traffic_name
+
+if TYPE_CHECKING:
+    from shiftsim.runs.filter import Verdicts
 
 RUNS = Path("runs")
 _MAX_NAME = 40  # characters of one part of a run's name
@@ -38,64 +46,56 @@ class Prepared:
 
     Attributes:
         config: The settings, names resolved.
-        runner: Does one unit of tasks.
-        units: All tasks whose scenario exists, as they are handed out.
+        store: Folder or URL of the scenario store.
+        planners: The planners, by name.
+        noises: The noise models, by name.
+        batches: All tasks whose scenario exists, as they are handed out.
         missing: Tasks whose scenario the store does not hold.
         split: Name of the split.
         tokens: All scenarios of the run, whatever the shard.
+        num_dropped: Scenarios left out because the filter dropped them.
         determining: Everything that the scores depend on.
         folder: Where the run folder will be.
         before: What it holds now.
         workers: Number of worker processes.
-        num_dropped: Scenarios left out because the filter dropped them.
     """
 
     config: RunConfig
-    runner: TaskRunner
-    units: tuple[Unit, ...]
+    store: str
+    planners: Mapping[str, RunPlanner]
+    noises: Mapping[str, NoiseModel]
+    batches: tuple[Batch, ...]
     missing: tuple[Task, ...]
     split: str
     tokens: tuple[str, ...]
+    num_dropped: int
     determining: dict[str, Any]
     folder: Path
     before: State
     workers: int
-    num_dropped: int = 0
 
     @property
     def tasks(self) -> tuple[Task, ...]:
         """All tasks whose scenario exists."""
-        return tuple(task for unit in self.units for task in unit)
-
-    @property
-    def num_expected(self) -> int:
-        """Tasks that a complete run has."""
-        return len(self.tasks) + len(self.missing)
-
-    @property
-    def resumes(self) -> bool:
-        """Whether what is finished is kept."""
-        return self.config.resume or self.config.retry_failed
+        return tuple(task for batch in self.batches for task in batch.tasks)
 
 
-def open_named_store(name: str) -> Any:
-    """A store by name, path or URL; the demo store is made when it is not there yet."""
-    from shiftsim.data.store.reading import open_store
+class Chosen(NamedTuple):
+    """The scenarios of a run.
 
-    if "://" in name:
-        return open_store(name)
-    path = store_path(name)
-    if name == DEFAULT_STORE and not path.exists():
-        from shiftsim.data.demo.store import demo_store
+    Attributes:
+        split: Name of the split.
+        present: Tokens that the store holds.
+        missing: Tokens that it does not hold.
+        num_dropped: Scenarios left out because the filter dropped them.
+        determining: What identifies them.
+    """
 
-        path = demo_store(path)
-    if not path.exists():
-        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
-        raise DataError(
-            f"no store {name!r} at {str(path)!r}",
-            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
-        )
-    return open_store(path)
+    split: str
+    present: list[str]
+    missing: list[str]
+    num_dropped: int
+    determining: dict[str, Any]
 
 
 def prepare(
@@ -126,43 +126,34 @@ def prepare(
         load_metric(metric)
     entries = _entries(config, planners or config.planners)
     store = open_named_store(config.store)
-    split, present, lacking, dropped, determining = _scenarios(config, store)
-    determining |= _determining(config, entries, models, thresholds)
-    folder = Path(config.out) if config.out else RUNS / run_name(config, split, determining)
+    chosen = _scenarios(config, store)
+    determining = chosen.determining | _determining(config, entries, models, thresholds)
+    folder = Path(config.out) if config.out else RUNS / run_name(config, chosen.split, determining)
     before = _check_folder(config, folder, determining)
-    runner = TaskRunner(
-        store.source,
-        {entry.name: entry for entry in entries},
-        {model.name: model for model in models},
-        config.traffic,
-        config.controller,
-        config.thresholds,
-        config.metrics,
-        config.save_rollouts,
-        config.strict,
-    )
-    tasks = list(_tasks(entries, models, config.seeds, present))
-    units = _of_shard(config.shard, _units(entries, tasks, config.batch_size))
+    tasks = list(_tasks(entries, models, config.seeds, chosen.present))
+    missing = [Batch((task,)) for task in _tasks(entries, models, config.seeds, chosen.missing)]
+    batches = _of_shard(config.shard, _batches(entries, tasks, config.batch_size))
     if before == "new":
-        count = sum(map(len, units))
-        check_room(folder, count, with_rollouts=config.save_rollouts == "all")
-    missing: list[Unit] = [(task,) for task in _tasks(entries, models, config.seeds, lacking)]
+        count = sum(len(batch.tasks) for batch in batches)
+        check_space(folder, count, with_rollouts=config.save_rollouts == "all")
     return Prepared(
-        config,
-        runner,
-        tuple(_leading_first(units)),
-        tuple(task for (task,) in _of_shard(config.shard, missing)),
-        split,
-        (*present, *lacking),
-        determining,
-        folder,
-        before,
-        _workers(config, entries, len(units)),
-        dropped,
+        config=config,
+        store=store.source,
+        planners={entry.name: entry for entry in entries},
+        noises={model.name: model for model in models},
+        batches=tuple(_leading_first(batches)),
+        missing=tuple(batch.tasks[0] for batch in _of_shard(config.shard, missing)),
+        split=chosen.split,
+        tokens=(*chosen.present, *chosen.missing),
+        num_dropped=chosen.num_dropped,
+        determining=determining,
+        folder=folder,
+        before=before,
+        workers=_workers(config, entries, len(batches)),
     )
 
 
-def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
+def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
     checkpoints = _checkpoints(config, sources)
     entries = []
     for name, source in zip(config.planners, sources, strict=True):
@@ -171,7 +162,7 @@ def _entries(config: RunConfig, sources: Sequence[Any]) -> list[PlannerEntry]:
             arguments["checkpoint"] = checkpoints[name]
         if takes_argument(source, "device"):
             arguments.setdefault("device", config.device)
-        entries.append(planner_entry(source, arguments))
+        entries.append(run_planner(source, arguments))
     return entries
 
 
@@ -196,46 +187,44 @@ def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
     return out
 
 
-def _scenarios(
-    config: RunConfig, store: Any
-) -> tuple[str, list[str], list[str], int, dict[str, Any]]:
-    """Name of the split, tokens found and lacking, number dropped, and what identifies them."""
+def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     known = tuple(store.tokens)
-    verdicts = _verdicts(config, store)
+    whole = config.split in ("", store.path.name)
+    verdicts = _verdicts(config, store) if whole and not config.all_scenarios else None
     usable = known if verdicts is None else verdicts.accepted
-    if not config.all_scenarios and config.split in ("", store.path.name):
+    if whole and not config.all_scenarios:
         usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
-    chosen = split.tokens[: config.limit] if config.limit else split.tokens
-    lacking = sorted(set(chosen) - set(known))
-    if lacking and not config.allow_partial:
+    tokens = split.tokens[: config.limit] if config.limit else split.tokens
+    missing = sorted(set(tokens) - set(known))
+    if missing and not config.allow_partial:
         raise DataError(
-            f"split {split.name!r} needs {len(chosen)} scenarios, store {config.store!r} "
-            f"lacks {len(lacking)} of them, such as {lacking[0]!r}",
+            f"split {split.name!r} needs {len(tokens)} scenarios, store {config.store!r} "
+            f"lacks {len(missing)} of them, such as {missing[0]!r}",
             hint="convert the missing scenarios, or --allow-partial",
         )
-    if len(lacking) == len(chosen):
+    if len(missing) == len(tokens):
         raise DataError(
             f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
             hint="name the store that was converted for this split",
         )
-    absent = set(lacking)
-    present = [token for token in chosen if token not in absent]
-    determining = {"store": store.hash, "tokens": token_hash(chosen)}
+    determining = {"store": store.hash, "tokens": token_hash(tokens)}
     if verdicts is not None:
         determining["filter"] = verdicts.hash
     if store.reviews.hash:
         determining["review"] = store.reviews.hash
-    return split.name, present, lacking, len(known) - len(usable), determining
+    absent = set(missing)
+    present = [token for token in tokens if token not in absent]
+    return Chosen(split.name, present, missing, len(known) - len(usable), determining)
 
 
-def _verdicts(config: RunConfig, store: Any) -> Verdicts | None:
+def _verdicts(config: RunConfig, store: ScenarioStore) -> "Verdicts | None":
     """The verdicts that decide which scenarios of a whole store are run.
 
     A split names its scenarios itself.
     """
-    if config.all_scenarios or config.split not in ("", store.path.name):
-        return None
+    from shiftsim.runs.filter import read_verdicts
+
     found = read_verdicts(store.path, store.hash)
     if found is not None and not found.accepted:
         raise DataError(
@@ -247,7 +236,7 @@ def _verdicts(config: RunConfig, store: Any) -> Verdicts | None:
 
 def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) -> State:
     before = check_target(folder, determining, shard=config.shard)
-    if config.resume or config.retry_failed:
+    if config.resumes:
         if before == "new" and not config.out:
             check_resumable(folder, determining, shard=config.shard)
     elif before == "unfinished":
@@ -258,9 +247,9 @@ def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) 
     return before
 
 
-def _workers(config: RunConfig, entries: Sequence[PlannerEntry], num_units: int) -> int:
+def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int) -> int:
     """Number of worker processes; 1 for planners that cannot be sent to another process."""
-    stuck = [entry.name for entry in entries if not can_travel(entry)]
+    stuck = [entry.name for entry in entries if not entry.can_travel]
     if stuck and (config.timeout or config.executor != "processes"):
         raise ConfigError(
             f"planner {stuck[0]!r} cannot be sent to a worker process, as a timeout or a cluster "
@@ -269,7 +258,7 @@ def _workers(config: RunConfig, entries: Sequence[PlannerEntry], num_units: int)
         )
     memory = max([_MEMORY_OF_NETWORK for entry in entries if entry.in_batches], default=0.0)
     workers = config.workers or (default_workers(memory) if memory else default_workers())
-    return 1 if stuck else max(1, min(workers, num_units))
+    return 1 if stuck else max(1, min(workers, num_batches))
 
 
 def _expanded(names: Iterable[str]) -> list[str]:
@@ -288,7 +277,7 @@ def _check_traffic(name: str) -> None:
 
 
 def _tasks(
-    entries: Iterable[PlannerEntry],
+    entries: Iterable[RunPlanner],
     models: Iterable[NoiseModel],
     seeds: Iterable[int],
     tokens: Iterable[str],
@@ -303,46 +292,47 @@ def _tasks(
     return (Task(*run, token) for token in tokens for run in runs)
 
 
-def _units(entries: Iterable[PlannerEntry], tasks: list[Task], size: int) -> list[Unit]:
+def _batches(entries: Iterable[RunPlanner], tasks: list[Task], size: int) -> list[Batch]:
     """The tasks, those of a planner that answers in batches grouped.
 
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
     first is a single task: other workers wait until it has compiled the planner's kernels.
     """
-    batched = {entry.name for entry in entries if entry.in_batches}
-    units: list[Unit] = [(task,) for task in tasks if task.planner not in batched]
-    for name in sorted(batched):
-        own = [task for task in tasks if task.planner == name]
-        units += [tuple(own[:1]), *(tuple(own[i : i + size]) for i in range(1, len(own), size))]
-    return units
+    grouped = {entry.name for entry in entries if entry.in_batches}
+    batches = [Batch((task,)) for task in tasks if task.planner not in grouped]
+    for name in sorted(grouped):
+        own = tuple(task for task in tasks if task.planner == name)
+        batches += [Batch(own[:1])]
+        batches += [Batch(own[i : i + size]) for i in range(1, len(own), size)]
+    return batches
 
 
-def _of_shard(shard: str, units: list[Unit]) -> list[Unit]:
-    """The units of a shard: by the hash of their first task, so no shard needs to know another."""
+def _of_shard(shard: str, batches: list[Batch]) -> list[Batch]:
+    """The batches of a shard: by a hash of the first task, so no shard needs to know another."""
     if not shard:
-        return units
+        return batches
     number, count = parse_shard(shard)
 
     def bucket(task: Task) -> int:
         digest = hashlib.blake2b(repr(tuple(task)).encode(), digest_size=8).digest()
         return int.from_bytes(digest, "little") % count
 
-    return [unit for unit in units if bucket(unit[0]) == number - 1]
+    return [batch for batch in batches if bucket(batch.tasks[0]) == number - 1]
 
 
-def _leading_first(units: list[Unit]) -> list[Unit]:
-    """One unit per planner to the front: they compile all the kernels."""
-    leading: dict[str, Unit] = {}
-    for unit in units:
-        leading.setdefault(unit[0].planner, unit)
+def _leading_first(batches: list[Batch]) -> list[Batch]:
+    """One batch per planner to the front: they compile all the kernels."""
+    leading: dict[str, Batch] = {}
+    for batch in batches:
+        leading.setdefault(batch.planner, batch)
     first = list(leading.values())
     chosen = set(first)
-    return first + [unit for unit in units if unit not in chosen]
+    return first + [batch for batch in batches if batch not in chosen]
 
 
 def _determining(
     config: RunConfig,
-    entries: Sequence[PlannerEntry],
+    entries: Sequence[RunPlanner],
     models: Sequence[NoiseModel],
     thresholds: dict[str, Any],
 ) -> dict[str, Any]:

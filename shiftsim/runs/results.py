@@ -19,12 +19,19 @@ import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollout_files import FOLDER, Place, RolloutReader
-from shiftsim.runs.rollouts import Task, complete_rollout, describe
+from shiftsim.runs.rollouts import (
+    FOLDER,
+    Place,
+    RolloutReader,
+    Task,
+    complete_rollout,
+    describe,
+)
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
 FORMAT_VERSION = 4
+JOURNAL = "unfinished.sqlite"  # of a run under way
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
 
 _KEY = [

@@ -1,18 +1,24 @@
-"""Rollouts as columns with a row per sample, and as the bytes that a worker hands over.
+"""Rollouts: a row per sample on the way from a worker to a file, and Parquet files of many of them.
 
 What the scenario holds already is not kept again: recorded tracks (unless the traffic reacts),
-lights, route and expert come back from the store when a rollout is read. The files they end in are
-those of `rollout_files`.
+lights, route and expert come back from the store when a rollout is read.
+
+A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
+into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers, and
+clusters dislike many small files: so rollouts share row groups, and a `Place` says which rows are
+whose. The first columns name the task, for readers that know nothing of places.
 """
 
 import math
-import struct
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import lru_cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
@@ -47,9 +53,27 @@ TRACKS = _without_nulls(
         **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
     }
 )
-_BOTH = pa.schema([*STATES, *TRACKS])
-_CODEC = pa.Codec("lz4_raw")
-_LENGTH = struct.Struct("<q")
+FOLDER = "rollouts"
+_MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
+_MAX_GROUP = 16, 16 << 20
+# states hardly compress and are never searched: what costs more time brings next to nothing
+_WRITE_OPTIONS: dict[str, Any] = {
+    "compression": "zstd",
+    "compression_level": 1,
+    "use_dictionary": ["planner", "noise", "token"],
+    "write_statistics": False,
+}
+_NAME = pa.dictionary(pa.int32(), pa.string())
+_KEY = [
+    pa.field(name, kind, nullable=False)
+    for name, kind in {
+        "planner": _NAME,
+        "noise": _NAME,
+        "seed": pa.int64(),
+        "token": _NAME,
+        "iteration": pa.int64(),
+    }.items()
+]
 
 
 class Task(NamedTuple):
@@ -74,34 +98,43 @@ def describe(task: Task) -> str:
     return f"{task.planner} {task.noise}{seed} {task.token}"
 
 
-def encode_rollout(log: SimulationLog, *, with_tracks: bool) -> bytes:
-    """One rollout as bytes; with the states of tracks where those are not the recorded ones."""
-    batches = [pa.RecordBatch.from_arrays(_states(log), schema=STATES)]
-    if with_tracks:
-        batches.append(pa.RecordBatch.from_arrays(_tracks(log.tracks), schema=TRACKS))
-    return encode_batches(batches)
+class Place(NamedTuple):
+    """Where a rollout is.
 
-
-def encode_batches(batches: Iterable[pa.RecordBatch]) -> bytes:
-    """The columns of a rollout as they are in memory, compressed.
-
-    Columns of `STATES` are one message of Arrow IPC, those of `TRACKS`, if there are any, another
-    one: so the bytes say by themselves what they hold. In front is the length of the messages.
+    Attributes:
+        file: The Parquet file.
+        row: Its first row there.
+        rows: Number of its rows.
     """
-    messages = b"".join(batch.serialize() for batch in batches)
-    compressed: bytes = _CODEC.compress(messages, asbytes=True)
-    return _LENGTH.pack(len(messages)) + compressed
+
+    file: Path
+    row: int
+    rows: int
 
 
-def decode_rollout(data: bytes) -> pa.RecordBatch:
-    """What `encode_rollout` was given, a row per sample: columns of `STATES`, then of `TRACKS`."""
-    (length,) = _LENGTH.unpack_from(data)
-    source = pa.BufferReader(_CODEC.decompress(memoryview(data)[_LENGTH.size :], length))
-    states = pa.ipc.read_record_batch(pa.ipc.read_message(source), STATES)
-    if source.tell() == length:
-        return states
-    tracks = pa.ipc.read_record_batch(pa.ipc.read_message(source), TRACKS)
-    return pa.RecordBatch.from_arrays([*states.columns, *tracks.columns], schema=_BOTH)
+def rollout_rows(log: SimulationLog, *, with_tracks: bool) -> pa.RecordBatch:
+    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones."""
+    columns = _states(log)
+    if not with_tracks:
+        return pa.RecordBatch.from_arrays(columns, schema=STATES)
+    schema = pa.schema([*STATES, *TRACKS])
+    return pa.RecordBatch.from_arrays([*columns, *_tracks(log.tracks)], schema=schema)
+
+
+def encode_rows(rows: pa.RecordBatch) -> bytes:
+    """The rows of a rollout as compressed bytes."""
+    sink = pa.BufferOutputStream()
+    with pa.CompressedOutputStream(sink, "lz4") as compressed:
+        with pa.ipc.new_stream(compressed, rows.schema) as stream:
+            stream.write_batch(rows)
+    encoded: bytes = sink.getvalue().to_pybytes()
+    return encoded
+
+
+def decode_rows(data: bytes) -> pa.RecordBatch:
+    """What `encode_rows` was given."""
+    with pa.CompressedInputStream(pa.BufferReader(data), "lz4") as source:
+        return pa.ipc.open_stream(source).read_next_batch()
 
 
 def _states(log: SimulationLog) -> list[pa.Array]:
@@ -185,3 +218,178 @@ def _stored_tracks(rows: pa.RecordBatch, recorded: Tracks) -> Tracks:
         recorded.kinds,
         recorded.tokens,
     )
+
+
+def num_rows(file: Path) -> int:
+    """Rows of a file, of all its rollouts together.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    return int(_opened(file).metadata.num_rows)
+
+
+def _opened(file: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(file)
+    except (OSError, pa.ArrowException) as error:
+        raise _unreadable(file, error) from error
+
+
+def _unreadable(file: Path, error: Exception) -> DataError:
+    return DataError(f"{str(file)!r} cannot be read: {error}", hint="make the run again")
+
+
+class RolloutReader:
+    """Reads rollouts; keeps the row group of the last one, as its neighbours are read next."""
+
+    def __init__(self) -> None:
+        self._file: pq.ParquetFile | None = None
+        self._path = Path()
+        self._starts = np.zeros(1, np.int64)  # first row of every row group, and the end
+        self._group = -1
+        self._rows = pa.table({})
+
+    def read(self, place: Place) -> pa.RecordBatch:
+        """The rows of a rollout, all columns.
+
+        Raises:
+            DataError: The file cannot be read, or does not hold them.
+        """
+        if self._file is None or self._path != place.file:
+            self._file, self._path, self._group = _opened(place.file), place.file, -1
+            found = self._file.metadata
+            lengths = [found.row_group(i).num_rows for i in range(found.num_row_groups)]
+            self._starts = np.cumsum([0, *lengths])
+        group = int(np.searchsorted(self._starts, place.row, side="right")) - 1
+        if not 0 <= group < len(self._starts) - 1:
+            raise _unreadable(place.file, IndexError(f"it has no row {place.row}"))
+        if group != self._group:
+            try:
+                self._rows = self._file.read_row_group(group, use_threads=False)
+            except (OSError, pa.ArrowException) as error:
+                raise _unreadable(place.file, error) from error
+            self._group = group
+        first = place.row - int(self._starts[group])
+        rows = self._rows.slice(first, place.rows).combine_chunks()
+        if len(rows) != place.rows:
+            raise _unreadable(place.file, IndexError(f"rows {place.row} and after are cut off"))
+        return rows.to_batches()[0]
+
+
+class PartWriter:
+    """Writes rollouts into new files of a folder; a file is there when it is whole."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._number = next_number(folder)
+        self._writer: pq.ParquetWriter | None = None
+        self._pending: list[tuple[Task, pa.RecordBatch]] = []
+        self._in_file, self._in_group = _Size(), _Size()
+
+    def add(self, task: Task, rows: pa.RecordBatch) -> Place:
+        """Write a rollout, or keep it until its row group is full.
+
+        Args:
+            task: Whose it is.
+            rows: Columns of `rollouts.STATES`, and of `TRACKS` in all rollouts or in none.
+
+        Returns:
+            Where it will be.
+        """
+        place = Place(self._path, self._in_file.rows, len(rows))
+        self._pending.append((task, rows))
+        for size in (self._in_file, self._in_group):
+            size.add(rows)
+        if self._in_file.exceeds(*_MAX_FILE):
+            self.close()
+        elif self._in_group.exceeds(*_MAX_GROUP):
+            self._write_group()
+        return place
+
+    @property
+    def _path(self) -> Path:
+        return self.folder / part_name(self._number)
+
+    @property
+    def _partial(self) -> Path:
+        return self._path.with_name(f".{self._path.name}.tmp")
+
+    def _write_group(self) -> None:
+        rows = pa.Table.from_batches([batch for _, batch in self._pending]).combine_chunks()
+        schema = pa.schema([*_KEY, *rows.schema])
+        if self._writer is None:
+            self._writer = pq.ParquetWriter(self._partial, schema, **_WRITE_OPTIONS)
+        group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
+        self._writer.write_table(group, row_group_size=len(group))
+        self._pending.clear()
+        self._in_group = _Size()
+
+    def close(self) -> None:
+        """Finish the file that is under way; the next rollout begins another one."""
+        if self._pending:
+            self._write_group()
+        if self._writer is not None:
+            self._writer.close()
+            self._partial.replace(self._path)
+            self._writer = None
+            self._number += 1
+        self._in_file = _Size()
+
+    def discard(self) -> None:
+        """Remove what is not finished."""
+        self._pending.clear()
+        if self._writer is not None:
+            with suppress(OSError):
+                self._writer.close()
+            self._writer = None
+            self._partial.unlink(missing_ok=True)
+
+
+class _Size:
+    """How much is in a file or row group."""
+
+    def __init__(self) -> None:
+        self.rollouts = self.rows = self.bytes = 0
+
+    def add(self, rows: pa.RecordBatch) -> None:
+        self.rollouts += 1
+        self.rows += len(rows)
+        self.bytes += rows.get_total_buffer_size()
+
+    def exceeds(self, rollouts: int, num_bytes: int) -> bool:
+        return self.rollouts >= rollouts or self.bytes >= num_bytes
+
+
+def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
+    """The columns of `_KEY`."""
+    tasks = [task for task, _ in rollouts]
+    lengths = [len(rows) for _, rows in rollouts]
+    owner = np.repeat(np.arange(len(tasks), dtype=np.int32), lengths)
+    columns: list[pa.Array] = []
+    for name in Task._fields:
+        values = [getattr(task, name) for task in tasks]
+        if name == "seed":
+            columns.append(pa.array(np.array(values, np.int64)[owner]))
+            continue
+        distinct = sorted(set(values))
+        codes = np.array([distinct.index(value) for value in values], np.int32)
+        columns.append(pa.DictionaryArray.from_arrays(codes[owner], pa.array(distinct)))
+    iterations = np.concatenate([np.arange(length, dtype=np.int64) for length in lengths])
+    return [*columns, pa.array(iterations)]
+
+
+def without_key(rows: pa.RecordBatch) -> pa.RecordBatch:
+    """A rollout as it was given to `PartWriter.add`."""
+    return rows.select(rows.schema.names[len(_KEY) :])
+
+
+def part_name(number: int) -> str:
+    """Name of a file of rollouts."""
+    return f"part-{number:05d}.parquet"
+
+
+def next_number(folder: Path) -> int:
+    """The first number for which, and for all after it, a folder has no file yet."""
+    taken = [path.stem.removeprefix("part-") for path in folder.glob("part-*.parquet")]
+    return 1 + max((int(number) for number in taken if number.isdigit()), default=-1)

@@ -1,162 +1,191 @@
 """Tasks of a run: read the scenario, drive it, score it, and never raise.
 
-This runs in a worker, on one unit of work after the other: one task, or several of a planner that
-answers for all of them with one forward pass. It holds what is worth keeping between them: the open
-store, one instance per planner, and the last scenario.
+This runs in a worker, on one batch of tasks after the other: a batch is one task, or several of a
+planner that answers for all of them with one forward pass. It holds what is worth keeping between
+them: the open store, one instance per planner, and the last scenario.
 """
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
-from typing import Any, TypeAlias
+from typing import Any, TypeVar
 
 import numpy as np
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ShiftsimError
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
-from shiftsim.runs.planners import PlannerEntry, close_planner
+from shiftsim.planners.registry import RunPlanner, close_planner
+from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TaskResult
-from shiftsim.runs.rollouts import Task, encode_rollout
+from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.loop import Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import BatchPlanner, Planner
 from shiftsim.world.scenario import Scenario
 
-Unit: TypeAlias = tuple[Task, ...]  # what a worker is handed at once
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What a worker is handed at once.
+
+    Attributes:
+        tasks: One task, or several of one planner that are driven in lock step.
+    """
+
+    tasks: tuple[Task, ...]
+
+    @property
+    def planner(self) -> str:
+        """Name of the planner of all tasks."""
+        return self.tasks[0].planner
+
+    @property
+    def token(self) -> str:
+        """Scenario of the first task."""
+        return self.tasks[0].token
+
+    def split(self) -> list["Batch"]:
+        """The tasks one by one."""
+        return [Batch((task,)) for task in self.tasks]
+
+
+class Stopwatch:
+    """How long parts of a task took.
+
+    Attributes:
+        seconds: Durations by column of `tasks.parquet` [s].
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Measure what is done within, whether it succeeds or not."""
+        began = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = perf_counter() - began
+
+
+class Scenarios:
+    """A store that is opened when it is needed, and the scenario that was read last."""
+
+    def __init__(self, store: str) -> None:
+        self.store = store
+        self._open: Any = None
+        self._last: Scenario | None = None
+
+    def read(self, token: str) -> Scenario:
+        """A scenario; several tasks on one follow each other."""
+        if self._open is None:
+            self._open = open_store(self.store)
+        if self._last is None or self._last.token != token:
+            self._last = self._open.read(token)
+        return self._last
 
 
 @dataclass
 class TaskRunner:
-    """Does units of tasks, one after the other.
+    """Does batches of tasks, one after the other.
 
     Attributes:
+        config: The settings of the run.
         store: Folder or URL of the scenario store.
         planners: The planners, by name.
         noises: The noise models, by name.
-        traffic: Traffic mode.
-        controller: How a plan moves the ego.
-        thresholds: Threshold profile.
-        metrics: Own metrics, by `module:attribute`.
-        save_rollouts: Which results carry their rollout: `all`, `failed` (a score of 0) or `none`.
-        strict: Whether a step with a makeshift plan fails its task.
     """
 
+    config: RunConfig
     store: str
-    planners: Mapping[str, PlannerEntry]
+    planners: Mapping[str, RunPlanner]
     noises: Mapping[str, NoiseModel]
-    traffic: str
-    controller: str
-    thresholds: str
-    metrics: tuple[str, ...]
-    save_rollouts: str
-    strict: bool = False
-    _open: Any = field(default=None, init=False)
     _made: dict[str, Planner] = field(default_factory=dict, init=False)
-    _last: Scenario | None = field(default=None, init=False)
 
-    def __call__(self, unit: Unit) -> list[TaskResult]:
-        """One result per task of a unit."""
-        return self._together(unit) if len(unit) > 1 else [self._alone(unit[0])]
+    def __post_init__(self) -> None:
+        self._scenarios = Scenarios(self.store)
+
+    def __call__(self, batch: Batch) -> list[TaskResult]:
+        """One result per task."""
+        if len(batch.tasks) == 1:
+            return [self._alone(batch.tasks[0])]
+        return self._together(batch)
 
     def _alone(self, task: Task) -> TaskResult:
-        result = attempt(task, partial(self._do, task))
+        watch = Stopwatch()
+        result = attempt(task, partial(self._drive, task, watch))
         if result.status != OK:
             self._forget(task.planner)
-        return result
+        return replace(result, seconds=watch.seconds)
 
-    def _do(self, task: Task, seconds: dict[str, float], result: TaskResult) -> TaskResult:
-        from shiftsim.sim.loop import simulate
-
-        with _measured(seconds, "read_seconds"):
-            scenario = self._read(task.token)
-        with _measured(seconds, "simulate_seconds"):
+    def _drive(self, task: Task, watch: Stopwatch) -> TaskResult:
+        with watch("read_seconds"):
+            scenario = self._scenarios.read(task.token)
+        with watch("simulate_seconds"):
             log = simulate(scenario, self._planner(task), **self._setting(task))
-        return self._scored(scenario, log, result)
+        return self._scored(task, scenario, log, watch)
 
-    def _together(self, unit: Unit) -> list[TaskResult]:
+    def _together(self, batch: Batch) -> list[TaskResult]:
         """Several tasks in lock step; each of them fails for itself."""
-        from shiftsim.sim.loop import Rollout, simulate_together
-
-        rollouts: dict[Task, tuple[Scenario, Rollout]] = {}
-
-        def begin(task: Task, seconds: dict[str, float], result: TaskResult) -> TaskResult:
-            with _measured(seconds, "read_seconds"):
-                scenario = self._read(task.token)
-            rollout = Rollout(scenario, self._planner(task), **self._setting(task))
-            rollouts[task] = (scenario, rollout)
-            return result
-
-        results = {task: attempt(task, partial(begin, task)) for task in unit}
+        watches = {task: Stopwatch() for task in batch.tasks}
+        begun = {task: attempt(task, partial(self._begin, task, watches[task])) for task in watches}
+        rollouts = {task: found for task, found in begun.items() if isinstance(found, Rollout)}
+        results = {task: found for task, found in begun.items() if isinstance(found, TaskResult)}
         began = perf_counter()
         try:
-            logs = simulate_together([rollout for _, rollout in rollouts.values()])
+            logs = simulate_together(list(rollouts.values()))
         except Exception:  # the shared pass itself failed: too little memory for all of them?
-            self._forget(unit[0].planner)
-            return [self._alone(task) for task in unit]
+            self._forget(batch.planner)
+            return [self._alone(task) for task in batch.tasks]
         share = (perf_counter() - began) / max(1, len(logs))
-        for (task, (scenario, _)), log in zip(rollouts.items(), logs, strict=True):
-            read = results[task].seconds
-            results[task] = attempt(task, partial(self._finished, scenario, log))
-            results[task].seconds.update(read, simulate_seconds=share)
-        return list(results.values())
+        for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
+            watches[task].seconds["simulate_seconds"] = share
+            score = partial(self._scored, task, rollout.scenario, log, watches[task])
+            results[task] = attempt(task, score)
+        return [replace(results[task], seconds=watches[task].seconds) for task in batch.tasks]
 
-    def _finished(
-        self,
-        scenario: Scenario,
-        log: SimulationLog | Exception,
-        seconds: dict[str, float],
-        result: TaskResult,
+    def _begin(self, task: Task, watch: Stopwatch) -> Rollout:
+        with watch("read_seconds"):
+            scenario = self._scenarios.read(task.token)
+        return Rollout(scenario, self._planner(task), **self._setting(task))
+
+    def _scored(
+        self, task: Task, scenario: Scenario, log: SimulationLog | Exception, watch: Stopwatch
     ) -> TaskResult:
         if isinstance(log, Exception):
             raise log
-        return self._scored(scenario, log, result)
-
-    def _scored(self, scenario: Scenario, log: SimulationLog, result: TaskResult) -> TaskResult:
-        result.seconds.update(planning_times(log))
-        with _measured(result.seconds, "metrics_seconds"):
-            scores, metrics = score_rollout(
-                scenario,
-                log,
-                thresholds=self.thresholds,
-                traffic=self.traffic,
-                metrics=self.metrics,
-            )
-        reactive = self.traffic != "nonreactive"
-        keep = self.save_rollouts == "all" or (
-            self.save_rollouts == "failed" and scores["cls"] == 0.0
-        )
-        return replace(
-            result,
-            scenario_type=scenario.scenario_type,
-            scores=scores,
-            metrics=metrics,
-            rollout=encode_rollout(log, with_tracks=reactive) if keep else b"",
+        watch.seconds.update(planning_times(log))
+        with watch("metrics_seconds"):
+            scores, metrics = score_rollout(scenario, log, self.config)
+        keep = self.config.save_rollouts
+        rollout = b""
+        if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
+            reactive = self.config.traffic != "nonreactive"
+            rollout = encode_rows(rollout_rows(log, with_tracks=reactive))
+        return TaskResult(
+            task, OK, scenario.scenario_type, scores=scores, metrics=metrics, rollout=rollout
         )
 
     def _setting(self, task: Task) -> dict[str, Any]:
         return {
             "noise": self.noises[task.noise],
             "seed": task.seed,
-            "traffic": self.traffic,
-            "controller": self.controller,
-            "strict": self.strict,
+            "traffic": self.config.traffic,
+            "controller": self.config.controller,
+            "strict": self.config.strict,
         }
-
-    def _read(self, token: str) -> Scenario:
-        if self._open is None:
-            from shiftsim.data.store.reading import open_store
-
-            self._open = open_store(self.store)
-        if self._last is None or self._last.token != token:
-            self._last = self._open.read(token)
-        return self._last
 
     def _planner(self, task: Task) -> Planner | None:
         """The planner of a task: made once, or a fork of it that has nothing of other tasks."""
-        if self.controller == "log-playback":
+        if self.config.controller == "log-playback":
             return None
         planner = self._made.get(task.planner)
         if planner is None:
@@ -175,21 +204,16 @@ class TaskRunner:
         self._made.clear()
 
 
-def attempt(task: Task, work: Callable[[dict[str, float], TaskResult], TaskResult]) -> TaskResult:
-    """The result of a piece of work; whatever goes wrong becomes its error text.
-
-    Args:
-        task: The task.
-        work: Fills the durations it is given, and completes the result it is given.
-    """
-    result = TaskResult(task, OK)
+def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
+    """What a piece of work returns or, whatever goes wrong, the failed result of its task."""
     try:
-        return work(result.seconds, result)
+        return work()
     except Exception as error:  # the one place: a task that fails is a row, not the end of a run
-        return replace(
-            result,
-            status=FAILED,
-            error=f"{_kind(error)}{error}",
+        kind = "" if isinstance(error, ShiftsimError) else f"{type(error).__name__}: "
+        return TaskResult(
+            task,
+            FAILED,
+            error=f"{kind}{error}",
             hint=getattr(error, "hint", ""),
             traceback=traceback.format_exc(),
         )
@@ -206,21 +230,23 @@ def planning_times(log: SimulationLog) -> dict[str, float]:
 
 
 def score_rollout(
-    scenario: Scenario,
-    log: SimulationLog,
-    *,
-    thresholds: str,
-    traffic: str,
-    metrics: Sequence[str] = (),
+    scenario: Scenario, log: SimulationLog, config: RunConfig
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
-    result = compute_metrics(log, scenario.map, thresholds=thresholds, own=metrics)
-    profile = {"thresholds": thresholds, "metric_version": METRIC_VERSION}
+    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key.
+
+    Args:
+        scenario: The scenario.
+        log: How it was driven.
+        config: Says under which thresholds and custom metrics it is scored, and with which traffic
+            it was driven.
+    """
+    result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
+    profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {
         "scenario_type": scenario.scenario_type,
         "city": scenario.city,
         "log_name": scenario.log_name,
-        "traffic": traffic,
+        "traffic": config.traffic,
         "cls": result.score,
         **{name: result.scores[name] for name in SHORT_NAMES if name != "score"},
         "degraded_steps": int(log.degraded.sum()),
@@ -245,17 +271,3 @@ def _metric_row(row: MetricRow, start_us: int) -> dict[str, Any]:
         "first_violation_value": None if first is None else first.value,
         "partner_token": None if first is None else first.partner,
     }
-
-
-def _kind(error: Exception) -> str:
-    """Errors of our own explain themselves; others are named."""
-    return "" if isinstance(error, ShiftsimError) else f"{type(error).__name__}: "
-
-
-@contextmanager
-def _measured(seconds: dict[str, float], name: str) -> Iterator[None]:
-    began = perf_counter()
-    try:
-        yield
-    finally:
-        seconds[name] = perf_counter() - began

@@ -1,7 +1,7 @@
 """SimulationLog: the arrays of one finished rollout, nothing else.
 
 Metrics, results and pictures are made from it. It holds K = T - 1 samples for a scenario of T
-iterations: the state reached after the last planner call is never stored (nuplan-simulation.md §1).
+iterations: the state reached after the last planner call is never stored.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class SimulationLog:
         plans: (K, P, 3) poses of the plan over its first second, from the moment of planning on
             (P = 11 at 0.1 s); NaN where a command was returned.
         planning_seconds: (K,) time the planner took for each call [s].
-        degraded: (K,) whether the plan was a makeshift by the planner's own account.
+        degraded: (K,) whether the plan was a fallback by the planner's own account.
     """
 
     token: str

@@ -1,20 +1,18 @@
 """The closed loop: simulate one scenario with one planner.
 
-Order of one step (nuplan-simulation.md §2): the planner sees iteration i; sample i is stored before
-anything moves; then the ego moves to i + 1, and the traffic, which still sees the ego of i. The
-planner is asked T - 1 times; its last answer is never executed, and the state at T - 1 is neither
-reached nor stored.
+Order of one step: the planner sees iteration i; sample i is stored before anything moves; then the
+ego moves to i + 1, and the traffic, which still sees the ego of i. The planner is asked T - 1
+times; its last answer is never executed, and the state at T - 1 is neither reached nor stored.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.errors import ConfigError, DataError, PlannerError
+from shiftsim.errors import ConfigError, DataError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
@@ -25,13 +23,7 @@ from shiftsim.sim.plan_check import validate_plan
 from shiftsim.sim.planner import BatchPlanner, History, Observation, Planner
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    NUM_STATE,
-    Command,
-    Tracks,
-    TrafficLights,
-    Trajectory,
-)
+from shiftsim.world.state import NUM_STATE, Command, Trajectory
 
 PLAN_SAMPLES = 11  # first second of a plan, every 0.1 s
 MIN_ITERATIONS = 3
@@ -39,29 +31,29 @@ CONTROLLERS = ("lqr", "perfect", "log-playback")
 
 
 @dataclass(frozen=True, slots=True)
-class _Buffer:
-    """Rows of a rollout: the past samples, then the iterations. B rows.
+class Setting:
+    """How a scenario is driven, whichever scenario and planner it is.
 
     Attributes:
-        start: Row of iteration 0.
-        time_us: (B,) time stamps [us].
-        ego: (B, 11) ego states, filled up to the present.
-        tracks: Tracks, filled from the log; traffic models rewrite them.
-        lights: Lights.
+        noise: Actuation noise, by name or model; added to the command before the motion model.
+        seed: Seed of the noise, and of planners that sample.
+        traffic: `nonreactive`, `reactive`, or a traffic model.
+        controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan
+            says) or `log-playback` (the ego is where the recording was; plans are ignored).
+        strict: Fail where the planner falls back instead of counting the step.
     """
 
-    start: int
-    time_us: IntArray
-    ego: FloatArray
-    tracks: Tracks
-    lights: TrafficLights
+    noise: str | NoiseModel = "none"
+    seed: int = 0
+    traffic: str | Traffic = "nonreactive"
+    controller: str = "lqr"
+    strict: bool = False
 
-    def observation(self, iteration: int) -> Observation:
-        row = self.start + iteration
-        span = slice(max(0, row + 1 - HISTORY_SAMPLES), row + 1)
-        history = History(self.time_us[span], self.ego[span], self.tracks.rows(span))
-        lights = self.lights.rows(slice(row, row + 1))
-        return Observation(iteration, int(self.time_us[row]), history, lights)
+    def __post_init__(self) -> None:
+        one_of("controller", self.controller, CONTROLLERS)
+
+
+DEFAULT = Setting()
 
 
 class Rollout:
@@ -75,18 +67,15 @@ class Rollout:
         self,
         scenario: Scenario,
         planner: Planner | None,
-        *,
-        noise: str | NoiseModel = "none",
-        seed: int = 0,
-        traffic: str | Traffic = "nonreactive",
-        controller: str = "lqr",
-        strict: bool = False,
+        setting: Setting = DEFAULT,
+        **changes: Any,
     ) -> None:
         """Prepare a scenario and its planner; the arguments and errors are those of `simulate`."""
-        if controller not in CONTROLLERS or (planner is None and controller != "log-playback"):
+        self.setting = setting = replace(setting, **changes)
+        if planner is None and setting.controller != "log-playback":
             raise ConfigError(
-                f"controller {controller!r} with planner {planner!r} is not possible",
-                hint=f"controllers: {', '.join(CONTROLLERS)}; only log-playback needs no planner",
+                f"controller {setting.controller!r} needs a planner",
+                hint="only log-playback needs none",
             )
         if scenario.num_iterations < MIN_ITERATIONS:
             raise DataError(
@@ -97,22 +86,30 @@ class Rollout:
         self.scenario = scenario
         self.planner = planner
         self.iteration = 0
+        # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
-        self._controller = controller
-        self._strict = strict
-        self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
-        self._noise = sample_noise(
-            noise, seed=seed, token=scenario.token, num_steps=self.num_samples
-        )
         self._times = scenario.iteration_times
-        self._buffer = _make_buffer(scenario)
-        self._traffic.start(scenario, self._buffer.tracks, self._buffer.start)
+        rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
+        self._start = start = len(rows) - scenario.num_iterations  # row of iteration 0
+        # rows: the past samples, then the iterations; the ego is filled up to the present, the
+        # tracks from the log until the traffic rewrites them
+        self._time_us = scenario.time_us[rows]
+        self._ego = np.full((len(rows), NUM_STATE), np.nan)
+        self._ego[: start + 1] = scenario.ego[rows[: start + 1]]
+        self._tracks = scenario.tracks.rows(rows)
+        self._lights = scenario.traffic_lights.rows(rows)
+        traffic = setting.traffic
+        self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
+        self._traffic.start(scenario, self._tracks, start)
+        self._noise = sample_noise(
+            setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
+        )
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, PLAN_SAMPLES, 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
-            planner.reset(scene_info(scenario, seed))
+            planner.reset(scene_info(scenario, setting.seed))
 
     @property
     def done(self) -> bool:
@@ -121,7 +118,11 @@ class Rollout:
 
     def observe(self) -> Observation:
         """What the planner sees now."""
-        return self._buffer.observation(self.iteration)
+        row = self._start + self.iteration
+        span = slice(max(0, row + 1 - HISTORY_SAMPLES), row + 1)
+        history = History(self._time_us[span], self._ego[span], self._tracks.rows(span))
+        lights = self._lights.rows(slice(row, row + 1))
+        return Observation(self.iteration, int(self._time_us[row]), history, lights)
 
     def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
@@ -130,27 +131,47 @@ class Rollout:
             plan: The planner's answer; None only under log playback without a planner.
             seconds: How long it took [s].
         """
-        iteration, buffer = self.iteration, self._buffer
-        row = buffer.start + iteration
+        iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
         if plan is not None:
             plan = self._checked(plan)
         if iteration + 1 < self.num_samples:
-            if self._controller == "log-playback":
-                rows = self.scenario.iteration_rows
-                buffer.ego[row + 1] = self.scenario.ego[rows[iteration + 1]]
-            else:
-                noise, command = self._noise[iteration], self._commands[iteration]
-                _advance(self._controller, buffer, row, plan, noise, command)
-            self._traffic.step(iteration, buffer.ego[row], buffer.tracks, row + 1)
+            # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
+            self._move_ego(plan)
+            self._traffic.step(iteration, self._ego[row], self._tracks, row + 1)
         self.iteration += 1
 
+    def _move_ego(self, plan: Trajectory | Command | None) -> None:
+        """Write the next state of the ego, and note the command."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._time_us[row], self._time_us[row + 1]
+        state, after = self._ego[row], self._ego[row + 1]
+        noise, command = self._noise[iteration], self._commands[iteration]
+        controller = self.setting.controller
+        if controller == "log-playback":
+            after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
+        elif isinstance(plan, Command):
+            if controller == "perfect":
+                raise ConfigError(
+                    "perfect tracking needs a planner that returns a trajectory, not a command",
+                    hint="use the controller 'lqr', which sends commands to the motion model",
+                )
+            command[:] = plan.acceleration, plan.steering_rate
+            command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
+        elif isinstance(plan, Trajectory) and controller == "perfect":
+            follow_perfectly(plan, int(next_us), after)
+        elif isinstance(plan, Trajectory):
+            times, states = plan.time_us, plan.states
+            status = track_and_step(
+                now_us, next_us, state, times, states, noise[0], noise[1], after, command
+            )
+            raise_for_status(status, int(now_us), times)
+
     def _checked(self, plan: Trajectory | Command) -> Trajectory | Command:
-        """The plan in log time; its first second and whether it is a makeshift are noted."""
-        now_us = int(self._buffer.time_us[self._buffer.start + self.iteration])
-        next_us = int(self._times[self.iteration + 1])
+        """The plan in log time; its first second and whether it is a fallback are noted."""
+        now_us, next_us = self._times[self.iteration : self.iteration + 2].tolist()
         if reason := getattr(self.planner, "degraded", ""):
-            if self._strict:
+            if self.setting.strict:
                 raise PlannerError(
                     f"the planner fell back at iteration {self.iteration}: {reason}",
                     hint="without --strict it continues, and the step is counted as degraded",
@@ -166,14 +187,13 @@ class Rollout:
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
-        buffer = self._buffer
-        samples = slice(buffer.start, buffer.start + self.num_samples)
+        samples = slice(self._start, self._start + self.num_samples)
         return SimulationLog(
             token=self.scenario.token,
-            time_us=buffer.time_us[samples],
-            ego=buffer.ego[samples],
-            tracks=buffer.tracks.rows(samples),
-            traffic_lights=buffer.lights.rows(samples),
+            time_us=self._time_us[samples],
+            ego=self._ego[samples],
+            tracks=self._tracks.rows(samples),
+            traffic_lights=self._lights.rows(samples),
             expert_time_us=self._times,
             expert_ego=self.scenario.expert,
             route=self.scenario.route,
@@ -186,44 +206,26 @@ class Rollout:
 
 
 def simulate(
-    scenario: Scenario,
-    planner: Planner | None,
-    *,
-    noise: str | NoiseModel = "none",
-    seed: int = 0,
-    traffic: str | Traffic = "nonreactive",
-    controller: str = "lqr",
-    strict: bool = False,
+    scenario: Scenario, planner: Planner | None, setting: Setting = DEFAULT, **changes: Any
 ) -> SimulationLog:
     """Drive one scenario in closed loop.
 
     Args:
         scenario: The scenario.
         planner: The planner; None only with `log-playback`, which needs none.
-        noise: Actuation noise, by name or model; added to the command before the motion model.
-        seed: Seed of the noise, and of planners that sample.
-        traffic: `nonreactive`, `reactive`, or a traffic model.
-        controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan
-            says) or `log-playback` (the ego is where the recording was; plans are ignored).
-        strict: Fail where the planner falls back to a makeshift instead of counting the step.
+        setting: How it is driven.
+        changes: Fields of `Setting` that differ from it: `noise`, `seed`, `traffic`, `controller`,
+            `strict`.
 
     Returns:
         The rollout, K = T - 1 samples.
 
     Raises:
-        ConfigError: An argument is unknown.
+        ConfigError: A setting is unknown.
         DataError: The scenario has fewer than three iterations.
         PlannerError: The planner returned something that cannot be executed.
     """
-    rollout = Rollout(
-        scenario,
-        planner,
-        noise=noise,
-        seed=seed,
-        traffic=traffic,
-        controller=controller,
-        strict=strict,
-    )
+    rollout = Rollout(scenario, planner, setting, **changes)
     while not rollout.done:
         plan, seconds = None, 0.0
         if planner is not None:
@@ -271,50 +273,3 @@ def _advanced(
     except Exception as error:  # one scenario fails, its neighbours in the batch do not
         return error
     return rollout.log() if rollout.done else None
-
-
-def _advance(
-    controller: str,
-    buffer: _Buffer,
-    row: int,
-    plan: Trajectory | Command | None,
-    noise: FloatArray,
-    command: FloatArray,
-) -> None:
-    """Move the ego from `row` to the next one, and note the command in `command`."""
-    now_us, next_us = buffer.time_us[row], buffer.time_us[row + 1]
-    state, after = buffer.ego[row], buffer.ego[row + 1]
-    if isinstance(plan, Command):
-        if controller == "perfect":
-            raise ConfigError(
-                "perfect tracking needs a planner that returns a trajectory, not a command",
-                hint="use the controller 'lqr', which sends commands to the motion model",
-            )
-        command[:] = plan.acceleration, plan.steering_rate
-        command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
-    elif isinstance(plan, Trajectory) and controller == "perfect":
-        follow_perfectly(plan, int(next_us), after)
-    elif isinstance(plan, Trajectory):
-        status = track_and_step(
-            now_us, next_us, state, plan.time_us, plan.states, noise[0], noise[1], after, command
-        )
-        raise_for_status(status, int(now_us), plan.time_us)
-
-
-def _make_buffer(scenario: Scenario) -> _Buffer:
-    """Rows from up to 2.2 s before iteration 0 to the last iteration, filled from the log.
-
-    nuPlan asks for 22 past samples and drops the oldest when the present one arrives; samples that
-    the log does not have are missing silently (nuplan-simulation.md §1, §2).
-    """
-    rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
-    start = len(rows) - scenario.num_iterations
-    ego = np.full((len(rows), NUM_STATE), np.nan)
-    ego[: start + 1] = scenario.ego[rows[: start + 1]]
-    return _Buffer(
-        start,
-        scenario.time_us[rows],
-        ego,
-        scenario.tracks.rows(rows),
-        scenario.traffic_lights.rows(rows),
-    )

@@ -1,12 +1,9 @@
 """Actuation noise: what is added to the command between tracker and motion model.
 
 White noise (`awgn`) is sigma times a standard normal at every step. The Ornstein-Uhlenbeck process
-(`ou`) starts at 0 and is updated before it is applied: x += theta (0 - x) dt + sigma sqrt(dt) eps
-(benchmark.md, track 2). Random numbers are keyed by (seed, scenario token, channel) alone, so the
-same noise hits every planner, in any order of runs and on any number of workers.
+(`ou`) starts at 0 and is updated before it is applied: x += theta (0 - x) dt + sigma sqrt(dt) eps.
 """
 
-import difflib
 import hashlib
 import importlib
 from dataclasses import dataclass
@@ -15,16 +12,16 @@ from typing import Protocol
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, one_of
 
 CHANNELS = ("noise-accel", "noise-steer")
 NOISE_NAMES = ("none", "awgn-low", "awgn-mid", "awgn-high", "ou-low", "ou-mid", "ou-high")
-SIGMA_BY_LEVEL = {  # acceleration [m/s^2], steering rate [rad/s]; benchmark.md
+SIGMA_BY_LEVEL = {  # acceleration [m/s^2], steering rate [rad/s]; of the state-drift benchmark
     "low": (0.5, 0.1),
     "mid": (1.0, 0.2),
     "high": (1.5, 0.3),
 }
-OU_THETA = 2.0  # 1/s, benchmark.md
+OU_THETA = 2.0  # 1/s, of the state-drift benchmark
 
 
 class NoiseFunction(Protocol):
@@ -67,8 +64,7 @@ class NoiseModel:
     name: str = ""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("none", "awgn", "ou", "custom"):
-            raise ConfigError(f"noise kind {self.kind!r} unknown", "use none, awgn, ou or custom")
+        one_of("noise kind", self.kind, ("none", "awgn", "ou", "custom"))
         for field in ("sigma_accel", "sigma_rate", "theta"):
             value = getattr(self, field)
             if not (np.isfinite(value) and value >= 0.0):
@@ -102,20 +98,14 @@ def parse_noise(name: str) -> NoiseModel:
     Raises:
         ConfigError: The name is unknown, or the own model cannot be imported.
     """
-    if name == "none":
-        return NoiseModel()
-    if name in NOISE_NAMES:
-        kind, level = name.split("-")
-        accel, rate = SIGMA_BY_LEVEL[level]
-        return NoiseModel(kind, accel, rate, name=name)
     if ":" in name:
         return _load_noise(name)
-    near = difflib.get_close_matches(name, NOISE_NAMES, n=1, cutoff=0.5)
-    question = f"did you mean {near[0]!r}? " if near else ""
-    raise ConfigError(
-        f"noise {name!r} unknown",
-        f"{question}available: {', '.join(NOISE_NAMES)}, or module:attribute of an own model",
-    )
+    one_of("noise", name, (*NOISE_NAMES, "module:attribute"))
+    if name == "none":
+        return NoiseModel()
+    kind, level = name.split("-")
+    accel, rate = SIGMA_BY_LEVEL[level]
+    return NoiseModel(kind, accel, rate, name=name)
 
 
 def sample_noise(
@@ -151,23 +141,16 @@ def sample_noise(
 
 def noise_from_normals(model: NoiseModel, eps: FloatArray, dt: float = 0.1) -> FloatArray:
     """The noise (T, 2) that standard normals (T, 2) make, acceleration and steering rate."""
-    sigmas = (model.sigma_accel, model.sigma_rate)
     out = np.zeros(eps.shape)
-    for column, sigma in enumerate(sigmas):
+    for column, sigma in enumerate((model.sigma_accel, model.sigma_rate)):
         if sigma == 0.0 or model.kind == "none":
             continue  # not 0 * eps, which can be -0.0
         normals = eps[:, column]
+        is_ou = model.kind == "ou"
         out[:, column] = (
-            ou_from_normals(normals, sigma, model.theta, dt)
-            if model.kind == "ou"
-            else awgn_from_normals(normals, sigma)
+            ou_from_normals(normals, sigma, model.theta, dt) if is_ou else sigma * normals
         )
     return out
-
-
-def awgn_from_normals(eps: FloatArray, sigma: float) -> FloatArray:
-    """White noise (T,) from standard normals (T,)."""
-    return sigma * eps
 
 
 def ou_from_normals(eps: FloatArray, sigma: float, theta: float, dt: float) -> FloatArray:
@@ -181,7 +164,11 @@ def ou_from_normals(eps: FloatArray, sigma: float, theta: float, dt: float) -> F
 
 
 def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
-    """Random numbers that depend on nothing but seed, scenario token and channel name."""
+    """Random numbers that depend on nothing but seed, scenario token and channel name.
+
+    So the same noise hits every planner, in any order of runs and on any number of workers.
+    """
+    # nuPlan rule 14: the key is the BLAKE2b digest of the three, the generator is Philox
     text = f"{int(seed)}\n{token}\n{channel}"
     digest = hashlib.blake2b(text.encode(), digest_size=16).digest()
     return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))

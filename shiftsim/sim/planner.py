@@ -99,7 +99,7 @@ class Planner(Protocol):
     """What the simulator asks of a planner. Subclassing is not required.
 
     Optional are `close()`, `name`, and `degraded`: a text that says why the plan just returned is a
-    makeshift, empty when it is not. Such steps are counted, or fail a strict run.
+    fallback, empty when it is not. Such steps are counted, or fail a strict run.
     """
 
     def reset(self, scene: SceneInfo) -> None:

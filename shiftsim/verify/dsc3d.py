@@ -62,7 +62,7 @@ class LocalMap:
     def _area(self, key: LaneKey, low: float, high: float) -> shapely.Polygon:
         road = self._drive.roads[key.road]
         s = np.linspace(low, high, max(2, round((high - low) / 0.5) + 1))
-        borders = section_borders(road, key.section, s, mend=True)
+        borders = section_borders(road, key.section, s, repair=True)
         poses = ReferenceLine(road.geometries).evaluate(s)
         inner, outer = (poses.offset(side[key.lane]) for side in (borders.inner, borders.outer))
         return shapely.Polygon(np.concatenate([inner, outer[::-1]]))
@@ -279,7 +279,7 @@ def _verify_scripted(path: Path, report: Report, maps: Path | None) -> None:
         where = f"{name} track {track}"
         tracks.each(str(track))[0].match(where, facts, {"dim": _SIZE}, quantity="track")
     windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
-    wanted, lanes = expected.each("windows"), dict[tuple[str, ...], Any]()
+    wanted, lanes = expected.each("windows"), dict[tuple[str, str], Any]()
     report.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):
         where = f"{name} window {window.start_s:g} s"
@@ -313,7 +313,7 @@ def _verify_scenarios(
     site: Site,
     recording: Annotations,
     local: LocalMap,
-    lanes: dict[tuple[str, ...], Any],
+    lanes: dict[tuple[str, str], Any],
     report: Report,
 ) -> None:
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
@@ -321,8 +321,8 @@ def _verify_scenarios(
     made = convert_recording(recording, local.placed(site), site.offset[:2], ConversionConfig())
     egos = {ego.name: ego for ego in made.egos}
     for window in made.windows:
-        start = float(str(window.metadata["window_start_s"]))
-        key = (f"{start:.1f}", str(window.metadata["track_id"]))
+        begin = float(str(window.metadata["window_start_s"]))
+        key = (f"{begin:.1f}", str(window.metadata["track_id"]))
         where, ego = f"{folder.name} window {key[0]} track {key[1]}", egos[window.ego]
         rows = slice(window.first_row - ego.first_row, window.last_row - ego.first_row)
         centers = center_poses(ego.states[rows, :3])
@@ -338,8 +338,8 @@ def _verify_scenarios(
         given = repr([tuple(lane) for lane in lanes.pop(key, ())])
         ways = [repr([tuple(lane) for lane in way]) for way in local.sequences(centers[first:, :2])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
-    for key in lanes:
-        report.fail("lanes", f"{folder.name} window {key[0]} track {key[1]}", "no such scenario")
+    for start, track in lanes:
+        report.fail("lanes", f"{folder.name} window {start} track {track}", "no such scenario")
     poses.finish()
 
 

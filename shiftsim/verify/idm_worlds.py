@@ -27,7 +27,7 @@ def verify_idm_world(path: Path, report: Report) -> None:
         scenario, expected = _make_scenario(world), world.each("expected")[0]
         tracks, traffic = scenario.tracks, IdmTraffic()
         traffic.start(scenario, tracks, 0)
-        order = order_observed(tracks.kinds, tracks.valid[0], traffic.parameters.open_loop)
+        order = order_observed(tracks.kinds, tracks.valid[0])
         ours = {
             "vehicle_columns": list(VEHICLE_COLUMNS),
             "order_frame0": [tracks.tokens[i] for i in order.tolist()],

@@ -1,7 +1,7 @@
 """The OpenDRIVE reader against sampled reference lines, lanes, links and counts of real maps."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from shiftsim.verify.files import Source, read_json, read_table, verify_files
 from shiftsim.verify.report import Report
 
 EXACT = 1e-6  # m, rad: tolerance of the folder's README
-CUBIC = {"": 2e-3, "hdg": 1e-3}  # m, rad: paramPoly3
+CUBIC, CUBIC_HEADING = 2e-3, 1e-3  # m, rad: paramPoly3
 LENGTH_SHARE, LENGTH = 1e-3, 0.05  # of a length, or m
 COUNTS = {  # key of a summary → what our reader counts
     "roads": "road",
@@ -76,34 +76,24 @@ def _read_json(path: Path, report: Report) -> Source:
     return Source(path.stem, "field", content, report)
 
 
-def _match_points(
-    rows: Source, line: ReferenceLine, quantity: str, where: str, ours: Mapping[str, FloatArray]
-) -> None:
-    """Compare columns whose tolerance depends on the record of the reference line."""
-    cubic = np.array([kind == "paramPoly3" for kind in line.kinds(rows["s"])])
-    for here, atol, of in ((~cubic, EXACT, ""), (cubic, CUBIC, " of paramPoly3")):
-        if here.any():
-            mine = {name: values[here] for name, values in ours.items()}
-            rows.at(here).match(where, mine, atol, quantity=f"{quantity}{of}")
+def _tolerance(line: ReferenceLine, s: FloatArray, cubic: float = CUBIC) -> FloatArray:
+    return np.where([kind == "paramPoly3" for kind in line.kinds(s)], cubic, EXACT)
 
 
 def _verify_reference_lines(od: OpenDrive, file: Source, path: Path) -> None:
+    compare = file.report.compare
     roads = {road: rows for (road,), rows in file.groups("road").items()}
-    file.report.compare("roads with a reference line", path.stem, sorted(od.roads), sorted(roads))
+    compare("roads with a reference line", path.stem, sorted(od.roads), sorted(roads))
     for road in sorted(set(roads) & set(od.roads)):
-        where, rows, line = (
-            f"{path.stem} road {road}",
-            roads[road],
-            ReferenceLine(od.roads[road].geometries),
-        )
-        s, heading = rows["s"], rows["hdg"]
+        where, line = f"{path.stem} road {road}", ReferenceLine(od.roads[road].geometries)
+        s, heading = roads[road]["s"], roads[road]["hdg"]
         poses, extent = line.evaluate(s), [0.0, od.roads[road].stated_length]
-        file.report.compare("road extent", where, s[[0, -1]], extent, atol=EXACT)
-        file.report.compare("heading is wrapped", where, np.abs(heading).max() <= np.pi, True)
-        rows.match(where, {"kind": line.kinds(s)}, quantity="geometry")
-        turns = np.rint((heading - poses.heading) / (2.0 * np.pi))
-        ours = {"x": poses.x, "y": poses.y, "hdg": poses.heading + 2.0 * np.pi * turns}
-        _match_points(rows, line, "reference line", where, ours)
+        compare("road extent", where, extent, s[[0, -1]], atol=EXACT)
+        compare("heading is wrapped", where, np.abs(heading).max() <= np.pi, True)
+        atol = _tolerance(line, s, CUBIC_HEADING)
+        compare("reference line hdg", where, poses.heading, heading, atol=atol, angle=True)
+        ours = {"x": poses.x, "y": poses.y, "kind": line.kinds(s)}
+        roads[road].match(where, ours, {"": _tolerance(line, s)}, quantity="reference line")
 
 
 def _verify_lanes(od: OpenDrive, file: Source, path: Path) -> None:
@@ -127,7 +117,7 @@ def _verify_lanes(od: OpenDrive, file: Source, path: Path) -> None:
         columns = {
             f"{p}{axis}": xy[:, i] for p, xy in points.items() for i, axis in enumerate("xy")
         }
-        _match_points(rows, line, "lane", where, columns)
+        rows.match(where, columns, {"": _tolerance(line, s)}, quantity="lane")
 
 
 def _lanes(od: OpenDrive) -> dict[LaneKey, Lane]:
@@ -167,16 +157,15 @@ def _verify_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
         line, outline = ReferenceLine(road.geometries), "box"
         if thing.outlines:
             outline = "cornerRoad" if thing.outlines[0].on_road else "cornerLocal"
-        cubic = line.kinds(np.array([thing.s])) == ["paramPoly3"]
         centre, polygon = object_origin(line, thing), object_rings(line, thing)[0]
         ours = {"outline": outline, "centre": centre, "polygon": polygon}
-        atol = CUBIC[""] if cubic else EXACT
+        atol = {"": float(_tolerance(line, np.array([thing.s]))[0])}
         rows[key].match(f"{path.stem} object {key}", ours, atol, quantity="crosswalk")
 
 
 def _verify_summary(od: OpenDrive, file: Source, path: Path) -> None:
     kinds = {geometry.kind for road in od.roads.values() for geometry in road.geometries}
-    gap = CUBIC[""] if "paramPoly3" in kinds else EXACT
+    gap = CUBIC if "paramPoly3" in kinds else EXACT
     for key, value in summarize(od, path).items():
         atol = 0.0
         if key.startswith(("max_", "parampoly3_")):

@@ -47,7 +47,8 @@ def warm_up(*shares: str) -> Iterator[None]:
 def _routes() -> None:
     """Metrics that find the ego on the map."""
     from shiftsim.metrics import collision, drivable_area
-    from shiftsim.metrics.route import corner_routes, driven_route, lane_changes
+    from shiftsim.metrics.lane_change import lane_changes
+    from shiftsim.metrics.route import corner_routes, driven_route
 
     log, road = _rollout()
     ego = collision.flat_ego(log.ego, PACIFICA)
@@ -58,9 +59,9 @@ def _routes() -> None:
 
 def _contacts() -> None:
     """The other metrics."""
-    from shiftsim.metrics import collision, driving_direction, progress, speed_limit
+    from shiftsim.metrics import collision, progress, speed_limit
     from shiftsim.metrics.comfort import comfort_signals
-    from shiftsim.metrics.route import EdgeLists, list_room
+    from shiftsim.metrics.route import empty_lists
     from shiftsim.metrics.time_to_collision import time_to_collision
 
     log, road = _rollout()
@@ -70,11 +71,9 @@ def _contacts() -> None:
     time_to_collision(ego, tracks, contacts, (), is_common, road, log.tracks)
     comfort_signals(log.time_us, log.ego)
     progress.measure(road, ego.centers, ego.centers)
-    off_road = EdgeLists(
-        np.zeros((len(log.ego), list_room(road)), np.int64), np.zeros(len(log.ego), np.int64)
-    )
-    speed_limit.overspeed(road, off_road, ego.speeds)
-    driving_direction.lane_progress(road, off_road, ego.centers)
+    off_lane = empty_lists(road, len(log.ego))
+    speed_limit.overspeed(road, off_lane, ego.speeds)
+    progress.lane_progress(road, off_lane, ego.centers)
 
 
 def _planners() -> None:

@@ -1,17 +1,17 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
-import difflib
-import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim.errors import ConfigError, DataError
+import pyarrow as pa
+
+from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.view.page import MAX_ROLLOUTS, Page, asset, fill, json_text, replay_page
+from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, framed, json_text, replay_page
 from shiftsim.view.scene import Shown
 
 
@@ -76,8 +76,8 @@ class Gallery:
                 if place is not None:
                     planner = f"{task.planner} ({name})" if name else task.planner
                     self._runs[task._replace(planner=planner)] = (run, task)
-        self._scores = {run.path: _by_task(run.scores.to_pylist()) for run in runs}
-        self._metrics = {run.path: _grouped(run.metrics.to_pylist()) for run in runs}
+        self._scores = {run.path: _by_task(run.scores) for run in runs}
+        self._metrics = {run.path: _by_task(run.metrics) for run in runs}
         self._tokens: dict[str, list[Task]] = {}
         for task in self._runs:
             self._tokens.setdefault(task.token, []).append(task)
@@ -89,11 +89,14 @@ class Gallery:
         return sorted(found, key=lambda token: (self._lowest(token), token))
 
     def _lowest(self, token: str) -> float:
-        return min(self._cls(task) for task in self.choice.of(self._tokens[token]))
+        tasks = self.choice.of(self._tokens[token])
+        return min(float(self._results(task)[0].get("cls", 1.0)) for task in tasks)
 
-    def _cls(self, task: Task) -> float:
+    def _results(self, task: Task) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
+        """The rows of a rollout in `scores.parquet` and `metrics.parquet`; empty where none."""
         run, key = self._runs[task]
-        return float(self._scores[run.path].get(key, {}).get("cls", 1.0))
+        (score,) = self._scores[run.path].get(key, [{}])
+        return score, self._metrics[run.path].get(key, [])
 
     def find(self, text: str) -> str:
         """A scenario by its token or an unambiguous beginning of it.
@@ -101,13 +104,15 @@ class Gallery:
         Raises:
             ConfigError: There is none, or there are several.
         """
+        if text in self._tokens:
+            return text
         found = [token for token in self._tokens if token.startswith(text)]
-        if text in self._tokens or len(found) == 1:
-            return text if text in self._tokens else found[0]
-        near = difflib.get_close_matches(text, self._tokens, n=1)
+        if len(found) == 1:
+            return found[0]
+        near = nearest(text, self._tokens)
         raise ConfigError(
             f"{len(found) or 'no'} scenarios with stored rollouts begin with {text!r}",
-            hint=f"did you mean {near[0]!r}?" if near else f"such as {self.tokens[:3]}",
+            hint=f"did you mean {near!r}?" if near else f"such as {self.tokens[:3]}",
         )
 
     def tasks(self, token: str) -> list[Task]:
@@ -129,10 +134,9 @@ class Gallery:
         out = []
         for task in self.tasks(token):
             run, key = self._runs[task]
-            row = self._scores[run.path].get(key, {})
-            rows = self._metrics[run.path].get(key, [])
+            score, metrics = self._results(task)
             log = run.rollout(key, scenario)
-            out.append(Shown(task.planner, task.noise, task.seed, log, row.get("cls"), rows))
+            out.append(Shown(task.planner, task.noise, task.seed, log, score.get("cls"), metrics))
         return out
 
     def page(self, token: str, *, back: str = "") -> Page:
@@ -145,9 +149,7 @@ class Gallery:
         return [self._row(task, index) for index, task in enumerate(self.tasks(token))]
 
     def _row(self, task: Task, index: int) -> dict[str, Any]:
-        run, key = self._runs[task]
-        score = self._scores[run.path].get(key, {})
-        metrics = self._metrics[run.path].get(key, [])
+        score, metrics = self._results(task)
         firsts = {
             SHORT_NAMES[row["metric"]]: row["first_violation_s"]
             for row in metrics
@@ -183,13 +185,14 @@ def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "")
         rows: Rows of `Gallery.rows`.
         above: HTML between heading and list; the caller escapes what comes from data.
     """
-    return fill(
-        asset("list.html"),
-        title=html.escape(title),
-        style=asset("list.css"),
+    return framed(
+        "list.html",
+        title=title,
+        meta=POLICY.format(images="'self' data:"),
+        styles=["list.css"],
+        scripts=["list.js"],
         above=above,
         data=f'<script type="application/json" id="data-rows">{json_text(list(rows))}</script>',
-        script=asset("list.js"),
     )
 
 
@@ -248,12 +251,9 @@ def _names(runs: Sequence[Run]) -> list[str]:
     return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]
 
 
-def _by_task(rows: Sequence[Mapping[str, Any]]) -> dict[Task, Mapping[str, Any]]:
-    return {Task(*(row[name] for name in Task._fields)): row for row in rows}
-
-
-def _grouped(rows: Sequence[Mapping[str, Any]]) -> dict[Task, list[Mapping[str, Any]]]:
-    out: dict[Task, list[Mapping[str, Any]]] = {}
-    for row in rows:
+def _by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
+    """The rows of each task."""
+    out: dict[Task, list[dict[str, Any]]] = {}
+    for row in table.to_pylist():
         out.setdefault(Task(*(row[name] for name in Task._fields)), []).append(row)
     return out

@@ -13,8 +13,11 @@ from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, s
 from shiftsim.world.scenario import Scenario
 
 _HERE = Path(__file__).parent
-_SCRIPTS = ("codec.js", "world.js", "strips.js", "replay.js")
 MAX_ROLLOUTS = 6
+POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; script-src '
+    "'unsafe-inline'; style-src 'unsafe-inline'; img-src {images}\">"
+)
 
 
 class Page(str):
@@ -69,20 +72,50 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
         sections[f"rollout{index}"] = pack(rollout_fields(replay, index))
     data = [_data("meta", "application/json", json_text(meta))]
     data += [_data(name, "text/plain", text) for name, text in sections.items()]
-    text = fill(
-        asset("replay.html"),
-        title=html.escape(f"{scenario.token} · shiftsim"),
-        style=asset("replay.css"),
+    text = framed(
+        "replay.html",
+        title=f"{scenario.token} · shiftsim",
+        meta=POLICY.format(images="data:"),
+        styles=["replay.css"],
+        scripts=["codec.js", "world.js", "strips.js", "replay.js"],
         data="\n".join(data),
-        script="\n".join(asset(name) for name in _SCRIPTS),
     )
     return Page(text)
 
 
+def framed(
+    body: str,
+    *,
+    title: str,
+    meta: str,
+    styles: Sequence[str],
+    scripts: Sequence[str],
+    **parts: str,
+) -> str:
+    """A whole page from files of this folder, with one head for all pages.
+
+    Args:
+        body: The file with what stands between head and scripts.
+        title: Of the page.
+        meta: One more `meta` element.
+        styles: The style sheets.
+        scripts: The scripts.
+        parts: What is filled into the body, beside `title`.
+    """
+    return fill(
+        asset("frame.html"),
+        title=html.escape(title),
+        meta=meta,
+        style="".join(map(asset, styles)),
+        body=fill(asset(body), title=html.escape(title), **parts),
+        script="\n".join(map(asset, scripts)),
+    )
+
+
 @cache
-def asset(name: str, folder: Path = _HERE) -> str:
-    """A file of this folder, or of another one."""
-    return (folder / name).read_text(encoding="utf-8")
+def asset(name: str) -> str:
+    """A file of this folder."""
+    return (_HERE / name).read_text(encoding="utf-8")
 
 
 def fill(template: str, **parts: str) -> str:

@@ -16,6 +16,7 @@ from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.report.palette import looks
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
+from shiftsim.world.layers import Layer
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, PACIFICA, Tracks, speeds
 
@@ -232,30 +233,26 @@ def map_lines(scenario: Scenario, box: FloatArray) -> dict[str, list[FloatArray]
         "crosswalk": road.crosswalks,
         "stop": road.stop_polygons,
     }
-    out = {name: _rings(_near(layer, box), box) for name, layer in areas.items()}
-    blocks = [road.blocks.index[name] for name in scenario.route if name in road.blocks.index]
-    out["route"] = _rings(_near(road.blocks, box, np.array(sorted(set(blocks)), np.int64)), box)
-    edges = _indices_near(road.edges.polygons.bounds, box)
+    near = {name: (layer, indices_near(layer, box)) for name, layer in areas.items()}
+    blocks = {road.blocks.index[name] for name in scenario.route if name in road.blocks.index}
+    route = [block for block in indices_near(road.blocks, box) if block in blocks]
+    near["route"] = (road.blocks, route)
+    out = {
+        name: _rings([layer.shape(index) for index in found], box)
+        for name, (layer, found) in near.items()
+    }
+    edges = indices_near(road.edges, box)
     sides = [lines.at(e) for e in edges for lines in (road.left_boundaries, road.right_boundaries)]
     out["boundary"] = _lines(sides, box)
     out["centre"] = _lines([road.baselines.at(e) for e in edges], box)
     return out
 
 
-def _indices_near(bounds: FloatArray, box: FloatArray) -> np.ndarray:
-    return np.flatnonzero(
-        (bounds[:, 0] <= box[2])
-        & (bounds[:, 1] <= box[3])
-        & (bounds[:, 2] >= box[0])
-        & (bounds[:, 3] >= box[1])
-    )
-
-
-def _near(layer: Any, box: FloatArray, among: np.ndarray | None = None) -> list[shapely.Polygon]:
-    found = _indices_near(layer.polygons.bounds, box)
-    if among is not None:
-        found = np.intersect1d(found, among)
-    return [layer.shape(int(i)) for i in found]
+def indices_near(layer: Layer, box: FloatArray) -> list[int]:
+    """Objects of a layer whose bounds share a point with a box (min x, min y, max x, max y) [m]."""
+    bounds = layer.polygons.bounds
+    near = (bounds[:, :2] <= box[2:]).all(axis=1) & (bounds[:, 2:] >= box[:2]).all(axis=1)
+    return np.flatnonzero(near).tolist()
 
 
 def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]:

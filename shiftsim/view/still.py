@@ -9,7 +9,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.report.palette import looks
+from shiftsim.report.palette import looks, new_figure, save_picture
 from shiftsim.view.scene import Replay, Shown, map_lines
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, AgentKind, Tracks, center_poses
@@ -18,7 +18,7 @@ STILLS = (".pdf", ".png", ".svg")
 FILMS = (".mp4", ".gif")
 _PAD = 12.0  # m around the driven paths
 _FPS = 10
-_DPI = 150
+_FILM_DPI = 100
 _LAYERS = {  # what is drawn first lies below
     "walkway": "#ece6d8",
     "drivable": "#dcdcd8",
@@ -54,43 +54,18 @@ def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: f
         )
     if not 0.0 <= at <= times[-1] + 1e-9:
         raise ConfigError(f"time {at} s is not within 0 … {times[-1]:.1f} s", hint="--at SECONDS")
-    pyplot = _matplotlib()
+    figure, axes = _canvas(Replay(scenario, shown))
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure, axes = _canvas(pyplot, Replay(scenario, shown))
-    try:
-        if path.suffix.lower() in FILMS:
-            _film(path, figure, axes, shown)
-        else:
-            row = int(np.argmin(np.abs(times - at)))
-            _moment(axes, shown, row)
-            _heading(axes, scenario, float(times[row]))
-            figure.savefig(path, dpi=_DPI, metadata=_metadata(path))
-    finally:
-        pyplot.close(figure)
+    if path.suffix.lower() in FILMS:
+        _film(path, figure, axes, shown)
+        return
+    row = int(np.argmin(np.abs(times - at)))
+    _moment(axes, shown, row)
+    _heading(axes, scenario, float(times[row]))
+    save_picture(figure, path)
 
 
-def _matplotlib() -> Any:
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        matplotlib.rcParams["svg.hashsalt"] = (
-            "shiftsim"  # ids in SVG files are then always the same
-        )
-        from matplotlib import pyplot
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
-        ) from error
-    return pyplot
-
-
-def _metadata(path: Path) -> dict[str, Any] | None:
-    """No time stamps: the same picture has the same bytes."""
-    return {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
-
-
-def _canvas(pyplot: Any, replay: Replay) -> tuple[Any, Any]:
+def _canvas(replay: Replay) -> tuple[Any, Any]:
     """Axes with the map, as large as the driven paths need."""
     paths = [replay.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in replay.shown)]
     points = np.concatenate(paths)
@@ -102,7 +77,8 @@ def _canvas(pyplot: Any, replay: Replay) -> tuple[Any, Any]:
     height = width * half[1] / half[0]
     if height > 7.0:
         width, height = 7.0 * width / height, 7.0
-    figure, axes = pyplot.subplots(figsize=(max(width, 4.0), height + 0.9), layout="constrained")
+    figure = new_figure(figsize=(max(width, 4.0), height + 0.9))
+    axes = figure.subplots()
     _draw_map(axes, map_lines(replay.scenario, extent))
     axes.set_xlim(extent[0], extent[2])
     axes.set_ylim(extent[1], extent[3])
@@ -210,7 +186,7 @@ def _film(path: Path, figure: Any, axes: Any, shown: Sequence[Shown]) -> None:
             raise MissingExtraError("mp4 needs ffmpeg", hint="install ffmpeg, or write a .gif")
         writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
     times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
-    with writer.saving(figure, str(path), _DPI * 2 // 3):
+    with writer.saving(figure, str(path), _FILM_DPI):
         for row, time in enumerate(times):
             drawn = _moment(axes, shown, row)
             axes.set_title(f"{shown[0].log.token}  {time:.1f} s", fontsize=9)

@@ -6,13 +6,15 @@ exact point-in-polygon tests; results come in the order of the layer, as nuPlan'
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.polylines import arc_lengths
+from shiftsim.errors import MapError
+from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.geometry.predicates import orientation
 from shiftsim.geometry.rings import (
     EXTERIOR,
@@ -21,6 +23,9 @@ from shiftsim.geometry.rings import (
     polygon_distance,
     segments_intersect,
 )
+
+if TYPE_CHECKING:
+    from rtree.index import Index
 
 _MIN_CELL, _MAX_CELL = 4.0, 64.0  # m
 _CELLS_PER_POLYGON = 4
@@ -165,6 +170,12 @@ def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntAr
                 items[fill[cell]] = poly
                 fill[cell] += 1
     return ptr, items
+
+
+@lean_kernel
+def project_on_line(lines: Polylines, line: int, x: float, y: float) -> float:
+    """Arc length of the point of a line nearest to (x, y); the first one on ties [m]."""
+    return project_on_polyline(lines.xy, lines.arc, lines.ptr[line], lines.ptr[line + 1], x, y)
 
 
 @lean_kernel
@@ -353,6 +364,51 @@ class Layer:
             out = np.empty(count, np.int64)
             containing(self.polygons, x, y, out)
         return out[:count]
+
+    @cached_property
+    def _tree(self) -> "Index":
+        """The bounding boxes of the polygons in an R-tree, made when it is first asked for."""
+        from rtree.index import Index
+
+        boxes = enumerate(self.polygons.bounds.tolist())
+        return Index((number, box, None) for number, box in boxes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the tree, which is made again where it is needed."""
+        return {name: value for name, value in vars(self).items() if name != "_tree"}
+
+    def nearest(self, x: float, y: float) -> tuple[int, float]:
+        """The polygon nearest to a point, the first one on ties, and its distance, 0 inside [m].
+
+        Raises:
+            MapError: The layer is empty.
+        """
+        if not len(self):
+            raise MapError("the layer has no polygons, so none is nearest")
+        # no polygon can be nearer than its box, and the nearest box gives a first bound
+        guess = next(iter(self._tree.nearest((x, y, x, y), 1)))
+        reach = distance_to(self.polygons, guess, x, y)
+        around = (x - reach, y - reach, x + reach, y + reach)
+        return min(
+            (
+                (number, distance_to(self.polygons, number, x, y))
+                for number in {guess, *self._tree.intersection(around)}
+            ),
+            key=lambda found: (found[1], found[0]),
+        )
+
+    def meeting(self, area: shapely.Polygon | Sequence[float]) -> IntArray:
+        """Indices, ascending, of the polygons that share a point with an area; touching counts.
+
+        Args:
+            area: A polygon, or its bounds min x, min y, max x, max y [m].
+        """
+        if not len(self):
+            return np.zeros(0, np.int64)
+        polygon = area if isinstance(area, shapely.Polygon) else shapely.box(*area)
+        near = sorted(self._tree.intersection(polygon.bounds))
+        meets = [shapely.intersects(self.shape(number), polygon) for number in near]
+        return np.array(near, np.int64)[np.array(meets, np.bool_)]
 
     def within_box(self, x: float, y: float, half_width: float) -> IntArray:
         """Indices of the polygons that share a point with an axis-parallel square around (x, y)."""

@@ -12,11 +12,28 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.errors import MapError
-from shiftsim.geometry.polylines import project_on_polyline
-from shiftsim.world.layers import Layer, Lists, Polylines, make_layer, make_lists, make_polylines
+from shiftsim.errors import MapError, one_of
+from shiftsim.world.layers import (
+    Layer,
+    Lists,
+    Polylines,
+    make_layer,
+    make_lists,
+    make_polylines,
+    project_on_line,
+)
 
 NONE = -1  # "no such object" in index arrays
+LAYERS = (
+    "edges",
+    "blocks",
+    "intersections",
+    "stop_polygons",
+    "crosswalks",
+    "walkways",
+    "car_parks",
+    "drivable_areas",
+)
 
 
 @dataclass(frozen=True)
@@ -209,12 +226,39 @@ class VectorMap:
         """Lane connectors that hold a point in their interior."""
         return [e for e in self.edges.containing(x, y).tolist() if e >= self.num_lanes]
 
+    def nearest(self, x: float, y: float, layer: str = "edges") -> int:
+        """Index of the object of a layer that is nearest to a point, the first one on ties.
+
+        Args:
+            x: Point [m].
+            y: Point [m].
+            layer: One of `LAYERS`.
+
+        Raises:
+            ConfigError: There is no such layer.
+            MapError: The layer is empty.
+        """
+        return self._layer(layer).nearest(x, y)[0]
+
+    def within(self, area: shapely.Polygon | Sequence[float], layer: str = "edges") -> IntArray:
+        """Indices, ascending, of the objects of a layer that share a point with an area.
+
+        Args:
+            area: A polygon, or bounds min x, min y, max x, max y [m]; touching counts.
+            layer: One of `LAYERS`.
+
+        Raises:
+            ConfigError: There is no such layer.
+        """
+        return self._layer(layer).meeting(area)
+
+    def _layer(self, name: str) -> Layer:
+        found: Layer = getattr(self, one_of("map layer", name, LAYERS))
+        return found
+
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""
-        lines = self.baselines
-        return float(
-            project_on_polyline(lines.xy, lines.arc, lines.ptr[edge], lines.ptr[edge + 1], x, y)
-        )
+        return float(project_on_line(self.baselines, edge, x, y))
 
 
 def build_map(

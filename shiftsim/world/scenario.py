@@ -2,7 +2,7 @@
 
 Rows are the log's own samples (20 Hz); iterations are the rows the simulation visits (10 Hz). Rows
 before the first iteration feed the history a planner sees, rows after the last one feed planners
-and learned targets that look into the recorded future (nuplan-simulation.md §1).
+and learned targets that look into the recorded future.
 """
 
 from dataclasses import dataclass

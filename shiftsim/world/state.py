@@ -1,7 +1,7 @@
 """Vehicle states, tracks, traffic lights, trajectories and commands.
 
 Everything is an array with one row per time; the few objects here name the columns. The ego pose is
-the rear axle, a track's pose is the centre of its box (nuplan-simulation.md §3).
+the rear axle, a track's pose is the centre of its box.
 """
 
 from collections.abc import Sequence
@@ -319,11 +319,9 @@ def center_velocities(states: FloatArray, vehicle: VehicleParameters = PACIFICA)
 
 
 def center_accelerations(states: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
-    """(..., 2) acceleration at the box centre in the body frame [m/s^2], from (..., 11) states.
-
-    nuPlan: the centripetal and the angular term both go to the longitudinal part with a plus sign;
-    this is not the rigid-body formula, and the comfort metrics read it (nuplan-simulation.md §3).
-    """
+    """(..., 2) acceleration at the box centre in the body frame [m/s^2], from (..., 11) states."""
+    # nuPlan rule 19: the centripetal and the angular term both go to the longitudinal part, with a
+    # plus sign; the comfort metrics read it
     out = states[..., AX : AY + 1].copy()
     distance = vehicle.rear_axle_to_center
     out[..., 0] += distance * states[..., YAW_RATE] ** 2 + distance * states[..., YAW_ACCEL]

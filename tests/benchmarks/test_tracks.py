@@ -95,7 +95,7 @@ def test_published_robustness_is_that_of_the_paper(shared):
         cells = paper.robustness[row["traffic"]][row["set"]][row["planner"]]
         name = f"{row['noise']}-{row['level']}".rstrip("-")
         expected = tuple(float(row[key]) for key in ("mean", "std") if row[key])
-        assert cells[paper.noises.index(name)] == expected
+        assert tuple(cells[paper.noises.index(name)]) == expected
 
 
 def test_cities_are_recognised_by_name_and_abbreviation():

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from shiftsim.cli import diagnosis as doctor
+from shiftsim.cli import doctor
 from shiftsim.errors import ShiftsimError
 
 

@@ -72,7 +72,7 @@ def test_arrays_of_different_length_are_refused() -> None:
 
 
 def test_an_unknown_profile_names_the_nearest() -> None:
-    with pytest.raises(ConfigError, match="valid are nuplan, deepplan") as error:
+    with pytest.raises(ConfigError, match="threshold profile 'deeplan' unknown") as error:
         judge(measure(LOG, straight_road()), "deeplan")
     assert "deepplan" in error.value.hint
 

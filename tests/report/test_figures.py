@@ -3,7 +3,7 @@
 import pytest
 from made_runs import random_scores, write_run
 
-from shiftsim.report import read_groups
+from shiftsim.report.groups import read_groups
 
 pytest.importorskip("matplotlib")
 

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from shiftsim.errors import ConfigError
-from shiftsim.report import FORMATS, failures, score_rows, score_table, summary, worst_rollouts
+from shiftsim.report.groups import read_groups
+from shiftsim.report.scores import (
+    failures,
+    score_rows,
+    score_table,
+    scores,
+    summary,
+    worst_rollouts,
+)
+from shiftsim.report.writers import FORMATS, render
 
 
 def test_the_score_is_the_plain_mean_of_the_scenarios(clean_run):
@@ -53,24 +62,30 @@ def test_rows_can_be_split_by_scenario_type(clean_run):
     assert all(row.num_scenarios == 2 for row in rows)
 
 
+def test_the_table_of_a_run_is_the_text_of_its_scores(clean_run):
+    found = render(scores(read_groups([clean_run])), "text")
+    assert found == f"All planners and noises, scores x 100\n{score_table([clean_run])}"
+
+
 @pytest.mark.parametrize("style", FORMATS)
 def test_profile_version_and_scenario_count_stand_with_every_table(clean_run, style):
-    text = score_table([clean_run], style=style)
+    text = render(scores(read_groups([clean_run])), style)
     assert "thresholds nuplan" in text
     assert "metrics v" in text
     assert "4 scenarios" in text
 
 
 def test_csv_has_unrounded_numbers(clean_run):
-    rows = list(csv.DictReader(io.StringIO(score_table([clean_run], style="csv"))))
+    table = render(scores(read_groups([clean_run])), "csv")
+    rows = list(csv.DictReader(io.StringIO(table)))
     assert float(rows[0]["CLS"]) == 100.0 * score_rows(clean_run)[0].means["cls"]
 
 
 def test_an_unknown_format_or_column_is_refused(clean_run):
     with pytest.raises(ConfigError, match="format 'pdf' unknown"):
-        score_table([clean_run], style="pdf")
+        render(scores(read_groups([clean_run])), "pdf")
     with pytest.raises(ConfigError, match="colour"):
-        score_table([clean_run], by="colour")
+        scores(read_groups([clean_run]), by="colour")
 
 
 def test_the_worst_rollouts_come_with_a_reason(clean_run):

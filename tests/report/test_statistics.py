@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shiftsim.report.groups import seed_deviation
 from shiftsim.report.statistics import (
     bootstrap_interval,
     cluster_codes,
     compare,
     holm,
-    seed_deviation,
     sign_flip_test,
 )
 

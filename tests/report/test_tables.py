@@ -9,13 +9,12 @@ from made_runs import random_scores, write_run
 
 from shiftsim.benchmarks import known_sets, published
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.report import KnownSet, read_groups, render
 from shiftsim.report.build import TABLES, Options, make_tables, write_report
 from shiftsim.report.details import planner_comparison, planning_times, scenario_types
-from shiftsim.report.groups import token_digest
+from shiftsim.report.groups import KnownSet, read_groups, token_digest
 from shiftsim.report.paper import noise_robustness, semantic_shift
 from shiftsim.report.tables import Number, Table, shown
-from shiftsim.report.writers import latex_escape, markdown_escape
+from shiftsim.report.writers import latex_escape, markdown_escape, render
 
 TOKENS = ("t0", "t1", "t2", "t3")
 

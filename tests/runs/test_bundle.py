@@ -8,9 +8,9 @@ import pytest
 import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import DataError
-from shiftsim.runs.bundle import open_run_store
-from shiftsim.runs.rescore import rescore
+from shiftsim.runs.derive import rescore
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.scenarios import open_run_store
 
 TOKEN = "0001cafe"
 

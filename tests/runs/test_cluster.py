@@ -11,7 +11,8 @@ import pytest
 
 from shiftsim.errors import ConfigError
 from shiftsim.runs.config import make_config
-from shiftsim.runs.execute import execute, prepare
+from shiftsim.runs.execute import execute
+from shiftsim.runs.prepare import prepare
 
 pytest.importorskip("distributed", reason="needs the extra `cluster`")
 

@@ -1,21 +1,21 @@
 """Settings are checked when they are read."""
 
-import tomllib
+import json
 from pathlib import Path
 
 import pytest
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import read_toml, store_path
-from shiftsim.runs.config import make_config, parse_argument, write_toml
+from shiftsim.runs.config import make_config, parse_argument
 
 GOOD = {"planners": ["idm", "my.module:Mine"], "noise": ["ou-high"], "seeds": [0, 2]}
 
 
-def test_settings_survive_toml():
+def test_settings_survive_as_plain_values():
     arguments = {"idm": {"min_gap": 1.5, "name": 'a "quoted" \\ name', "on": True, "list": [1, 2]}}
     config = make_config({**GOOD, "planner_args": arguments, "limit": 3, "out": "runs/ü"})
-    assert make_config(tomllib.loads(write_toml(config))) == config
+    assert make_config(json.loads(json.dumps(config.to_dict()))) == config
 
 
 @pytest.mark.parametrize(

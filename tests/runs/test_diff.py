@@ -10,7 +10,7 @@ import shiftsim
 from shiftsim.errors import ConfigError
 from shiftsim.runs.diff import diff_lines, diff_runs, find_departure
 from shiftsim.runs.results import Run
-from shiftsim.runs.rollouts import Task, decode_rollout, encode_rollout
+from shiftsim.runs.rollouts import Task, rollout_rows
 
 
 class Coast:
@@ -128,10 +128,7 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
         log = replace(log, plans=np.zeros((len(log.time_us), 2, 3)))
     values = np.array(getattr(log, field))
     values[row].reshape(-1)[1] += 1e-9
-    tables = [
-        decode_rollout(encode_rollout(one, with_tracks=True))
-        for one in (log, replace(log, **{field: values}))
-    ]
+    tables = [rollout_rows(one, with_tracks=True) for one in (log, replace(log, **{field: values}))]
     found = find_departure(*tables)
     assert (found.iteration, found.quantity) == (row, quantity)
     assert found.second - found.first == pytest.approx(1e-9, rel=1e-4)

@@ -13,7 +13,8 @@ import shiftsim
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.runs.config import make_config
-from shiftsim.runs.execute import execute, prepare
+from shiftsim.runs.execute import execute
+from shiftsim.runs.prepare import prepare
 from shiftsim.sim.noise import NoiseModel
 
 sys.path.append(str(Path(__file__).parent))  # worker processes import `drivers`, too
@@ -53,9 +54,9 @@ def test_shuffled_tasks_give_the_same_bytes(clean_run, toy, tmp_path):
         seeds=[1, 0],
     )
     prepared = prepare(config)
-    units = list(prepared.units)
-    random.Random(5).shuffle(units)
-    other = execute(replace(prepared, units=tuple(units)))
+    batches = list(prepared.batches)
+    random.Random(5).shuffle(batches)
+    other = execute(replace(prepared, batches=tuple(batches)))
     assert same_results(clean_run, other) == [True, True]
 
 
@@ -99,9 +100,9 @@ def test_a_failing_task_is_a_row_and_withholds_the_score(toy, tmp_path):
     assert failed[0]["error"] == "RuntimeError: cannot drive here"
     assert "drivers.py" in failed[0]["traceback"]
     assert len(run.scores) == 3
-    assert "– (3/4 done)" in run.table()
-    assert "partial" not in run.table()
-    assert "partial (3/4)" in run.table(allow_partial=True)
+    assert "– (3/4 done)" in shiftsim.open_run(run.path).table()
+    assert "partial" not in shiftsim.open_run(run.path).table()
+    assert "partial (3/4)" in shiftsim.open_run(run.path).table(allow_partial=True)
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ def test_an_interrupt_keeps_what_is_finished(toy, tmp_path):
         "timeout": 0,
         "missing": 3,
     }
-    assert "– (1/4 done)" in run.table()
+    assert "– (1/4 done)" in shiftsim.open_run(run.path).table()
 
 
 def test_an_answer_that_is_no_plan_is_named(toy, tmp_path):
@@ -178,7 +179,7 @@ def test_an_unknown_store_is_named_with_the_known_ones(toy, tmp_path, monkeypatc
     with pytest.raises(DataError, match="no store 'toi'") as caught:
         prepare(settings("toi", tmp_path / "run"))
     assert "toy" in caught.value.hint
-    assert prepare(settings("toy", tmp_path / "run")).num_expected == 4
+    assert len(prepare(settings("toy", tmp_path / "run")).tasks) == 4
 
 
 def test_scenarios_that_the_store_lacks_stop_the_run_or_are_counted(toy, tmp_path):
@@ -196,7 +197,7 @@ def test_scenarios_that_the_store_lacks_stop_the_run_or_are_counted(toy, tmp_pat
         "timeout": 0,
         "missing": 1,
     }
-    assert "– (2/3 done)" in run.table()
+    assert "– (2/3 done)" in shiftsim.open_run(run.path).table()
 
 
 def test_a_broken_scenario_fails_alone(tmp_path):

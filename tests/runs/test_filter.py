@@ -127,8 +127,8 @@ def test_a_killed_filter_goes_on_where_it_stopped(store):
     with pytest.raises(Stop):
         filter_store(store, workers=1, on_progress=stop_at_three)
     assert not (store / VERDICTS).exists()
-    unfinished = store / "filter/unfinished.jsonl"
-    unfinished.write_text(unfinished.read_text() + '{"token": "cut o')
+    unfinished = store / "filter/unfinished.sqlite"
+    assert unfinished.exists()
     calls = []
     again = filter_store(store, workers=1, on_progress=lambda *done: calls.append(done))
     assert calls == [(3, 6), (4, 6), (5, 6), (6, 6)]
@@ -188,19 +188,19 @@ def test_a_filter_that_drops_everything_stops_a_run(store):
 def test_a_killed_command_goes_on_with_other_workers_to_the_same_bytes(tmp_path):
     store = write_toy_store(tmp_path / "toy", count=40)
     command = [sys.executable, "-m", "shiftsim", "filter", str(store), "--json", "--workers"]
-    unfinished = store / "filter/unfinished.jsonl"
+    unfinished = store / "filter/unfinished.sqlite-wal"
     process = subprocess.Popen(
         [*command, "1"], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 60.0
-    while not (unfinished.exists() and unfinished.read_text().count("\n") > 3):
+    while not (unfinished.exists() and unfinished.stat().st_size > 40_000):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    kept = len(unfinished.read_text().splitlines()) if unfinished.exists() else 41
+    kept = unfinished.exists()
     done = subprocess.run([*command, "2"], capture_output=True, text=True, check=True)
-    assert kept > 3
+    assert kept
     counts = json.loads(done.stdout)["counts"]
     assert (counts["accepted"] + counts["dropped"], counts["failed"]) == (40, 0)
     resumed = (store / VERDICTS).read_bytes()

@@ -45,7 +45,7 @@ def duckdb_means(path):
 
 @pytest.mark.parametrize("means_of", [pandas_means, polars_means, duckdb_means])
 def test_other_readers_give_the_same_means(clean_run, means_of):
-    from shiftsim.report import score_rows
+    from shiftsim.report.scores import score_rows
 
     means = means_of(clean_run.path / "scores.parquet")
     rows = score_rows(clean_run)
@@ -68,7 +68,7 @@ def test_other_readers_open_rollouts(clean_run, reader):
 
 
 def test_grouping_with_arrow_gives_the_same_means(clean_run):
-    from shiftsim.report import score_rows
+    from shiftsim.report.scores import score_rows
 
     table = pq.read_table(clean_run.path / "scores.parquet")
     means = table.group_by(["planner", "noise"]).aggregate([("cls", "mean")]).to_pylist()

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from stores import write_toy_store
 
-from shiftsim.runs.journal import JOURNAL
+from shiftsim.runs.results import JOURNAL
 
 HERE = Path(__file__).parent
 ROUNDS = int(os.environ.get("KILL_ROUNDS", "2"))

@@ -1,19 +1,14 @@
 """Reactive traffic through a whole run."""
 
-import pytest
-
 import shiftsim
-from shiftsim.runs.rescore import rescore
+from shiftsim.runs.derive import rescore
 
 
-@pytest.mark.parametrize(
-    "traffic", ["reactive", pytest.param("reactive-fixed", marks=pytest.mark.thorough)]
-)
-def test_workers_do_not_change_reactive_results(traffic, toy, tmp_path):
+def test_workers_do_not_change_reactive_results(toy, tmp_path):
     runs = [
         shiftsim.run(
             ["constant-velocity"],
-            traffic=traffic,
+            traffic="reactive",
             store=str(toy),
             workers=workers,
             out=str(tmp_path / str(workers)),
@@ -24,7 +19,7 @@ def test_workers_do_not_change_reactive_results(traffic, toy, tmp_path):
     names = ("metrics.parquet", "scores.parquet")
     first, second = ([(run.path / name).read_bytes() for name in names] for run in runs)
     assert first == second
-    assert f"traffic {traffic} ·" in runs[0].table()
+    assert "traffic reactive ·" in runs[0].table()
 
 
 def test_stored_reactive_traffic_is_scored_again_as_it_drove(toy, tmp_path):

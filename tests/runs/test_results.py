@@ -8,8 +8,16 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.rescore import rescore
-from shiftsim.runs.rollouts import STATES, Task, complete_rollout, decode_rollout, encode_rollout
+from shiftsim.runs.config import make_config
+from shiftsim.runs.derive import rescore
+from shiftsim.runs.rollouts import (
+    STATES,
+    Task,
+    complete_rollout,
+    decode_rows,
+    encode_rows,
+    rollout_rows,
+)
 from shiftsim.runs.task import score_rollout
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
@@ -43,7 +51,7 @@ def test_a_rollout_is_read_back_as_it_was_driven(clean_run, toy):
 def test_a_stored_rollout_has_the_score_in_the_table(clean_run, toy):
     scenario = open_store(toy).read(TOKEN)
     log = clean_run.rollout(KEY, scenario)
-    scores, _ = score_rollout(scenario, log, thresholds="nuplan", traffic="nonreactive")
+    scores, _ = score_rollout(scenario, log, make_config({"planners": [KEY.planner]}))
     rows = clean_run.scores.to_pylist()
     row = next(r for r in rows if Task(*(r[n] for n in Task._fields)) == KEY)
     assert {name: row[name] for name in scores} == scores
@@ -52,7 +60,7 @@ def test_a_stored_rollout_has_the_score_in_the_table(clean_run, toy):
 def test_tracks_are_stored_when_the_traffic_is_not_the_log(toy):
     scenario = open_store(toy).read(TOKEN)
     log = simulate(scenario, None, controller="log-playback", traffic=PushingTraffic())
-    back = complete_rollout(decode_rollout(encode_rollout(log, with_tracks=True)), scenario)
+    back = complete_rollout(decode_rows(encode_rows(rollout_rows(log, with_tracks=True))), scenario)
     for name in ("valid", "poses", "velocities", "sizes"):
         np.testing.assert_array_equal(getattr(back.tracks, name), getattr(log.tracks, name))
     assert not np.array_equal(back.tracks.poses[-1], scenario.tracks.poses[-1])
@@ -61,7 +69,7 @@ def test_tracks_are_stored_when_the_traffic_is_not_the_log(toy):
 def test_a_rollout_of_another_scenario_is_refused(clean_run, toy):
     store = open_store(toy)
     log = simulate(store.read("0000cafe"), None, controller="log-playback")
-    rows = decode_rollout(encode_rollout(log, with_tracks=False))
+    rows = rollout_rows(log, with_tracks=False)
     times = pa.array(log.time_us + 1)
     moved = pa.RecordBatch.from_arrays([times, *rows.columns[1:]], schema=STATES)
     assert complete_rollout(rows, store.read("0000cafe")).token == "0000cafe"

@@ -1,5 +1,6 @@
 """Runs that were stopped go on: nothing finished is done again, nothing is mixed."""
 
+import errno
 import json
 import os
 import shutil
@@ -12,11 +13,13 @@ import pytest
 import shiftsim
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.config import make_config
-from shiftsim.runs.execute import execute, prepare
+from shiftsim.runs.execute import execute
 from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.journal import JOURNAL, ROLLOUTS
-from shiftsim.runs.results import TaskResult
+from shiftsim.runs.journal import Journal
+from shiftsim.runs.prepare import prepare
+from shiftsim.runs.results import JOURNAL, TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.task import Batch
 from shiftsim.runs.workers import Outcome
 
 sys.path.append(str(Path(__file__).parent))  # worker processes import `drivers`, too
@@ -56,15 +59,24 @@ def undisturbed(toy, tmp_path_factory):
 
 @pytest.fixture
 def stopped(toy, tmp_path):
-    """Folder of a run that ended after 5 of 12 tasks, without a chance to clean up."""
+    """Folder of a run as kill -9 leaves it after 5 of 12 tasks, without a chance to clean up."""
+
+    def kill(progress):
+        if progress.done == 5:
+            shutil.copytree(tmp_path / "first", tmp_path / "run")
+            raise Stop
+
     with pytest.raises(Stop):
-        execute(prepare(settings(toy, tmp_path / "run", **NOISY)), on_progress=stop_after(5))
+        execute(prepare(settings(toy, tmp_path / "first", **NOISY)), on_progress=kill)
+    shutil.rmtree(tmp_path / "first")
     return tmp_path / "run"
 
 
 def test_a_stopped_run_is_visible_and_says_what_to_do(stopped):
     assert json.loads((stopped / "manifest.json").read_text())["state"] == "running"
-    assert len((stopped / JOURNAL).read_text().splitlines()) == 5
+    journal = Journal(stopped / JOURNAL, keep=True)
+    assert len(list(journal.items())) == 5
+    journal.close()
     with pytest.raises(DataError, match="not finished") as caught:
         shiftsim.open_run(stopped)
     assert "--resume" in caught.value.hint
@@ -82,22 +94,22 @@ def test_resuming_does_only_what_is_left_and_gives_the_same_bytes(stopped, toy, 
     assert [path.name for path in (stopped / "rollouts").iterdir()] == ["part-00000.parquet"]
 
 
-@pytest.mark.parametrize("cut", [1, 40, 5000])
-def test_a_line_that_was_cut_off_is_done_again(stopped, toy, undisturbed, cut):
-    journal = stopped / JOURNAL
+@pytest.mark.parametrize("cut", [1, 40, 5000, 100_000])
+def test_what_a_power_failure_took_is_made_again(stopped, toy, undisturbed, cut):
+    journal = stopped / f"{JOURNAL}-wal"
     os.truncate(journal, journal.stat().st_size - cut)
-    run = execute(prepare(settings(toy, stopped, resume=True, **NOISY)))
-    assert content(run) == content(undisturbed)
-
-
-@pytest.mark.parametrize("left", [0.0, 0.5, 0.99])
-def test_a_rollout_that_was_lost_is_made_again(stopped, toy, undisturbed, left):
-    rollouts = stopped / ROLLOUTS
-    os.truncate(rollouts, int(left * rollouts.stat().st_size))
     run = execute(prepare(settings(toy, stopped, resume=True, **NOISY)))
     assert content(run) == content(undisturbed)
     for task in undisturbed.rollout_places:
         assert run.rollout_rows(task)["x_m"] == undisturbed.rollout_rows(task)["x_m"]
+
+
+def test_an_unfinished_run_of_an_earlier_version_is_not_gone_on_with(stopped, toy):
+    (stopped / "unfinished.jsonl").write_text("{}")
+    for resume in (False, True):
+        with pytest.raises(ConfigError, match="of an earlier version") as caught:
+            prepare(settings(toy, stopped, resume=resume, **NOISY))
+        assert "run again" in caught.value.hint
 
 
 def test_halves_of_files_that_a_killed_process_leaves_do_no_harm(stopped, toy, undisturbed):
@@ -271,33 +283,37 @@ def test_a_run_that_the_disk_cannot_hold_is_refused(
     assert not (tmp_path / "not").exists()
 
 
-@pytest.mark.parametrize("name", [JOURNAL, ROLLOUTS])
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), None])
-def test_half_a_result_on_a_full_disk_is_taken_back(tmp_path, name, error):
+def test_a_result_that_does_not_fit_on_the_disk_is_taken_back(tmp_path):
     writer = RunWriter(tmp_path / "run", {"format": 3})
     writer.add(TaskResult(Task("p", "none", 0, "a"), "ok", rollout=b"some bytes of a rollout"))
-    before = (tmp_path / "run" / name).read_bytes()
-
-    class Full:
-        def __init__(self, file):
-            self.file = file
-
-        def write(self, data):
-            self.file.write(data[:10])
-            if error:
-                raise error
-            return 10
-
-        def truncate(self, size):
-            return self.file.truncate(size)
-
-    journal = writer._journal
-    appended = journal._text if name == JOURNAL else journal._rollouts
-    appended.file = Full(appended.file)
+    (pages,) = writer._journal._database.execute("pragma page_count").fetchone()
+    writer._journal._database.execute(f"pragma max_page_count = {pages}")
     with pytest.raises(OSError, match="No space left"):
-        writer.add(TaskResult(Task("p", "none", 0, "b"), "ok", rollout=b"some bytes of another"))
-    assert (tmp_path / "run" / name).read_bytes() == before
+        writer.add(TaskResult(Task("p", "none", 0, "b"), "ok", rollout=bytes(1 << 20)))
     assert list(writer.ended) == [Task("p", "none", 0, "a")]
+    writer._journal._database.execute("pragma max_page_count = 100000")
+    writer.add(TaskResult(Task("p", "none", 0, "c"), "ok"))
+    writer.close()
+    again = RunWriter(tmp_path / "run", {"format": 3}, resume=True)
+    assert [task.token for task in again.ended] == ["a", "c"]
+    assert again._journal.data(json.dumps(["p", "none", 0, "a"])) == b"some bytes of a rollout"
+    again.close()
+
+
+def test_a_file_system_without_locks_is_no_hindrance(tmp_path, monkeypatch):
+    import fcntl
+
+    def refuse(*arguments):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    monkeypatch.setattr(fcntl, "lockf", refuse)
+    writer = RunWriter(tmp_path / "run", {"format": 3})
+    writer.add(TaskResult(Task("p", "none", 0, "a"), "ok"))
+    writer.close()
+    again = RunWriter(tmp_path / "run", {"format": 3}, resume=True)
+    assert len(again.ended) == 1
+    again.close()
 
 
 def test_an_output_that_cannot_be_written_is_one_error(toy, tmp_path):
@@ -310,6 +326,6 @@ def test_a_worker_that_died_is_told_from_one_that_was_late():
     from shiftsim.runs.execute import ended
 
     task = Task("p", "none", 0, "a")
-    (died,) = ended(Outcome((task,), None, "worker process killed by SIGKILL"))
-    (late,) = ended(Outcome((task,), None, "took longer than 2 s", is_late=True))
+    (died,) = ended(Outcome(Batch((task,)), None, "worker process killed by SIGKILL"))
+    (late,) = ended(Outcome(Batch((task,)), None, "took longer than 2 s", is_late=True))
     assert (died.status, late.status) == ("failed", "timeout")

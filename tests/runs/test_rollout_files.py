@@ -12,11 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shiftsim.errors import DataError
-from shiftsim.runs import rollout_files
+from shiftsim.runs import rollouts
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import TaskResult
-from shiftsim.runs.rollout_files import PartWriter, Place, RolloutReader, without_key
-from shiftsim.runs.rollouts import STATES, TRACKS, Task, encode_batches
+from shiftsim.runs.rollouts import (
+    STATES,
+    TRACKS,
+    PartWriter,
+    Place,
+    RolloutReader,
+    Task,
+    encode_rows,
+    without_key,
+)
 
 MANIFEST = {"format": 4, "state": "finished"}
 
@@ -49,14 +57,14 @@ def key(number):
 )
 def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_group, per_file):
     folder = tmp_path_factory.mktemp("rollouts")
-    rollouts = {
+    made = {
         key(i): made_up(length, value=float(i), tracks=tracks) for i, length in enumerate(lengths)
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout_files, "_MAX_GROUP", (per_group, 1 << 30))
-        patch.setattr(rollout_files, "_MAX_FILE", (per_file, 1 << 30))
+        patch.setattr(rollouts, "_MAX_GROUP", (per_group, 1 << 30))
+        patch.setattr(rollouts, "_MAX_FILE", (per_file, 1 << 30))
         writer = PartWriter(folder)
-        places = {task: writer.add(task, rows) for task, rows in rollouts.items()}
+        places = {task: writer.add(task, rows) for task, rows in made.items()}
         writer.close()
     files = sorted(folder.iterdir())
     assert len(files) == -(-len(lengths) // per_file)
@@ -64,7 +72,7 @@ def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_gro
     reader = RolloutReader()
     for task, place in places.items():
         rows = reader.read(place)
-        assert without_key(rows).equals(rollouts[task])
+        assert without_key(rows).equals(made[task])
         assert rows["iteration"].to_pylist() == list(range(len(rows)))
         named = pq.read_table(place.file, columns=[*Task._fields, "time_us"]).to_pylist()
         own = [row for row in named if Task(*(row[n] for n in Task._fields)) == task]
@@ -72,7 +80,7 @@ def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_gro
 
 
 def test_a_row_group_is_cut_where_it_gets_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(rollout_files, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
+    monkeypatch.setattr(rollouts, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
     writer = PartWriter(tmp_path)
     for number in range(7):
         place = writer.add(key(number), made_up(5))
@@ -106,7 +114,7 @@ def under_way(folder, results, *, resume):
         scores = {"cls": 1.0, "thresholds": "nuplan", "metric_version": "1"}
         metrics = [{"metric": "m", "thresholds": "nuplan", "metric_version": "1"}]
         writer.add(
-            TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode_batches([rows]))
+            TaskResult(task, "ok", scores=scores, metrics=metrics, rollout=encode_rows(rows))
         )
     return writer
 

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
+import shiftsim
 from shiftsim.errors import ConfigError
 from shiftsim.runs.config import make_config
-from shiftsim.runs.execute import execute, prepare
-from shiftsim.runs.merge import merge_runs
+from shiftsim.runs.derive import merge_runs
+from shiftsim.runs.execute import execute
+from shiftsim.runs.prepare import prepare
 
 sys.path.append(str(Path(__file__).parent))
 
@@ -60,7 +62,7 @@ def test_merged_shards_are_the_run_itself(whole, shards, tmp_path):
 def test_a_merged_run_may_be_resumed_and_repeated(shards, toy, tmp_path):
     merged = merge_runs(shards[:2], out=str(tmp_path / "merged"), allow_partial=True)
     assert merged.manifest["counts"]["missing"] > 0
-    assert "partial" in merged.table(allow_partial=True)
+    assert "partial" in shiftsim.open_run(merged.path).table(allow_partial=True)
     finished = execute(prepare(settings(toy, merged.path, resume=True)))
     assert finished.is_complete
 

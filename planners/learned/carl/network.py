@@ -1,4 +1,4 @@
-"""The network of CaRL (planner-carl.md §3), with the names and shapes of its checkpoint."""
+"""The network of CaRL, with the names and shapes of its checkpoint."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -12,14 +12,14 @@ from shiftsim.planners.learned.deterministic import State
 from shiftsim.planners.learned.network.rows import Convolution, Linear
 
 PREFIXES = ("",)  # of the names in the published checkpoint
-CHANNELS, SIZE = 9, 256  # of the picture
+CHANNELS, SIZE = 9, 256  # of the raster
 MEASUREMENTS, VALUE_MEASUREMENTS, ACTIONS = 10, 4, 2
 FEATURES, HIDDEN = 256, 512
 CONVOLUTIONS = (  # channels out, kernel, stride
     *((8, 5, 2), (16, 5, 2), (24, 5, 2), (32, 5, 2)),
     *((64, 3, 2), (128, 3, 1), (256, 3, 1)),
 )
-_SMALL = 6  # pixels wide: convolutions that a library does in another way for one picture
+_SMALL = 6  # pixels wide: convolutions that a library does in another way for one raster
 FLAT = 1024  # numbers that the convolutions leave
 RELEASED = {
     "image_encoder": "roach_ln2",
@@ -75,10 +75,9 @@ class Policy(NamedTuple):
 
 
 class FeaturesExtractor(nn.Module):
-    """The picture and the measurements to one vector."""
+    """The raster and the measurements to one vector."""
 
     def __init__(self) -> None:
-        """Make it with the published sizes."""
         super().__init__()
         layers: list[nn.Module] = []
         channels, size = CHANNELS, SIZE
@@ -122,7 +121,6 @@ class CarlNetwork(nn.Module):
     """Policy and critic."""
 
     def __init__(self) -> None:
-        """Make it with the published sizes."""
         super().__init__()
         inner: dict[str, list[float]] = {}
         for name, value in _CONSTANTS.items():

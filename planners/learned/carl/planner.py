@@ -1,11 +1,11 @@
-"""CaRL: a policy trained by reinforcement learning on a picture of the surroundings.
+"""CaRL: a policy trained by reinforcement learning on a raster of the surroundings.
 
-It answers with a command for the motion model, not with a trajectory (planner-carl.md). Several
-checkpoints make an ensemble, which does the mean of what they would do.
+It answers with a command for the motion model, not with a trajectory. Several checkpoints
+make an ensemble, which does the mean of what they would do.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,26 +14,28 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.carl.raster import Picture
-from shiftsim.planners.learned.carl.roads import Roads, make_roads
+from shiftsim.planners.learned.carl.raster import Raster
+from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.carl.view import (
     CHANNELS,
-    LIGHT_VALUES,
+    EGO,
     SIZE,
     Boxes,
-    Room,
-    draw_ego,
+    Scratch,
+    draw_box,
     draw_objects,
     draw_roads,
     find_areas,
-    make_room,
+    make_scratch,
     picture_frame,
 )
-from shiftsim.planners.learned.checkpoint import load_weights, split_ensemble
-from shiftsim.planners.learned.features import PerMap
-from shiftsim.planners.route_correction import correct_route, find_start
+from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
+from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.features import PerMap, route_blocks
+from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.map import VectorMap
 from shiftsim.world.state import (
     AX,
     STEERING,
@@ -41,7 +43,6 @@ from shiftsim.world.state import (
     YAW_ACCEL,
     Command,
     LightStatus,
-    TrafficLights,
     center_accelerations,
     center_poses,
     center_velocities,
@@ -65,7 +66,7 @@ class CarlFeatures(NamedTuple):
             steering angle [rad] and rate [rad/s], yaw rate [rad/s] and acceleration [rad/s^2].
     """
 
-    pictures: Picture
+    pictures: Raster
     measurements: NDArray[np.float32]
 
 
@@ -74,7 +75,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 
     name = "carl"
 
-    def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
+    def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the networks.
 
         Args:
@@ -84,32 +85,26 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         Raises:
             CheckpointError: A checkpoint is missing, damaged or of another network.
         """
-        from shiftsim.planners.learned.carl.network import build_network
-
-        self.networks: list[Any] = []
-        for part in split_ensemble(checkpoint):
-            weights = load_weights(part, self.name, device=device)
-            network = build_network(weights.args)
-            network.load_state_dict(weights.state, assign=True)
-            self.networks.append(network.eval())
+        parts = split_ensemble(checkpoint, self.name)
+        self.networks = [load_network(part, self.name, device=device) for part in parts]
+        self.device = resolve_device(device)
         self._maps = PerMap(_lay_out)
         self._scene: SceneInfo | None = None
 
     def reset(self, scene: SceneInfo) -> None:
         """Lay out the map and forget the last action; the route is corrected at the first step."""
         self._scene = scene
-        self._roads, self._room = self._maps(scene.map)
+        self._roads, self._scratch = self._maps(scene.map)
         self._on_route: BoolArray | None = None
         self._pictures = np.zeros((len(CHANNELS), SIZE, SIZE), np.uint8)
         self._last_action = np.zeros(2, np.float32)
-        self._light_names: tuple[str, ...] = ()
-        self._light_edges = self._unknown_lights = np.zeros(0, np.int64)
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
         self._route_flaw = self._blindness = self.degraded = ""
         self.route: list[int] = []
         self.found: IntArray = np.zeros(0, np.int64)
 
     def features(self, observation: Observation) -> CarlFeatures:
-        """Draw the picture and measure the ego; the arrays are reused at the next step."""
+        """Draw the raster and measure the ego; the arrays are reused at the next step."""
         scene = self._scene
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
@@ -118,16 +113,16 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         velocity = center_velocities(ego, scene.vehicle)
         if self._on_route is None:
             self._start(scene, ego, center)
-        roads, room, frame = self._roads, self._room, picture_frame(center)
+        roads, scratch, frame = self._roads, self._scratch, picture_frame(center)
         self.found = find_areas(roads, frame)
-        lights = self._read_lights(scene.map, observation.lights)
-        self._blindness = self._why_blind(scene.map)
+        status = self._lights.at(observation.lights)
+        self._blindness = self._why_blind(scene.map, status)
         self._pictures.fill(0)
-        draw_roads(self._pictures, roads, room, frame, self.found, self._on_route, lights)
-        draw_objects(self._pictures, frame, _boxes(observation), room)
-        speed = float(np.hypot(velocity[0], velocity[1]))
-        length, width = scene.vehicle.length, scene.vehicle.width
-        draw_ego(self._pictures, frame, center, length, width, speed, room)
+        draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, status)
+        draw_objects(self._pictures, frame, _boxes(observation), scratch)
+        value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
+        box = (*center.tolist(), scene.vehicle.length, scene.vehicle.width)
+        draw_box(self._pictures[EGO], frame, *box, value, scratch)
         return CarlFeatures(
             self._pictures,
             np.concatenate(
@@ -145,8 +140,8 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         """Actions (2,) in [-1, 1]: acceleration and steering."""
         import torch
 
-        device = next(self.networks[0].parameters()).device
-        step = CPU_BATCH if device.type == "cpu" else len(features)
+        device = self.device
+        step = CPU_BATCH if device == "cpu" else len(features)
         actions: list[Action] = []
         with torch.inference_mode():
             for start in range(0, len(features), step):
@@ -163,27 +158,9 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self.degraded = self._route_flaw or self._blindness
         return command_of(output, observation.history.ego[-1])
 
-    def _read_lights(self, road: VectorMap, lights: TrafficLights) -> NDArray[np.uint8]:
-        """(E,) value of the light of every connector, 0 where there is none to draw."""
-        if lights.connector_ids is not self._light_names:
-            self._light_names = lights.connector_ids
-            index = road.edges.index
-            self._light_edges = np.array([index.get(i, NONE) for i in lights.connector_ids], int)
-        values = np.zeros(len(road.edges), np.uint8)
-        if not lights.connector_ids:
-            return values
-        status = lights.status[0]
-        lit = (self._light_edges >= road.num_lanes) & (status != LightStatus.ABSENT)
-        edges, status = self._light_edges[lit], status[lit]
-        # an unknown status, at which the official code fails, is not drawn
-        self._unknown_lights = edges[status == LightStatus.UNKNOWN]
-        values[edges] = LIGHT_VALUES[status]
-        return values
-
     def _start(self, scene: SceneInfo, ego: FloatArray, center: FloatArray) -> None:
         """Correct the route, once per scenario."""
-        road = scene.map
-        known = [road.blocks.index[b] for b in dict.fromkeys(scene.route) if b in road.blocks.index]
+        road, known = scene.map, route_blocks(scene)
         if not known:
             self._route_flaw = "the map has no block of the route"
         elif len(known) < len(set(scene.route)):
@@ -197,18 +174,20 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self._on_route = np.zeros(len(road.blocks), np.bool_)
         self._on_route[self.route] = True
 
-    def _why_blind(self, road: VectorMap) -> str:
-        """Why the official code would have failed at the picture; empty where it would not."""
+    def _why_blind(self, road: VectorMap, status: IntArray) -> str:
+        """Why the official code would have failed at the raster; empty where it would not."""
         if not len(self.found):
-            return "no road within the picture"
-        unknown = self._unknown_lights
+            return "no road within the raster"
+        # nuPlan rule 360: the official code fails at an unknown status; here it is not drawn
+        listed = self._lights.edges
+        unknown = listed[(status[listed] == LightStatus.UNKNOWN) & (listed >= road.num_lanes)]
         if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
-            return "a light in the picture has an unknown status"
+            return "a light in the raster has an unknown status"
         return ""
 
 
 def command_of(action: Action, ego: FloatArray) -> Command:
-    """What an action asks of the motion model (planner-carl.md §4).
+    """What an action asks of the motion model.
 
     Args:
         action: (2,) acceleration and steering, in [-1, 1].
@@ -218,14 +197,14 @@ def command_of(action: Action, ego: FloatArray) -> Command:
     steering_rate = (steering * MAX_STEERING - float(ego[STEERING])) / DT
     acceleration = throttle * (MAX_ACCELERATION if throttle >= 0.0 else MAX_BRAKING)
     if float(ego[VX]) + DT * acceleration < 0.0:
-        # comes to a stop, rather than that it drives backwards
+        # nuPlan rule 361: it comes to a stop, rather than that it drives backwards
         acceleration = -float(ego[VX]) - REVERSE_GAIN * float(ego[AX])
     return Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
 
 
-def _lay_out(road: VectorMap) -> tuple[Roads, Room]:
+def _lay_out(road: VectorMap) -> tuple[Roads, Scratch]:
     roads = make_roads(road)
-    return roads, make_room(roads)
+    return roads, make_scratch(roads)
 
 
 def _boxes(observation: Observation) -> Boxes:

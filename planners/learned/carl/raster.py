@@ -1,13 +1,14 @@
-"""Lines and areas on a pixel grid, with the pixels that OpenCV sets (planner-carl.md §2.1).
+"""Lines and areas on a pixel grid, with the pixels that OpenCV sets.
 
-Vertices are whole pixels; x is the column, y the row. Three rules make the picture:
+Vertices are whole pixels; x is the column, y the row. Three rules (nuPlan rule 362) make
+the raster:
 
 * A line is Bresenham's, 8-connected, walked from the left end to the right one. One that leaves the
   picture is cut at its borders first, and the cut ends are rounded towards the first one.
 * An area is its outline, and in every row the pixels between the first and the second crossing of
   the outline, between the third and the fourth, and so on. An edge crosses the rows from its upper
   end on, its lower end not counted, at columns with 16 fractional bits, to the nearest pixel.
-* An edge of a general area that leaves the picture goes through its cut ends, and its columns are
+* An edge of a general area that leaves the raster goes through its cut ends, and its columns are
   rounded down. Edges of a box are not cut.
 """
 
@@ -20,20 +21,13 @@ from shiftsim.arrays import IntArray, kernel
 
 _ONE, _HALF = 1 << 16, 1 << 15  # a pixel, and half of one, in fixed point
 
-Picture = NDArray[np.uint8]
+Raster = NDArray[np.uint8]
 
 
 @kernel
-def draw_polyline(picture: Picture, xy: IntArray, value: int) -> None:
-    """Draw an open line through pixels (K, 2), of which there must be two at least."""
-    for index in range(1, len(xy)):
-        draw_line(picture, xy[index - 1, 0], xy[index - 1, 1], xy[index, 0], xy[index, 1], value)
-
-
-@kernel
-def draw_line(picture: Picture, x0: int, y0: int, x1: int, y1: int, value: int) -> None:
+def draw_line(raster: Raster, x0: int, y0: int, x1: int, y1: int, value: int) -> None:
     """Draw a line between two pixels, both included."""
-    height, width = picture.shape
+    height, width = raster.shape
     if not (_within(x0, y0, width, height) and _within(x1, y1, width, height)):
         visible, x0, y0, x1, y1 = _cut(x0, y0, x1, y1, width, height)
         if not visible:
@@ -45,7 +39,7 @@ def draw_line(picture: Picture, x0: int, y0: int, x1: int, y1: int, value: int) 
     long, short = (rise, run) if steep else (run, rise)
     error = long - 2 * short
     x, y = x0, y0
-    picture[y, x] = value
+    raster[y, x] = value
     for _ in range(long):
         aside = error < 0
         error += 2 * (long - short) if aside else -2 * short
@@ -56,7 +50,7 @@ def draw_line(picture: Picture, x0: int, y0: int, x1: int, y1: int, value: int) 
             x += 1
             if aside:
                 y += down
-        picture[y, x] = value
+        raster[y, x] = value
 
 
 @kernel
@@ -66,7 +60,7 @@ def _within(x: int, y: int, width: int, height: int) -> bool:
 
 @kernel
 def _side(at: int, size: int) -> int:
-    """Where a coordinate is: -1 before the picture, 1 behind it, 0 in it."""
+    """Where a coordinate is: -1 before the raster, 1 behind it, 0 in it."""
     return -1 if at < 0 else (1 if at >= size else 0)
 
 
@@ -114,7 +108,7 @@ def _quotient(dividend: int, divisor: int) -> int:
 
 
 class Crossings(NamedTuple):
-    """Room for the columns at which an outline crosses the rows.
+    """Scratch for the columns at which an outline crosses the rows.
 
     Attributes:
         columns: (H, V) columns of each row; an area of up to V vertices can be filled.
@@ -126,55 +120,50 @@ class Crossings(NamedTuple):
 
 
 def make_crossings(height: int, max_vertices: int) -> Crossings:
-    """Room for pictures of a given height, and areas of so many vertices at most."""
+    """Scratch for rasters of a given height, and areas of so many vertices at most."""
     return Crossings(np.empty((height, max(max_vertices, 4)), np.int32), np.zeros(height, np.int64))
 
 
 @kernel
-def fill_area(picture: Picture, xy: IntArray, value: int, crossings: Crossings) -> None:
+def fill_area(raster: Raster, xy: IntArray, value: int, crossings: Crossings) -> None:
     """Fill the area within a ring of pixels (V, 2), by the even-odd rule."""
-    height, width = picture.shape
+    _fill(raster, xy, value, crossings, False)
+
+
+@kernel
+def fill_box(raster: Raster, xy: IntArray, value: int, crossings: Crossings) -> None:
+    """Fill a convex ring of pixels (4, 2)."""
+    _fill(raster, xy, value, crossings, True)
+
+
+@kernel
+def _fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box: bool) -> None:
+    height, width = raster.shape
     top, bottom = height, -1
     bx, by = xy[-1, 0], xy[-1, 1]
     for index in range(len(xy)):
         ax, ay = bx, by
         bx, by = xy[index, 0], xy[index, 1]
         top, bottom = min(top, by), max(bottom, by)
-        draw_line(picture, ax, ay, bx, by, value)
+        draw_line(raster, ax, ay, bx, by, value)
         if ay == by or max(ay, by) <= 0 or min(ay, by) >= height:
             continue
-        cx, cy, dx, dy = ax, ay, bx, by
-        shift = _HALF
-        if not (_within(ax, ay, width, height) and _within(bx, by, width, height)):
+        cx, cy, dx, dy, shift = ax, ay, bx, by, _HALF
+        inside = _within(ax, ay, width, height) and _within(bx, by, width, height)
+        if not (is_box or inside):
             _, cx, cy, dx, dy = _cut(ax, ay, bx, by, width, height)
             shift = 0
             if cy == dy:
                 cx, cy, dx, dy = ax, ay, bx, by
         if dy < cy:
             cx, cy, dx, dy = dx, dy, cx, cy
-        slope = _quotient((dx - cx) * _ONE, dy - cy)
+        if is_box:
+            slope = _quotient(2 * (dx - cx) * _ONE + (dy - cy), 2 * (dy - cy))
+        else:
+            slope = _quotient((dx - cx) * _ONE, dy - cy)
         first = min(ay, by)
         _cross(crossings, first, max(ay, by), cx * _ONE + shift + (first - cy) * slope, slope)
-    _fill_rows(picture, max(top, 0), min(bottom, height - 1), value, crossings)
-
-
-@kernel
-def fill_box(picture: Picture, xy: IntArray, value: int, crossings: Crossings) -> None:
-    """Fill a convex ring of pixels (4, 2)."""
-    height = picture.shape[0]
-    top, bottom = height, -1
-    bx, by = xy[-1, 0], xy[-1, 1]
-    for index in range(len(xy)):
-        ax, ay = bx, by
-        bx, by = xy[index, 0], xy[index, 1]
-        top, bottom = min(top, by), max(bottom, by)
-        draw_line(picture, ax, ay, bx, by, value)
-        if ay == by or max(ay, by) <= 0 or min(ay, by) >= height:
-            continue
-        cx, cy, dx, dy = (ax, ay, bx, by) if ay < by else (bx, by, ax, ay)
-        slope = _quotient(2 * (dx - cx) * _ONE + (dy - cy), 2 * (dy - cy))
-        _cross(crossings, cy, dy, cx * _ONE + _HALF, slope)
-    _fill_rows(picture, max(top, 0), min(bottom, height - 1), value, crossings)
+    _fill_rows(raster, max(top, 0), min(bottom, height - 1), value, crossings)
 
 
 @kernel
@@ -195,9 +184,9 @@ def _cross(crossings: Crossings, first: int, stop: int, start: int, slope: int) 
 
 
 @kernel
-def _fill_rows(picture: Picture, top: int, bottom: int, value: int, crossings: Crossings) -> None:
+def _fill_rows(raster: Raster, top: int, bottom: int, value: int, crossings: Crossings) -> None:
     """Fill the rows between the noted columns, and forget these."""
-    width = picture.shape[1]
+    width = raster.shape[1]
     for row in range(top, bottom + 1):
         count, columns = crossings.counts[row], crossings.columns[row]
         crossings.counts[row] = 0
@@ -209,4 +198,4 @@ def _fill_rows(picture: Picture, top: int, bottom: int, value: int, crossings: C
             columns[place] = column
         for index in range(0, count - 1, 2):
             for column in range(max(columns[index], 0), min(columns[index + 1] + 1, width)):
-                picture[row, column] = value
+                raster[row, column] = value

@@ -1,4 +1,4 @@
-"""The map as CaRL sees it: what of its picture depends on the map only (planner-carl.md §2.2)."""
+"""The map as CaRL sees it: what of its raster depends on the map only."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,6 +1,6 @@
-"""The picture CaRL sees: nine channels of 256 x 256 pixels around the ego (planner-carl.md §2).
+"""The raster CaRL sees: nine channels of 256 x 256 pixels around the ego.
 
-Columns grow forward and rows to the left, two pixels a metre; the origin of the picture's middle is
+Columns grow forward and rows to the left, two pixels a metre; the origin of the raster's middle is
 14 m ahead of the centre of the ego. What depends on the map only is laid out once per map, with the
 roads in the order in which nuPlan's spatial index yields them.
 """
@@ -13,13 +13,13 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.planners.learned.carl.raster import (
     Crossings,
-    Picture,
+    Raster,
     draw_line,
     fill_area,
     fill_box,
     make_crossings,
 )
-from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, Values, level
+from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
@@ -27,7 +27,7 @@ from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 SIZE = 256  # pixels along each side
 PIXELS_PER_METRE = 2.0
 HALF_SIDE = 64.0  # m
-AHEAD = 14.0  # m, the middle of the picture lies so far before the centre of the ego
+AHEAD = 14.0  # m, the middle of the raster lies so far before the centre of the ego
 CHANNELS = (
     *("drivable_area", "route", "boundaries", "traffic_lights", "stop_signs", "speed_limits"),
     *("vehicles", "pedestrians_and_static", "ego"),
@@ -35,13 +35,13 @@ CHANNELS = (
 DRIVABLE, ROUTE, BOUNDARIES, LIGHTS, _STOPS, LIMITS, VEHICLES, PEDESTRIANS, EGO = range(9)
 STANDING = 127
 MAX_WALK = 4.0  # m/s
-LIGHT_VALUES = np.array([80, 170, 255, 0], np.uint8)  # by LightStatus; 0 is not drawn
+LIGHT_VALUES = np.array([80, 170, 255, 0, 0], np.uint8)  # by LightStatus; 0 is not drawn
 
 _PEDESTRIAN = AgentKind.PEDESTRIAN
 _LAST_AGENT = LAST_AGENT_KIND
 
 
-class Room(NamedTuple):
+class Scratch(NamedTuple):
     """Scratch of `draw_roads`, as large as the map needs.
 
     Attributes:
@@ -73,12 +73,12 @@ class Boxes(NamedTuple):
     kinds: IntArray
 
 
-def make_room(roads: Roads) -> Room:
+def make_scratch(roads: Roads) -> Scratch:
     """Scratch for a map."""
     shells = roads.areas.poly_ptr[:-1]
     sizes = roads.areas.ring_ptr[shells + 1] - roads.areas.ring_ptr[shells]
     longest = max(4, *sizes.tolist())
-    return Room(
+    return Scratch(
         np.empty((longest, 2), np.int64),
         make_crossings(SIZE, longest),
         np.zeros(len(roads.areas.bounds), np.bool_),
@@ -88,7 +88,7 @@ def make_room(roads: Roads) -> Room:
 
 @kernel
 def picture_frame(center: FloatArray) -> FloatArray:
-    """(4,) x [m], y [m], cosine and sine of the heading of the picture's middle.
+    """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle.
 
     Args:
         center: (3,) centre of the ego x [m], y [m], heading [rad].
@@ -99,7 +99,7 @@ def picture_frame(center: FloatArray) -> FloatArray:
 
 @kernel
 def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
-    """Areas that touch the picture, in the order of the spatial index."""
+    """Areas that touch the raster, in the order of the spatial index."""
     corners = np.empty((4, 2))
     for corner in range(4):
         ahead = HALF_SIDE if corner == 0 or corner == 3 else -HALF_SIDE
@@ -125,7 +125,7 @@ def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
 
 @kernel
 def in_picture(frame: FloatArray, x: float, y: float) -> bool:
-    """Whether a point lies strictly within the picture."""
+    """Whether a point lies strictly within the raster."""
     dx, dy = x - frame[0], y - frame[1]
     ahead, left = frame[2] * dx + frame[3] * dy, frame[2] * dy - frame[3] * dx
     return abs(ahead) < HALF_SIDE and abs(left) < HALF_SIDE
@@ -142,49 +142,50 @@ def _to_pixel(frame: FloatArray, x: float, y: float) -> tuple[int, int]:
 
 @kernel
 def draw_roads(
-    pictures: Picture,
+    rasters: Raster,
     roads: Roads,
-    room: Room,
+    scratch: Scratch,
     frame: FloatArray,
     found: IntArray,
     on_route: BoolArray,
-    lights: Values,
+    lights: IntArray,
 ) -> None:
     """Draw what the map has, and the lights.
 
     Args:
-        pictures: (9, 256, 256) of zeros.
+        rasters: (9, 256, 256) of zeros.
         roads: The map.
-        room: Scratch of the map.
-        frame: (4,) of the picture.
+        scratch: Scratch for the map.
+        frame: (4,) of the raster.
         found: Areas in it.
         on_route: (B,) blocks of the route.
-        lights: (E,) value of the light of every connector, 0 where it has none.
+        lights: (E,) LightStatus by edge, ABSENT where there is none.
     """
-    room.filled[:] = False
-    room.drawn[:] = False
+    scratch.filled[:] = False
+    scratch.drawn[:] = False
     for area in found:
         for channel in (DRIVABLE, ROUTE):
             shape = roads.drivable[area] if channel == DRIVABLE else area
             if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
                 continue
-            if channel == DRIVABLE and (shape == NONE or room.filled[shape]):
+            if channel == DRIVABLE and (shape == NONE or scratch.filled[shape]):
                 continue
             if channel == DRIVABLE:
-                room.filled[shape] = True
-            _fill_shell(pictures[channel], roads.areas, shape, frame, room)
+                scratch.filled[shape] = True
+            _fill_shell(rasters[channel], roads.areas, shape, frame, scratch)
     for connectors in (False, True):  # lanes first
         for area in found:
             if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:
                 continue
             for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
                 edge = roads.block_edges.items[entry]
-                _draw_edge(pictures, roads, room, frame, edge, lights[edge] if connectors else 0)
+                light = LIGHT_VALUES[lights[edge]] if connectors else 0
+                _draw_edge(rasters, roads, scratch, frame, edge, light)
 
 
 @kernel
 def _draw_edge(
-    pictures: Picture, roads: Roads, room: Room, frame: FloatArray, edge: int, light: int
+    rasters: Raster, roads: Roads, scratch: Scratch, frame: FloatArray, edge: int, light: int
 ) -> None:
     for slot in range(4):
         line = roads.lines_of[edge, slot]
@@ -194,28 +195,28 @@ def _draw_edge(
         elif slot == 3:
             channel, value = LIGHTS, int(light)
         elif line != NONE:
-            if room.drawn[line]:
+            if scratch.drawn[line]:
                 continue
-            room.drawn[line] = True
+            scratch.drawn[line] = True
         if line != NONE and value > 0:
-            _draw_line_of(pictures[channel], roads.lines, line, frame, value)
+            _draw_line_of(rasters[channel], roads.lines, line, frame, value)
 
 
 @kernel
 def _fill_shell(
-    picture: Picture, polygons: Polygons, poly: int, frame: FloatArray, room: Room
+    raster: Raster, polygons: Polygons, poly: int, frame: FloatArray, scratch: Scratch
 ) -> None:
     """Fill a polygon; its holes are filled, too."""
     shell = polygons.poly_ptr[poly]
     start, stop = polygons.ring_ptr[shell], polygons.ring_ptr[shell + 1]
     for vertex in range(start, stop):
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
-        room.ring[vertex - start, 0], room.ring[vertex - start, 1] = x, y
-    fill_area(picture, room.ring[: stop - start], YES, room.crossings)
+        scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
+    fill_area(raster, scratch.ring[: stop - start], YES, scratch.crossings)
 
 
 @kernel
-def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
+def _draw_line_of(raster: Raster, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
     """Draw a line, chunk by chunk."""
     first, last = lines.ptr[line], lines.ptr[line + 1] - 1
     for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
@@ -229,15 +230,15 @@ def _draw_line_of(picture: Picture, lines: Lines, line: int, frame: FloatArray, 
             x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
             if vertex > start + 1 and abs(x - px) <= 1 and abs(y - py) <= 1:
                 if 0 <= x < SIZE and 0 <= y < SIZE:  # the pixel before is drawn already
-                    picture[y, x] = value
+                    raster[y, x] = value
             else:
-                draw_line(picture, px, py, x, y, value)
+                draw_line(raster, px, py, x, y, value)
             px, py = x, y
 
 
 @kernel
-def draw_objects(pictures: Picture, frame: FloatArray, boxes: Boxes, room: Room) -> None:
-    """Draw the objects whose centre is in the picture."""
+def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scratch) -> None:
+    """Draw the objects whose centre is in the raster."""
     for is_static in (False, True):
         for index in range(len(boxes.kinds)):
             kind = boxes.kinds[index]
@@ -251,27 +252,12 @@ def draw_objects(pictures: Picture, frame: FloatArray, boxes: Boxes, room: Room)
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
             length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
-            _draw_box(pictures[channel], frame, x, y, heading, length, width, value, room)
+            draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
 
 
 @kernel
-def draw_ego(
-    pictures: Picture,
-    frame: FloatArray,
-    center: FloatArray,
-    length: float,
-    width: float,
-    speed: float,
-    room: Room,
-) -> None:
-    """Draw the ego; `center` is (3,), `speed` that of its centre."""
-    value = level(speed, MAX_SPEED)
-    _draw_box(pictures[EGO], frame, center[0], center[1], center[2], length, width, value, room)
-
-
-@kernel
-def _draw_box(
-    picture: Picture,
+def draw_box(
+    raster: Raster,
     frame: FloatArray,
     x: float,
     y: float,
@@ -279,11 +265,12 @@ def _draw_box(
     length: float,
     width: float,
     value: int,
-    room: Room,
+    scratch: Scratch,
 ) -> None:
-    corners, pixels = np.empty((4, 2)), room.ring[:4]
+    """Draw a box."""
+    corners, pixels = np.empty((4, 2)), scratch.ring[:4]
     box_corners(x, y, heading, length, width, corners)
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
-    fill_box(picture, pixels, value, room.crossings)
+    fill_box(raster, pixels, value, scratch.crossings)

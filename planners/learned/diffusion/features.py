@@ -1,4 +1,4 @@
-"""What the Diffusion Planner's network reads (planner-diffusion.md §2).
+"""What the Diffusion Planner's network reads.
 
 The frame is that of the present rear axle. Lanes are resampled once per map; a step only picks the
 nearest ones and turns them.
@@ -15,6 +15,8 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.diffusion.kernels import (
     AGENT_COLUMNS,
     AGENTS,
+    BICYCLE,
+    CONE,
     GREEN,
     LANE_COLUMNS,
     OBJECT_COLUMNS,
@@ -23,9 +25,8 @@ from shiftsim.planners.learned.diffusion.kernels import (
     RED,
     SAMPLES,
     UNKNOWN,
+    VEHICLE,
     LaneLines,
-    choose_agents,
-    choose_objects,
     fill_agents,
     fill_lanes,
     fill_objects,
@@ -34,15 +35,21 @@ from shiftsim.planners.learned.diffusion.kernels import (
     nearest_lanes,
     resample_lanes,
 )
-from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.planners.learned.features import route_blocks
+from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import LightStatus, Tracks, TrafficLights
+from shiftsim.world.state import Tracks
 
 RADIUS = 100.0  # m, half side of the square from which lanes are taken
 LANES, ROUTE_LANES = 70, 25
+SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
 START_SQUARE = 1.0  # m, half side of the square that is searched for the start of the route
+
+# one-hot position of each LightStatus; nuPlan rule 332: yellow counts as unknown
+_LIGHT_COLUMN = np.array([GREEN, UNKNOWN, RED, UNKNOWN])
 
 Single = NDArray[np.float32]
 
@@ -82,7 +89,8 @@ class Features:
 
     @property
     def ego_current_state(self) -> Single:
-        """(10,) the ego in its own frame; nuPlan: without its motion (§2.1)."""
+        """(10,) the ego in its own frame."""
+        # nuPlan rule 331: without its motion
         out = np.zeros(10, np.float32)
         out[2] = 1.0
         return out
@@ -100,25 +108,20 @@ class FeatureBuilder:
     def __init__(self, scene: SceneInfo, lanes: LaneLines) -> None:
         """Prepare for a scenario on a map whose lanes are given."""
         self._road, self._lanes = scene.map, lanes
-        blocks = [
-            scene.map.blocks.index[name]
-            for name in dict.fromkeys(scene.route)
-            if name in scene.map.blocks.index
-        ]
+        blocks = route_blocks(scene)
         self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None
-        self._light_names: tuple[str, ...] = ()
-        self._light_edges = np.zeros(0, np.int64)
+        self._lights = LightLookup(scene.map)
 
     def __call__(self, seen: Observation, noise: Single) -> Features:
         """Features of an observation and the start noise that goes with them."""
         anchor = np.array(seen.history.ego[-1, :3])
-        lights = self._lights(seen.lights)
         road = self._road
         edges = lanes_around(road, self._lanes.bounds, anchor)
         route = self._corrector.at(anchor) if self._corrector else None
         on_route = lanes_on_route(self._lanes.blocks[edges], route or ())
         agents, objects, chosen = agent_features(seen.history.tracks, anchor)
-        rows, limits, known = lane_features(self._lanes, edges, lights[edges], anchor, LANES)
+        lights = _LIGHT_COLUMN[self._lights.at(seen.lights)[edges]]
+        rows, limits, known = lane_features(self._lanes, edges, lights, anchor, LANES)
         return Features(
             neighbor_agents_past=agents,
             static_objects=objects,
@@ -133,18 +136,6 @@ class FeatureBuilder:
             agents=chosen,
             route=route,
         )
-
-    def _lights(self, lights: TrafficLights) -> IntArray:
-        """(E,) one-hot position of every edge's light; nuPlan: yellow counts as unknown (§2.5)."""
-        if lights.connector_ids is not self._light_names:
-            index = self._road.edges.index
-            edges = [index.get(name, -1) for name in lights.connector_ids]
-            self._light_names, self._light_edges = lights.connector_ids, np.array(edges, np.int64)
-        out = np.full(len(self._road.edges), UNKNOWN)
-        status, known = lights.status[0], self._light_edges >= 0
-        for code, position in ((LightStatus.GREEN, GREEN), (LightStatus.RED, RED)):
-            out[self._light_edges[known & (status == code)]] = position
-        return out
 
 
 def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> IntArray:
@@ -162,12 +153,13 @@ def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> Int
 
 
 def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
-    """Positions of the chosen lanes that are on the route, in the order of the lanes (§2.6).
+    """Positions of the chosen lanes that are on the route, in the order of the lanes.
 
     Args:
         blocks: Block of each chosen lane.
-        route: Blocks in order; of it counts one stretch without a gap, the first.
+        route: Blocks in order.
     """
+    # nuPlan rule 333: of the route counts one stretch without a gap, the first
     seen = set(blocks.tolist())
     stretch: set[int] = set()
     for block in route:
@@ -199,12 +191,39 @@ def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, 
     kinds, valid = _plain(tracks.kinds), _plain(tracks.valid)
     poses, sizes = _plain(tracks.poses), _plain(tracks.sizes)
     present, now = valid[-1], poses[-1]
-    chosen = choose_agents(present, now, kinds, anchor)
+    chosen = _choose_agents(present, now, kinds, anchor)
     velocities = _plain(tracks.velocities)
     fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
-    static = choose_objects(present, now, kinds, anchor)
+    static = _by_distance(present & (kinds >= CONE), now, anchor)[:OBJECTS]
     fill_objects(static, now, sizes[-1], kinds, anchor, objects)
     return agents, objects, chosen
+
+
+def _choose_agents(
+    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
+) -> Any:
+    """Tracks that the network sees, nearest first.
+
+    Args:
+        present: (N,) whether each track is there now.
+        poses: (N, 3) their present poses.
+        kinds: (N,) their kinds.
+        anchor: (3,) rear axle.
+    """
+    order = _by_distance(present & (kinds <= BICYCLE), poses, anchor)
+    if len(order) <= AGENTS:
+        return order
+    slow = kinds[order] != VEHICLE
+    # nuPlan rule 336: of a crowd, few pedestrians and bicycles are kept
+    allowed = max(SLOW_AGENTS, AGENTS - int(np.count_nonzero(~slow)))
+    return order[~slow | (np.cumsum(slow) <= allowed)][:AGENTS]
+
+
+def _by_distance(chosen: BoolArray, poses: FloatArray, anchor: FloatArray) -> IntArray:
+    """Chosen tracks by their distance to the rear axle."""
+    tracks = np.flatnonzero(chosen)
+    dx, dy = (poses[tracks, :2] - anchor[:2]).T
+    return tracks[np.argsort(np.sqrt(dx * dx + dy * dy), kind="stable")]
 
 
 def _first_rows(array: Any, rows: IntArray) -> Any:

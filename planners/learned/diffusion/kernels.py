@@ -1,7 +1,4 @@
-"""Kernels of the Diffusion Planner's features: lanes and agents around the ego, in its frame.
-
-Section numbers are of planner-diffusion.md.
-"""
+"""Kernels of the Diffusion Planner's features: lanes and agents around the ego, in its frame."""
 
 from typing import NamedTuple
 
@@ -15,7 +12,6 @@ from shiftsim.world.layers import Polygons, Polylines, distance_to, meets_convex
 POINTS = 20  # of a lane
 AGENTS, SAMPLES, AGENT_COLUMNS = 32, 21, 11
 OBJECTS, OBJECT_COLUMNS = 5, 10
-SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
 GREEN, RED, UNKNOWN = 0, 2, 3  # one-hot positions of a light
 LANE_COLUMNS = 12
 VEHICLE, PEDESTRIAN, BICYCLE, CONE, BARRIER, SIGN, GENERIC = range(7)  # state.AgentKind
@@ -42,8 +38,8 @@ class LaneLines(NamedTuple):
 def resample_lanes(lines: Polylines, left: Polylines, right: Polylines) -> FloatArray:
     """Centre lines and boundaries at equally spaced arc lengths, as rows of `LaneLines`.
 
-    A boundary that runs the other way is turned round (§2.5, rule 5); one that is missing or of one
-    point is taken for the centre line.
+    A boundary that runs the other way is turned round; one that is missing or of one point is taken
+    for the centre line.
     """
     count = len(lines.ptr) - 1
     out = np.zeros((count, POINTS, 8))
@@ -106,8 +102,6 @@ def lanes_in_square(
 ) -> IntArray:
     """Lanes whose area, and connectors whose centre line shares a point with a square, ascending.
 
-    nuPlan: the table of lane connectors, which is queried, holds lines; areas are in another one.
-
     Args:
         areas: Of the edges.
         lines: Centre lines of the edges.
@@ -122,6 +116,7 @@ def lanes_in_square(
         box = areas.bounds[edge] if edge < num_lanes else bounds[edge]
         if box[0] > high[0] or box[2] < low[0] or box[1] > high[1] or box[3] < low[1]:
             continue
+        # nuPlan rule 334: the layer of lane connectors that is asked holds lines, not areas
         if edge < num_lanes:
             meets = meets_convex(areas, edge, square)
         else:
@@ -154,10 +149,11 @@ def _line_meets(lines: Polylines, line: int, square: FloatArray) -> bool:
 def nearest_lanes(
     near: IntArray, areas: Polygons, lines: Polylines, x: float, y: float, most: int
 ) -> IntArray:
-    """The nearest edges of a list, at most `most` (§2.5, rules 2 and 3).
+    """The nearest edges of a list, at most `most`.
 
-    Sorted by the distance to the nearest vertex of the centre line; among equals, which are common
-    where a lane and its connectors meet, by the distance to the area, then as listed.
+    Sorted by the distance to the nearest vertex of the centre line (nuPlan rule 335); among equals,
+    which are common where a lane and its connectors meet, by the distance to the area, then as
+    listed.
     """
     keys = np.empty(len(near))
     for index, edge in enumerate(near):
@@ -218,68 +214,6 @@ def fill_lanes(
 
 
 @kernel
-def choose_agents(
-    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
-) -> IntArray:
-    """Tracks that the network sees, nearest first (§2.2, rule 5).
-
-    Args:
-        present: (N,) whether each track is there now.
-        poses: (N, 3) their present poses.
-        kinds: (N,) their kinds.
-        anchor: (3,) rear axle.
-    """
-    order = _by_distance(present, poses, kinds, anchor, VEHICLE, BICYCLE)
-    if len(order) <= AGENTS:
-        return order
-    slow = 0
-    for track in order:
-        slow += kinds[track] != VEHICLE
-    allowed = max(SLOW_AGENTS, AGENTS - (len(order) - slow))
-    out = np.empty(AGENTS, np.int64)
-    count, taken = 0, 0
-    for track in order:
-        if kinds[track] != VEHICLE:
-            if taken >= allowed:
-                continue
-            taken += 1
-        if count < AGENTS:
-            out[count] = track
-            count += 1
-    return out[:count]
-
-
-@kernel
-def choose_objects(
-    present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
-) -> IntArray:
-    """Static objects that the network sees, nearest first (§2.3; arguments as above)."""
-    return _by_distance(present, poses, kinds, anchor, CONE, GENERIC)[:OBJECTS]
-
-
-@kernel
-def _by_distance(
-    present: BoolArray,
-    poses: FloatArray,
-    kinds: IntArray,
-    anchor: FloatArray,
-    first_kind: int,
-    last_kind: int,
-) -> IntArray:
-    """Present tracks of some kinds by distance to the rear axle."""
-    tracks = np.empty(len(kinds), np.int64)
-    distances = np.empty(len(kinds))
-    count = 0
-    for track in range(len(kinds)):
-        if present[track] and first_kind <= kinds[track] <= last_kind:
-            tracks[count] = track
-            dx, dy = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
-            distances[count] = np.sqrt(dx * dx + dy * dy)
-            count += 1
-    return tracks[:count][np.argsort(distances[:count], kind="mergesort")]
-
-
-@kernel
 def fill_agents(
     tracks: IntArray,
     valid: BoolArray,
@@ -292,8 +226,8 @@ def fill_agents(
 ) -> None:
     """Write histories in the ego frame.
 
-    A missing sample takes the values of the next later one; so do those before the oldest sample
-    of a short history (§2.2, rule 3).
+    A missing sample takes the values of the next later one (nuPlan rule 337); so do those before
+    the oldest sample of a short history.
 
     Args:
         tracks: Which tracks, all of them present in the last sample.

@@ -4,45 +4,88 @@ Only inference is meant: no dropout, no drop path. What the official code comput
 away is not computed here: the ego's own history, and all but the last step of an agent's.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, linear
+from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp, Scenes, linear
 
 DIM = 128
 NUM_AGENT_KINDS = 4
 HISTORY_CHANNELS = 9
+STATE_CHANNELS = 6  # of the ego state that are read
 _WIDTHS, _HEADS, _WINDOWS = (32, 64, 128), (2, 4, 8), (3, 3, 5)
 _MLP_RATIO = 3  # of the history encoder
 _LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
 
 
-class Mlp(nn.Module):
-    """Two linear layers with an exact GELU between them."""
+@dataclass(frozen=True, slots=True)
+class SceneTensors:
+    """Agents and map of B scenes: A rows of agents of which the first is the ego, M polygons.
 
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = Linear(dim, hidden)
-        self.fc2 = Linear(hidden, dim)
+    Attributes:
+        position: (B, A, 21, 2) in the ego frame [m].
+        heading: (B, A, 21) [rad].
+        velocity: (B, A, 21, 2) [m/s].
+        shape: (B, A, 21, 2) width, length [m].
+        valid: (B, A, 21)
+        category: (B, A) indices of kinds.
+        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
+        points: (B, M, K, 2) of the centre lines [m]; of PLUTO (B, M, 3, K, 2) of the boundaries,
+            too.
+        vectors: (B, M, K, 2) along the centre line, to the next point [m].
+        orientations: (B, M, K) of these vectors [rad].
+        centers: (B, M, 3) pose that stands for the polygon.
+        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
+        on_route: (B, M) 1 where the polygon is on the route.
+        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
+        has_limit: (B, M)
+        limit: (B, M) speed limit [m/s].
+        point_valid: (B, M, K)
+    """
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., D) to (..., D)."""
-        out: Tensor = self.fc2(functional.gelu(self.fc1(x)))
-        return out
+    position: Tensor
+    heading: Tensor
+    velocity: Tensor
+    shape: Tensor
+    valid: Tensor
+    category: Tensor
+    current_state: Tensor
+    points: Tensor
+    vectors: Tensor
+    orientations: Tensor
+    centers: Tensor
+    kind: Tensor
+    on_route: Tensor
+    light: Tensor
+    has_limit: Tensor
+    limit: Tensor
+    point_valid: Tensor
+
+    @property
+    def there(self) -> tuple[Tensor, Tensor]:
+        """Agents (B, A) and polygons (B, M) of which anything is known."""
+        return self.valid.any(dim=-1), self.point_valid.any(dim=-1)
+
+    @property
+    def poses(self) -> Tensor:
+        """(B, A + M, 3) of the agents now, and of the polygons."""
+        now = torch.cat([self.position[:, :, -1], self.heading[:, :, -1:]], dim=-1)
+        return torch.cat([now, self.centers], dim=1)
 
 
 class EncoderBlock(nn.Module):
     """Pre-norm transformer block."""
 
-    def __init__(self, dim: int, num_heads: int, mlp_ratio: int = 4) -> None:
+    def __init__(self, num_heads: int) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(dim)
-        self.attn = Attention(dim, num_heads)
-        self.norm2 = nn.LayerNorm(dim)
-        self.mlp = Mlp(dim, mlp_ratio * dim)
+        self.norm1 = nn.LayerNorm(DIM)
+        self.attn = Attention(DIM, num_heads)
+        self.norm2 = nn.LayerNorm(DIM)
+        self.mlp = Mlp(DIM, 4 * DIM, DIM)
 
     def forward(self, x: Tensor, scenes: Scenes, asking: Tensor | None = None) -> Tensor:
         """Tokens (T, D) of scenes after the block, or one for each of them.
@@ -98,7 +141,7 @@ class _HistoryBlock(nn.Module):
         self.norm1 = nn.LayerNorm(dim)
         self.attn = NeighborhoodAttention(dim, num_heads, window)
         self.norm2 = nn.LayerNorm(dim)
-        self.mlp = Mlp(dim, _MLP_RATIO * dim)
+        self.mlp = Mlp(dim, _MLP_RATIO * dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attn(self.norm1(x))
@@ -188,15 +231,15 @@ def _upsampled_end(end: Tensor) -> Tensor:
 class EgoStateEncoder(nn.Module):
     """One vector from the scalars of the ego state: a learned query attends to a token for each."""
 
-    def __init__(self, num_scalars: int, dim: int = DIM, num_heads: int = 4) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.linears = nn.ModuleList(Linear(1, dim) for _ in range(num_scalars))
-        self.attn = Attention(dim, num_heads)
-        self.pos_embed = nn.Parameter(torch.zeros(1, num_scalars, dim))
-        self.query = nn.Parameter(torch.zeros(1, 1, dim))
+        self.linears = nn.ModuleList(Linear(1, DIM) for _ in range(STATE_CHANNELS))
+        self.attn = Attention(DIM, 4)
+        self.pos_embed = nn.Parameter(torch.zeros(1, STATE_CHANNELS, DIM))
+        self.query = nn.Parameter(torch.zeros(1, 1, DIM))
 
     def forward(self, state: Tensor) -> Tensor:
-        """(B, scalars) to (B, D)."""
+        """(B, >= 6) to (B, 128)."""
         embedded = [layer(state[:, i, None]) for i, layer in enumerate(self.linears)]
         tokens = torch.stack(embedded, dim=1) + self.pos_embed
         query = self.query.expand(len(state), -1, -1)
@@ -207,70 +250,46 @@ class EgoStateEncoder(nn.Module):
 class AgentEncoder(nn.Module):
     """Tokens of the ego and the agents, without their poses."""
 
-    def __init__(self, num_scalars: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.history_encoder = HistoryEncoder()
-        self.ego_state_emb = EgoStateEncoder(num_scalars)
+        self.ego_state_emb = EgoStateEncoder()
         self.type_emb = nn.Embedding(NUM_AGENT_KINDS, DIM)
-        self.num_scalars = num_scalars
 
-    def forward(
-        self, steps: Tensor, known: Tensor, category: Tensor, current_state: Tensor
-    ) -> Tensor:
-        """Encode rows of agents; row 0 is the ego.
-
-        Args:
-            steps: (B, A, 20, 9) of `history_steps`.
-            known: (B, A) whether any sample of the row is valid.
-            category: (B, A) indices of kinds.
-            current_state: (B, >= scalars) ego state.
-
-        Returns:
-            (B, A, 128)
-        """
-        ego = self.ego_state_emb(current_state[:, : self.num_scalars])
-        tokens = steps.new_zeros(*known.shape, DIM)
-        others = known.clone()
-        others[:, 0] = False  # the ego's history is not used
+    def forward(self, seen: SceneTensors) -> Tensor:
+        """(B, A, 128)."""
+        steps, (others, _) = _history_steps(seen), seen.there
+        others[:, 0] = False  # nuPlan rule 306: the ego's history is not used
+        tokens = steps.new_zeros(*others.shape, DIM)
         if others.any():
             tokens[others] = self.history_encoder(steps[others])
-        tokens[:, 0] = ego
-        out: Tensor = tokens + self.type_emb(category)
+        tokens[:, 0] = self.ego_state_emb(seen.current_state)
+        out: Tensor = tokens + self.type_emb(seen.category)
         return out
 
 
-def history_steps(
-    position: Tensor, heading: Tensor, velocity: Tensor, shape: Tensor, valid: Tensor
-) -> Tensor:
-    """(B, A, H - 1, 9) what changed in each step, from H samples per agent.
-
-    Changes count only between valid samples; the shape does not ask (planner-plantf.md §3.2).
-
-    Args:
-        position: (B, A, H, 2)
-        heading: (B, A, H)
-        velocity: (B, A, H, 2)
-        shape: (B, A, H, 2)
-        valid: (B, A, H)
-    """
-    both = valid[..., 1:] & valid[..., :-1]
-    moved = position.diff(dim=2).masked_fill(~both[..., None], 0.0)
-    faster = velocity.diff(dim=2).masked_fill(~both[..., None], 0.0)
-    turned = heading.diff(dim=2).masked_fill(~both, 0.0)
-    parts = [moved, faster, torch.stack([turned.cos(), turned.sin()], -1), shape[:, :, 1:]]
-    return torch.cat([*parts, both[..., None].to(position.dtype)], dim=-1)
+def _history_steps(seen: SceneTensors) -> Tensor:
+    """(B, A, 20, 9) what changed in each step of an agent's history."""
+    both = seen.valid[..., 1:] & seen.valid[..., :-1]
+    moved = seen.position.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    faster = seen.velocity.diff(dim=2).masked_fill(~both[..., None], 0.0)
+    turned = seen.heading.diff(dim=2).masked_fill(~both, 0.0)
+    directions = torch.stack([turned.cos(), turned.sin()], -1)
+    # nuPlan rule 304: changes count only between valid samples, but the shape counts always
+    parts = [moved, faster, directions, seen.shape[:, :, 1:]]
+    return torch.cat([*parts, both[..., None].to(moved.dtype)], dim=-1)
 
 
 class PointsEncoder(nn.Module):
     """One vector per polyline from its valid points; rows of invalid points count as zeros."""
 
-    def __init__(self, channels: int, out: int = DIM) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         self.first_mlp = _points_mlp(channels, 128, 256)
-        self.second_mlp = _points_mlp(512, 256, out)
+        self.second_mlp = _points_mlp(512, 256, DIM)
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
-        """(B, M, K, channels) with `keep` (B, M, K) to (B, M, out)."""
+        """(B, M, K, channels) with `keep` (B, M, K) to (B, M, 128)."""
         lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
         size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
         first, second = _folded(self.first_mlp), _folded(self.second_mlp)
@@ -336,7 +355,7 @@ class MapEncoder(nn.Module):
         self.traffic_light_emb = nn.Embedding(4, DIM)
         self.unknown_speed_emb = nn.Embedding(1, DIM)
 
-    def forward(self, points: Tensor, seen: Any) -> Tensor:
+    def forward(self, points: Tensor, seen: SceneTensors) -> Tensor:
         """(B, M, 128).
 
         Args:
@@ -356,7 +375,7 @@ class MapEncoder(nn.Module):
         return out
 
 
-def along_line(middle: Tensor, seen: Any) -> list[Tensor]:
+def along_line(middle: Tensor, seen: SceneTensors) -> list[Tensor]:
     """Of each point of the centre lines (B, M, K, 2): place, vector and direction, each (…, 2)."""
     angle = seen.orientations
     directions = torch.stack([angle.cos(), angle.sin()], dim=-1)

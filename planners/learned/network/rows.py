@@ -5,6 +5,7 @@ product in one way; the ways for one to three rows, or a single column, are not 
 Scenes of different sizes lie one after another, without any padding between them.
 """
 
+import math
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 ROWS, COLUMNS = 4, 2  # from which on a product is computed in the way of large ones
+_CUBIC, _TWICE = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the GELU by tanh
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -39,6 +41,69 @@ class Linear(nn.Linear):
     def forward(self, input: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
         return linear(input, self.weight, self.bias)
+
+
+class Mlp(nn.Module):
+    """Linear, GELU, Linear over the last dimension.
+
+    The activation overwrites what it reads, so that no second tensor of that size passes through
+    the cache.
+    """
+
+    def __init__(
+        self, inputs: int, hidden: int, outputs: int, *, approximate: str = "none"
+    ) -> None:
+        """Take the channels in, between and out; the GELU is by error function, or by `tanh`."""
+        super().__init__()
+        self.fc1 = Linear(inputs, hidden)
+        self.fc2 = Linear(hidden, outputs)
+        self.approximate = approximate
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., outputs)."""
+        out: Tensor = self.fc2(self.hidden(x))
+        return out
+
+    def hidden(self, x: Tensor) -> Tensor:
+        """(..., hidden) what the second layer reads."""
+        return self._activated(self.fc1(x))
+
+    def over_rows(self, x: Tensor) -> Tensor:
+        """The same over the last but one dimension: (..., inputs, C) to (..., outputs, C)."""
+        return _over_rows(self.fc2, self._activated(_over_rows(self.fc1, x)))
+
+    def add_to(self, x: Tensor, read: Tensor) -> None:
+        """Add `forward(read)` to x (..., outputs)."""
+        hidden = self.hidden(read).flatten(0, -2)
+        x += self.fc2.bias
+        x.view(-1, x.shape[-1]).addmm_(hidden, self.fc2.weight.t())
+
+    def add_over_rows_to(self, x: Tensor, read: Tensor) -> None:
+        """Add `over_rows(read)` to x (..., outputs, C)."""
+        hidden = self._activated(_over_rows(self.fc1, read))
+        x += self.fc2.bias[:, None]
+        x.baddbmm_(self.fc2.weight.expand(len(x), -1, -1), hidden)
+
+    def _activated(self, x: Tensor) -> Tensor:
+        return tanh_gelu_(x) if self.approximate == "tanh" else gelu_(x)
+
+
+def tanh_gelu_(x: Tensor) -> Tensor:
+    """The GELU by tanh, in place: `1 + tanh(z)` is `2 sigmoid(2 z)`, which is computed faster."""
+    twice = torch.addcmul(x, x * x, x, value=_CUBIC).mul_(_TWICE)
+    return x.mul_(twice.sigmoid_())
+
+
+def gelu_(x: Tensor) -> Tensor:
+    """The GELU by the error function, in place."""
+    out: Tensor = torch.ops.aten.gelu_(x)
+    return out
+
+
+def _over_rows(layer: Linear, x: Tensor) -> Tensor:
+    """A linear layer over the last but one dimension of (B, inputs, C), without transposing."""
+    weight = layer.weight.expand(len(x), -1, -1)
+    return torch.baddbmm(layer.bias[:, None], weight, x)
 
 
 class Convolution(nn.Conv2d):
@@ -147,11 +212,9 @@ class Attention(nn.Module):
         if query is key and key is value:
             q, k, v = linear(query, weights, biases).chunk(3, dim=-1)
             return q, k, v
-        dim = self.out_proj.in_features
         if key is value:
-            q = linear(query, weights[:dim], biases[:dim])
-            k, v = linear(key, weights[dim:], biases[dim:]).chunk(2, dim=-1)
-            return q, k, v
+            dim = self.out_proj.in_features
+            return linear(query, weights[:dim], biases[:dim]), *self.keys_values(key)
         q, k, v = (
             linear(x, weight, bias)
             for x, weight, bias in zip(
@@ -160,12 +223,19 @@ class Attention(nn.Module):
         )
         return q, k, v
 
+    def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
+        """Projected keys and values of a context, each (..., D)."""
+        dim = self.out_proj.in_features
+        k, v = linear(context, self.in_proj_weight[dim:], self.in_proj_bias[dim:]).chunk(2, dim=-1)
+        return k, v
+
     def mixed(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, Q, D) values (B, N, D), weighted as queries and keys say; `mask` adds to logits."""
         out = functional.scaled_dot_product_attention(
-            self._heads(q), self._heads(k), self._heads(v), attn_mask=mask
+            self.heads(q), self.heads(k), self.heads(v), attn_mask=mask
         )
         return out.transpose(1, 2).flatten(2)
 
-    def _heads(self, x: Tensor) -> Tensor:
+    def heads(self, x: Tensor) -> Tensor:
+        """(..., heads, N, width) of projections (..., N, D)."""
         return x.reshape(*x.shape[:-1], self.num_heads, self.width).transpose(1, 2)

@@ -1,11 +1,9 @@
-"""PLUTO's emergency brake: follow the best candidate, but stop (planner-pluto.md §6)."""
+"""PLUTO's emergency brake: follow the best proposal, but stop."""
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, kernel
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.planners.pdm.parameters import DT
-from shiftsim.planners.proposals.tracker import fit_speed
+from shiftsim.planners.proposals.tracker import DT, Profiles, fit_profiles, look_ahead
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.dynamics.lqr import (
     NUPLAN,
@@ -13,10 +11,9 @@ from shiftsim.sim.dynamics.lqr import (
     LqrParameters,
     Reference,
     command,
-    fit_curvature,
     is_stopping,
 )
-from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
+from shiftsim.world.state import NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters
 
 MAX_SPEED = 8.0  # m/s, a faster ego does not brake
 GENTLE, HARD = 2.4, 4.05  # m/s^2, that decide whether and how to brake
@@ -31,47 +28,38 @@ def must_brake(speed: float, fault_time: float) -> bool:
 
 
 def brake(
-    candidate: FloatArray, ego: FloatArray, fault_time: float, vehicle: VehicleParameters
+    proposal: FloatArray, ego: FloatArray, fault_time: float, vehicle: VehicleParameters
 ) -> FloatArray:
     """(81, 11) states, 0.1 s apart.
 
     Args:
-        candidate: (81, 3) poses to steer along.
+        proposal: (81, 3) poses to steer along.
         ego: (11,) ego state.
         fault_time: Of the infraction [s].
         vehicle: Dimensions of the ego.
     """
-    out = np.empty((len(candidate), NUM_STATE))
+    out = np.empty((len(proposal), NUM_STATE))
+    out[0] = ego
     soft = fault_time > float(np.hypot(ego[VX], ego[VY])) / HARD + REACTION
     tracker = NUPLAN._replace(wheel_base=vehicle.wheel_base)
-    _roll_out(np.ascontiguousarray(candidate), ego, soft, tracker, DT, out)
-    out[:, STEERING_RATE:] = 0.0  # nuPlan: the plan is made without the rates of steering and yaw
+    _roll_out(np.ascontiguousarray(proposal), soft, tracker, DT, out)
+    # nuPlan rule 240: the plan is made without the rates of steering and yaw
+    out[:, STEERING_RATE:] = 0.0
     return out
 
 
 @kernel
 def _roll_out(
-    poses: FloatArray,
-    ego: FloatArray,
-    soft: bool,
-    params: LqrParameters,
-    dt: float,
-    states: FloatArray,
+    poses: FloatArray, soft: bool, params: LqrParameters, dt: float, states: FloatArray
 ) -> None:
-    """Drive along poses (81, 3) to a standstill, into `states` (81, 11)."""
-    last = len(poses) - 2
-    speeds, curvatures = np.empty(last + 1), np.empty(last + 1)
-    ahead = np.empty(params.horizon)
-    fit_speed(poses, dt, params.jerk_penalty, speeds)
-    fit_curvature(poses, speeds, dt, params.curvature_rate_penalty, curvatures)
-    states[0] = ego
-    for step in range(last + 1):
-        state, pose = states[step], poses[step]
-        for index in range(params.horizon):
-            ahead[index] = curvatures[min(step + index, last)]
-        lateral = (state[Y] - pose[1]) * np.cos(pose[2]) - (state[X] - pose[0]) * np.sin(pose[2])
-        turn = wrap_angle(state[HEADING] - pose[2])
-        reference = Reference(TRACKED, lateral, turn, 0.0, ahead)
+    """Drive along poses (81, 3) to a standstill; `states` (81, 11) starts with the ego's."""
+    count = len(poses) - 1
+    profiles = Profiles(np.empty(count), np.empty(count), np.empty(params.horizon))
+    fit_profiles(poses, dt, params, profiles)
+    for step in range(count):
+        state = states[step]
+        lateral, turn = look_ahead(state, poses[step], step, profiles)
+        reference = Reference(TRACKED, lateral, turn, 0.0, profiles.ahead)
         accel, rate = command(state, reference, params)
         if soft or is_stopping(state[VX], 0.0, params):
             accel = max(accel, SOFT_ACCEL)

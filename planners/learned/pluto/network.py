@@ -1,6 +1,7 @@
-"""The network of PLUTO (planner-pluto.md §3), with the names and shapes of its checkpoint."""
+"""The network of PLUTO, with the names and shapes of its checkpoint."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -9,34 +10,39 @@ from torch import Tensor, nn
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network.blocks import (
     DIM,
+    STATE_CHANNELS,
     AgentEncoder,
     EncoderBlock,
     MapEncoder,
+    SceneTensors,
     along_line,
-    history_steps,
 )
 from shiftsim.planners.learned.network.rows import Linear, Scenes, without_padding
 from shiftsim.planners.learned.pluto.network_decoder import (
+    DEPTH,
+    HEADS,
+    MODES,
+    STEPS,
     FourierEmbedding,
     MlpLayer,
     PlanningDecoder,
 )
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
-STATE_CHANNELS, POLYGON_CHANNELS = 6, 10
+POLYGON_CHANNELS = 10
 RELEASED = {
     "dim": DIM,
     "state_channel": STATE_CHANNELS,
     "polygon_channel": 6,  # and the boundaries
     "history_channel": 9,
     "history_steps": 21,
-    "future_steps": 80,
-    "encoder_depth": 4,
-    "decoder_depth": 4,
+    "future_steps": STEPS,
+    "encoder_depth": DEPTH,
+    "decoder_depth": DEPTH,
     "drop_path": 0.2,  # training only
     "dropout": 0.1,  # training only
-    "num_heads": 4,
-    "num_modes": 12,
+    "num_heads": HEADS,
+    "num_modes": MODES,
     "state_dropout": 0.75,  # training only
     "use_ego_history": False,
     "state_attn_encoder": True,
@@ -71,27 +77,11 @@ DRIVE_SCALES = {
 }
 
 
-class Inputs(NamedTuple):
-    """One batch: B scenes, A rows of agents of which the first is the ego, M polygons, K points.
+@dataclass(frozen=True, slots=True)
+class Inputs(SceneTensors):
+    """One batch; S static objects and R reference lines.
 
     Attributes:
-        position: (B, A, 21, 2) in the ego frame [m].
-        heading: (B, A, 21) [rad].
-        velocity: (B, A, 21, 2) [m/s].
-        shape: (B, A, 21, 2) width, length [m].
-        valid: (B, A, 21)
-        category: (B, A) indices of kinds.
-        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
-        points: (B, M, 3, K, 2) centre line, left and right boundary [m].
-        vectors: (B, M, K, 2) along the centre line, to the next point [m].
-        orientations: (B, M, K) of these vectors [rad].
-        centers: (B, M, 3) pose that stands for the polygon.
-        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
-        on_route: (B, M) 1 where the polygon is on the route.
-        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
-        has_limit: (B, M)
-        limit: (B, M) speed limit [m/s].
-        point_valid: (B, M, K)
         object_pose: (B, S, 3) static objects x [m], y [m], heading [rad].
         object_shape: (B, S, 2) width, length [m].
         object_category: (B, S)
@@ -104,23 +94,6 @@ class Inputs(NamedTuple):
             padding; None where nothing is.
     """
 
-    position: Tensor
-    heading: Tensor
-    velocity: Tensor
-    shape: Tensor
-    valid: Tensor
-    category: Tensor
-    current_state: Tensor
-    points: Tensor
-    vectors: Tensor
-    orientations: Tensor
-    centers: Tensor
-    kind: Tensor
-    on_route: Tensor
-    light: Tensor
-    has_limit: Tensor
-    limit: Tensor
-    point_valid: Tensor
     object_pose: Tensor
     object_shape: Tensor
     object_category: Tensor
@@ -167,49 +140,35 @@ class StaticObjectsEncoder(nn.Module):
 class AgentPredictor(nn.Module):
     """Motion of the agents from their tokens."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.steps = steps
-        self.loc_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
-        self.yaw_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
-        self.vel_predictor = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.loc_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        self.yaw_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        self.vel_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(B, A, 128) to (B, A, steps, 6)."""
+        """(B, A, 128) to (B, A, 80, 6)."""
         heads = (self.loc_predictor, self.yaw_predictor, self.vel_predictor)
-        shape = (*tokens.shape[:2], self.steps, 2)
+        shape = (*tokens.shape[:2], STEPS, 2)
         return torch.cat([head(tokens).reshape(shape) for head in heads], dim=-1)
 
 
 class PlutoNetwork(nn.Module):
     """The whole network."""
 
-    def __init__(
-        self,
-        encoder_depth: int,
-        decoder_depth: int,
-        num_heads: int,
-        num_modes: int,
-        steps: int,
-        *,
-        misordered_masks: bool = False,
-    ) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.pos_emb = FourierEmbedding(3)
-        self.agent_encoder = AgentEncoder(STATE_CHANNELS)
+        self.agent_encoder = AgentEncoder()
         self.map_encoder = MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
         self.static_objects_encoder = StaticObjectsEncoder()
-        self.encoder_blocks = nn.ModuleList(
-            EncoderBlock(DIM, num_heads) for _ in range(encoder_depth)
-        )
+        self.encoder_blocks = nn.ModuleList(EncoderBlock(HEADS) for _ in range(DEPTH))
         self.norm = nn.LayerNorm(DIM)
-        self.agent_predictor = AgentPredictor(steps)
-        self.planning_decoder = PlanningDecoder(
-            decoder_depth, num_heads, num_modes, steps, misordered_masks=misordered_masks
-        )
+        self.agent_predictor = AgentPredictor()
+        self.planning_decoder = PlanningDecoder()
         # of the training only; the checkpoint holds it
         self.hidden_proj = nn.Sequential(Linear(DIM, DIM), nn.ReLU(), Linear(DIM, DIM))
-        self.ref_free_decoder = MlpLayer(DIM, 2 * DIM, 4 * steps)
+        self.ref_free_decoder = MlpLayer(DIM, 2 * DIM, 4 * STEPS)
 
     def forward(self, seen: Inputs) -> Outputs:
         """Plan for a batch."""
@@ -220,16 +179,7 @@ class PlutoNetwork(nn.Module):
         tokens[there] = x
         prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
         free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
-        trajectory, probability = self.planning_decoder(
-            seen.line_points,
-            seen.line_vectors,
-            seen.line_orientations,
-            seen.line_valid,
-            num_lines,
-            x,
-            scenes,
-            egos,
-        )
+        trajectory, probability = self.planning_decoder(seen, num_lines, x, scenes, egos)
         return Outputs(trajectory, probability, prediction, free, egos)
 
     def _encode(
@@ -239,20 +189,16 @@ class PlutoNetwork(nn.Module):
 
         Also how they lie, and which of all rows (B, A + M + S) they are: those without padding.
         """
-        known = seen.valid.any(dim=-1)
-        parts = (known, seen.point_valid.any(dim=-1), seen.object_valid)
-        there, scenes = without_padding(parts, counts)
-        steps = history_steps(seen.position, seen.heading, seen.velocity, seen.shape, seen.valid)
+        there, scenes = without_padding((*seen.there, seen.object_valid), counts)
         middle = seen.points[:, :, 0]
         sides = [seen.points[:, :, side] - middle for side in (1, 2)]
         points = torch.cat([*along_line(middle, seen), *sides], dim=-1)
         tokens = (
-            self.agent_encoder(steps, known, seen.category, seen.current_state),
+            self.agent_encoder(seen),
             self.map_encoder(points, seen),
             self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
         )
-        now = torch.cat([seen.position[:, :, -1], seen.heading[:, :, -1:]], dim=-1)
-        poses = torch.cat([now, seen.centers, seen.object_pose], dim=1)[there]
+        poses = torch.cat([seen.poses, seen.object_pose], dim=1)[there]
         angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
         where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
         x = torch.cat(tokens, dim=1)[there] + where
@@ -267,21 +213,14 @@ def _all_counts(seen: Inputs) -> list[list[int]]:
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
-    """The network, by default with the released hyper-parameters.
+    """The network, without weights; there is one architecture.
 
     Args:
-        args: Hyper-parameters that differ from `RELEASED`; widths and channels cannot. For tests
-            also `misordered_masks`, as the official code has them.
+        args: None, or for tests `misordered_masks`, as the official code has them.
     """
-    chosen = {**RELEASED, **(args or {})}
-    return PlutoNetwork(
-        int(chosen["encoder_depth"]),
-        int(chosen["decoder_depth"]),
-        int(chosen["num_heads"]),
-        int(chosen["num_modes"]),
-        int(chosen["future_steps"]),
-        misordered_masks=bool(chosen.get("misordered_masks", False)),
-    )
+    network = PlutoNetwork()
+    network.planning_decoder.misordered_masks = bool(args and args["misordered_masks"])
+    return network
 
 
 def drive_overrides(state: State) -> None:

@@ -1,7 +1,7 @@
-"""The decoder of PLUTO's network: trajectories along reference lines (planner-pluto.md §3.3)."""
+"""The decoder of PLUTO's network: trajectories along reference lines."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -9,9 +9,19 @@ from torch import Tensor, nn
 from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder
 from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, present
 
+DEPTH, HEADS, MODES, STEPS = 4, 4, 12, 80
 NUM_FREQUENCIES = 64
 LINE_CHANNELS = 6
 NEVER = -1e6  # logit of a reference line without points
+
+
+class SeenLines(Protocol):
+    """What the decoder reads of the inputs, as described there."""
+
+    line_points: Tensor
+    line_vectors: Tensor
+    line_orientations: Tensor
+    line_valid: Tensor
 
 
 class MlpLayer(nn.Module):
@@ -60,11 +70,9 @@ class FourierEmbedding(nn.Module):
 class DecoderBlock(nn.Module):
     """Attention among lines, among modes, and to the scene; then a feed-forward part."""
 
-    def __init__(self, num_heads: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.r2r_attn = Attention(DIM, num_heads)
-        self.m2m_attn = Attention(DIM, num_heads)
-        self.cross_attn = Attention(DIM, num_heads)
+        self.r2r_attn, self.m2m_attn, self.cross_attn = (Attention(DIM, HEADS) for _ in range(3))
         self.ffn = nn.Sequential(
             Linear(DIM, 4 * DIM), nn.ReLU(), nn.Identity(), Linear(4 * DIM, DIM)
         )
@@ -130,15 +138,13 @@ class Lines(NamedTuple):
     masks: list[Tensor]
 
 
-def make_lines(
-    valid: Tensor, counts: Sequence[int], modes: int, *, misordered_masks: bool
-) -> Lines:
+def make_lines(valid: Tensor, counts: Sequence[int], *, misordered_masks: bool) -> Lines:
     """From lines (B, R) that have points, of which `counts` are no padding."""
     # a scene without any line that has points attends to all of them, and nothing reads it
     attended = valid | ~valid.any(dim=1, keepdim=True)
     logits = torch.zeros(valid.shape, device=valid.device).masked_fill(~attended, -torch.inf)
-    if misordered_masks:  # by mode, where the queries are ordered by scene (planner-pluto.md §3.3)
-        logits = logits.repeat(modes, 1).reshape(len(valid), modes, -1)
+    if misordered_masks:  # nuPlan rule 307: by mode, where the queries are ordered by scene
+        logits = logits.repeat(MODES, 1).reshape(len(valid), MODES, -1)
     else:
         logits = logits[:, None]
     masks = [row[:, None, None, :count] for row, count in zip(logits, counts, strict=True)]
@@ -149,29 +155,24 @@ def make_lines(
 class PlanningDecoder(nn.Module):
     """Twelve trajectories and their logits for every reference line."""
 
-    def __init__(
-        self, depth: int, num_heads: int, num_modes: int, steps: int, *, misordered_masks: bool
-    ) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.steps, self.misordered_masks = steps, misordered_masks
+        self.misordered_masks = False
         self.r_encoder = PointsEncoder(LINE_CHANNELS)
         self.r_pos_emb = FourierEmbedding(3)
         self.q_proj = Linear(2 * DIM, DIM)
-        self.m_emb = nn.Parameter(torch.zeros(1, 1, num_modes, DIM))
-        self.m_pos = nn.Parameter(torch.zeros(1, num_modes, DIM))
-        self.decoder_blocks = nn.ModuleList(DecoderBlock(num_heads) for _ in range(depth))
+        self.m_emb = nn.Parameter(torch.zeros(1, 1, MODES, DIM))
+        self.m_pos = nn.Parameter(torch.zeros(1, MODES, DIM))
+        self.decoder_blocks = nn.ModuleList(DecoderBlock() for _ in range(DEPTH))
         self.cat_x_proj = Linear(2 * DIM, DIM)
-        self.loc_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
-        self.yaw_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
-        self.vel_head = MlpLayer(DIM, 2 * DIM, 2 * steps)
+        self.loc_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        self.yaw_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        self.vel_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
         self.pi_head = MlpLayer(DIM, DIM, 1)
 
     def forward(
         self,
-        points: Tensor,
-        vectors: Tensor,
-        orientations: Tensor,
-        valid: Tensor,
+        seen: SeenLines,
         counts: Sequence[int],
         tokens: Tensor,
         scenes: Scenes,
@@ -180,10 +181,7 @@ class PlanningDecoder(nn.Module):
         """Decode.
 
         Args:
-            points: (B, R, 120, 2) of the lines [m].
-            vectors: (B, R, 120, 2) to the next point [m].
-            orientations: (B, R, 120) [rad].
-            valid: (B, R, 120) points that exist.
+            seen: Inputs of the network, with the reference lines.
             counts: How many lines of each scene are no padding.
             tokens: (T, 128) of the scenes.
             scenes: How they lie.
@@ -192,16 +190,16 @@ class PlanningDecoder(nn.Module):
         Returns:
             Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
         """
-        modes = self.m_emb.shape[2]
-        shape = (*valid.shape[:2], modes)
-        trajectory = tokens.new_zeros(*shape, self.steps, 6)
+        valid = seen.line_valid
+        shape = (*valid.shape[:2], MODES)
+        trajectory = tokens.new_zeros(*shape, STEPS, 6)
         logits = tokens.new_full(shape, NEVER)
         if not any(counts):
             return trajectory, logits
-        lines = make_lines(valid.any(dim=-1), counts, modes, misordered_masks=self.misordered_masks)
+        lines = make_lines(valid.any(dim=-1), counts, misordered_masks=self.misordered_masks)
         there = present(counts, valid.shape[1], valid.device)
-        embedded = self._embed_lines(points, vectors, orientations, valid)[there]
-        wide = (len(embedded), modes, DIM)
+        embedded = self._embed_lines(seen)[there]
+        wide = (len(embedded), MODES, DIM)
         x = self.q_proj(
             torch.cat([embedded[:, None].expand(wide), self.m_emb[0].expand(wide)], dim=-1)
         )
@@ -210,20 +208,17 @@ class PlanningDecoder(nn.Module):
         own = egos.repeat_interleave(torch.tensor(counts, device=egos.device), dim=0)
         x = self.cat_x_proj(torch.cat([x, own[:, None].expand(wide)], dim=-1))
         heads = (self.loc_head, self.yaw_head, self.vel_head)
-        steps = (len(x), modes, self.steps, 2)
+        steps = (len(x), MODES, STEPS, 2)
         trajectory[there] = torch.cat([head(x).reshape(steps) for head in heads], dim=-1)
         logits[there] = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
         return trajectory, logits
 
-    def _embed_lines(
-        self, points: Tensor, vectors: Tensor, orientations: Tensor, valid: Tensor
-    ) -> Tensor:
+    def _embed_lines(self, seen: SeenLines) -> Tensor:
         """(B, R, 128)."""
-        parts = (
-            points - points[:, :, :1],
-            vectors,
-            torch.stack([orientations.cos(), orientations.sin()], dim=-1),
-        )
-        start = torch.cat([points[:, :, 0], orientations[:, :, :1]], dim=-1)
-        out: Tensor = self.r_encoder(torch.cat(parts, dim=-1), valid) + self.r_pos_emb(start)
+        points, angles = seen.line_points, seen.line_orientations
+        directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
+        parts = (points - points[:, :, :1], seen.line_vectors, directions)
+        start = torch.cat([points[:, :, 0], angles[:, :, :1]], dim=-1)
+        lines = self.r_encoder(torch.cat(parts, dim=-1), seen.line_valid)
+        out: Tensor = lines + self.r_pos_emb(start)
         return out

@@ -1,9 +1,8 @@
 """PLUTO: a network proposes trajectories along reference lines, rules choose among them.
 
-Here one step is put together; what belongs to one stage of it is in the `pluto_*` modules. Where
-the official planner would fail (planner-pluto.md §8), this one goes on and says so: without a
-reference line it drives the trajectory that needs none; with a history shorter than 2 s the missing
-samples are masked.
+Where the official planner would fail, this one goes on and says so: without a reference line it
+drives the trajectory that needs none; with a history shorter than 2 s the missing samples are
+masked.
 """
 
 from collections.abc import Sequence
@@ -15,8 +14,6 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.checkpoint import load_weights
-from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import SAMPLES, AgentFeatures, PerMap, agent_features
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
@@ -24,7 +21,7 @@ from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
 from shiftsim.planners.learned.pluto.proposals import (
     Output,
-    candidates,
+    best_proposals,
     headings_of,
     predicted_agents,
     to_map,
@@ -40,14 +37,15 @@ from shiftsim.planners.learned.pluto.reference import (
 )
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, nearest_line, score
 from shiftsim.planners.learned.pluto.world import (
+    Agents,
     StaticObjects,
     World,
     make_world,
     red_lights,
     static_objects,
 )
-from shiftsim.planners.pdm.parameters import STEP_US
-from shiftsim.planners.route_correction import RouteCorrector
+from shiftsim.planners.proposals.tracker import STEP_US
+from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import History, Observation, SceneInfo
 from shiftsim.world.state import VX, VY, Trajectory
 
@@ -85,17 +83,17 @@ class Choice:
     """How one step chose.
 
     Attributes:
-        poses: (P, 81, 3) candidates.
+        poses: (P, 81, 3) proposals.
         learned: (P,) their scores by the network.
-        agents: Poses (A, 81, 3) and speeds (A, 81) of the agents, now and predicted.
-        scores: Of the candidates.
+        agents: The agents, now and predicted.
+        scores: Of the proposals.
         best: Number of the best one.
         braked: Whether the emergency brake replaces it.
     """
 
     poses: FloatArray
     learned: FloatArray
-    agents: tuple[FloatArray, FloatArray]
+    agents: Agents
     scores: Scores
     best: int
     braked: bool
@@ -112,24 +110,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     name = "pluto"
 
-    def __init__(self, checkpoint: str, *, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            checkpoint: A file, a name, or `deterministic:base` or `deterministic:drive`.
-            device: Where the network runs, as in `resolve_device`.
-
-        Raises:
-            CheckpointError: There is no such file, or it is of another network.
-            MissingExtraError: PyTorch is not installed.
-        """
-        weights = load_weights(checkpoint, self.name, device=device)
-        from shiftsim.planners.learned.pluto.network import build_network
-
-        self._device = resolve_device(device)
-        self._network = build_network(weights.args)
-        self._network.load_state_dict(weights.state)
-        self._network.to(self._device).eval()
+    def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
+        """Load the network; arguments and errors as in the base."""
+        super().__init__(checkpoint, device=device)
         self._scene: SceneInfo | None = None
         self.route: RouteLanes | None = None
         self.sight: Sight | None = None
@@ -169,13 +152,13 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
             return ()
         return RouteCorrector(self._scene.map, self._blocks, START_HALF_SIDE).at(rear)
 
-    def _why_makeshift(self, history: History) -> str:
+    def _why_fallback(self, history: History) -> str:
         """Why the official planner would fail here; empty where it would not."""
         if not self._blocks:
             return "the scenario has no route on the map"
         assert self.sight is not None
         if not self.sight.lines:
-            return NO_LINE  # planner-pluto.md §8
+            return NO_LINE
         if len(history.ego) < SAMPLES:
             return f"the history has {len(history.ego)} samples, not {SAMPLES}"
         return ""
@@ -187,7 +170,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         from shiftsim.planners.learned.pluto.network import Inputs
 
         with torch.inference_mode():
-            outputs = self._network(Inputs(*stack(features, self._device)))
+            outputs = self.network(Inputs(*stack(features, self.device)))
         arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
         return [
             Output(
@@ -200,11 +183,11 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         ]
 
     def decode(self, output: Output, observation: Observation) -> Trajectory:
-        """The best candidate, an emergency brake, or the reference-free trajectory."""
+        """The best proposal, an emergency brake, or the reference-free trajectory."""
         assert self.sight is not None
         assert self._scene is not None
         rear = observation.history.ego[-1, :3]
-        self.degraded, self.choice = self._why_makeshift(observation.history), None
+        self.degraded, self.choice = self._why_fallback(observation.history), None
         if not self.sight.lines:
             free = headings_of(output.ref_free_trajectory)
             return _plan(to_map(free, rear), observation)
@@ -220,11 +203,12 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         assert scene is not None
         assert sight is not None
         ego, tracks = observation.history.ego[-1], observation.history.tracks
-        poses, learned = candidates(output, ego[:3])
+        poses, learned = best_proposals(output, ego[:3])
         seen, rows = sight.agents, sight.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
-        agents = predicted_agents(output, local, *present, ego[:3])
+        motion = predicted_agents(output, local, *present, ego[:3])
+        agents = Agents(*motion, tracks.sizes[-1, rows])
         world = self.world_of(observation, agents)
         place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
         scores = score(poses, learned, ego, world, place, scene.vehicle)
@@ -233,12 +217,12 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         braked = must_brake(speed, float(scores.fault_times[best]))
         return Choice(poses, learned, agents, scores, best, braked)
 
-    def world_of(self, observation: Observation, agents: tuple[FloatArray, FloatArray]) -> World:
-        """What the candidates of the last step can collide with.
+    def world_of(self, observation: Observation, agents: Agents) -> World:
+        """What the proposals of the last step can collide with.
 
         Args:
             observation: Of the last step.
-            agents: Poses (A, 81, 3) and speeds (A, 81) of the agents.
+            agents: The agents, now and predicted.
         """
         scene, sight, route = self._scene, self.sight, self.route
         assert scene is not None
@@ -246,13 +230,13 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         assert route is not None
         size = np.array([scene.vehicle.length, scene.vehicle.width])
         footprint = boxes_to_corners(observation.ego.center, size)
-        sizes = observation.history.tracks.sizes[-1, sight.agents.tracks]
         lights = red_lights(scene.map, route, observation)
-        return make_world(sight.static, (*agents, sizes), lights, footprint)
+        return make_world(sight.static, agents, lights, footprint)
 
 
 def _plan(poses: FloatArray, observation: Observation) -> Trajectory:
-    """Poses from 0.1 s on as a plan; nuPlan: it starts at the first pose, not at the ego."""
+    """Poses from 0.1 s on as a plan."""
     plan = plan_of_poses(poses, observation.history)
+    # nuPlan rule 249: the plan starts at the first pose, not at the ego
     plan.states[0] = plan.states[1]
     return plan

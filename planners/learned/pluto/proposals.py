@@ -1,14 +1,14 @@
-"""What PLUTO's network proposes, in the map frame (planner-pluto.md §3.3, §4)."""
+"""What PLUTO's network proposes, in the map frame."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
+from shiftsim.planners.proposals.tracker import STEPS
 
-MAX_CANDIDATES = 20  # that compete by their logits
+MAX_PROPOSALS = 20  # that compete by their logits
 REFERENCE_FREE_SCORE = 0.25
-STEPS = 80  # of a trajectory
 
 
 class Output(NamedTuple):
@@ -46,7 +46,7 @@ def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
     return out
 
 
-def candidates(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:
+def best_proposals(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The trajectories that are scored, best logit first and the reference-free one last.
 
     Args:
@@ -54,22 +54,19 @@ def candidates(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray
         rear: (3,) rear axle x [m], y [m], heading [rad].
 
     Returns:
-        Poses (P, 81, 3) and scores (P,). nuPlan: the pose of 0.1 s is also that of 0 s.
+        Poses (P, 81, 3) and scores (P,).
     """
     logits = output.probability.reshape(-1)
-    # nuPlan: NumPy's default sort, and a softmax over what it keeps
-    best = np.argsort(-logits)[:MAX_CANDIDATES]
+    # nuPlan rule 244: NumPy's default sort, and a softmax over what it keeps
+    best = np.argsort(-logits)[:MAX_PROPOSALS]
     powers = np.exp(logits[best] - logits[best].max())
     scores = np.append((powers / powers.sum()).astype(np.float64), REFERENCE_FREE_SCORE)
     kept = output.trajectory.reshape(-1, STEPS, output.trajectory.shape[-1])[best]
     free = output.ref_free_trajectory[None]
     local = np.concatenate([headings_of(kept), headings_of(free)])
-    return repeat_first(to_map(local, rear)), scores
-
-
-def repeat_first(poses: FloatArray) -> FloatArray:
-    """Trajectories (P, 81, 3) from (P, 80, 3), the first pose twice."""
-    return np.concatenate([poses[:, :1], poses], axis=1)
+    poses = to_map(local, rear)
+    # nuPlan rule 245: the pose of 0.1 s is also that of 0 s
+    return np.concatenate([poses[:, :1], poses], axis=1), scores
 
 
 def predicted_agents(

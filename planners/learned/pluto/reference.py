@@ -1,7 +1,7 @@
 """What PLUTO takes from the map around the ego: drivable areas and reference lines.
 
-The drivable areas are those of PDM-Closed with a larger square (planner-pluto.md §2.4). A reference
-line is one way along the lanes of the route, cut to the next 120 m (§2.5).
+The drivable areas are those of PDM-Closed with a larger square. A reference line
+is one way along the lanes of the route, cut to the next 120 m.
 """
 
 from collections.abc import Sequence
@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import meets_bounds
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import project_on_polyline
-from shiftsim.planners.proposals.areas import Areas, admit, make_areas
+from shiftsim.geometry.polylines import project_on_polyline, vertex_heading
+from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
+from shiftsim.planners.routes.lanes import deviation
 from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 
@@ -35,12 +37,12 @@ class Drivable(NamedTuple):
 
     Attributes:
         areas: All areas of the map, those of the route marked.
-        admitted: Areas near the ego.
+        selected: Areas near the ego.
         limits: (M,) speed limit of each area of the map, of this step [m/s].
     """
 
     areas: Areas
-    admitted: IntArray
+    selected: IntArray
     limits: FloatArray
 
 
@@ -99,14 +101,14 @@ def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> Route
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
     """Drivable areas around the ego centre (x, y) [m]."""
-    admitted = admit(road, route.areas, x, y, AREA_HALF_SIDE)
+    selected = select_areas(road, x, y, AREA_HALF_SIDE)
     limits = route.limits
-    if len(admitted) and admitted[-1] >= len(road.edges):
-        # nuPlan: a car park has the limit of the lane visited last (planner-pluto.md §2.4)
-        lanes = admitted[admitted < len(road.edges)]
+    if len(selected) and selected[-1] >= len(road.edges):
+        # nuPlan rule 246: a car park has the limit of the lane visited last
+        lanes = selected[selected < len(road.edges)]
         limits = limits.copy()
         limits[len(road.edges) :] = limits[lanes[-1]] if len(lanes) else FALLBACK_LIMIT
-    return Drivable(route.areas, admitted, limits)
+    return Drivable(route.areas, selected, limits)
 
 
 def reference_lines(
@@ -164,7 +166,7 @@ def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
     kept = [True] * len(lines)
     for i, first in enumerate(lines):
         for j in range(i + 1, len(lines)):
-            # nuPlan: a removed line still removes others (planner-pluto.md §2.5)
+            # nuPlan rule 247: a removed line still removes others
             if kept[j] and _runs_along(first, lines[j]):
                 kept[j] = False
     return [line for line, keep in zip(lines, kept, strict=True) if keep]
@@ -183,48 +185,25 @@ def _runs_along(first: FloatArray, second: FloatArray) -> bool:
 def _start_lanes(
     polygons: Polygons,
     baselines: Polylines,
-    candidates: IntArray,
+    lanes: IntArray,
     rear: FloatArray,
     x: float,
     y: float,
     out: IntArray,
 ) -> int:
     """Write the lanes a line may start on into `out`; their number."""
-    bounds, count = polygons.bounds, 0
+    count = 0
     square = square_around(x, y, START_HALF_SIDE)
-    for edge in candidates:
+    for lane in lanes:
         if (
-            bounds[edge, 0] <= x + START_HALF_SIDE
-            and bounds[edge, 2] >= x - START_HALF_SIDE
-            and bounds[edge, 1] <= y + START_HALF_SIDE
-            and bounds[edge, 3] >= y - START_HALF_SIDE
-            and baselines.arc[baselines.ptr[edge + 1] - 1] > MIN_BASELINE
-            and meets_convex(polygons, edge, square)
-            and _heading_error(baselines, edge, rear) < MAX_HEADING_ERROR
+            meets_bounds(square, polygons.bounds[lane])
+            and baselines.arc[baselines.ptr[lane + 1] - 1] > MIN_BASELINE
+            and meets_convex(polygons, lane, square)
+            and deviation(baselines, lane, STRIDE, rear[0], rear[1], rear[2])[1] < MAX_HEADING_ERROR
         ):
-            out[count] = edge
+            out[count] = lane
             count += 1
     return count
-
-
-@kernel
-def _heading_error(baselines: Polylines, edge: int, rear: FloatArray) -> float:
-    """Heading error at the nearest of every fourth vertex of a baseline [rad]."""
-    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
-    best, found = np.inf, start
-    for index in range(start, stop, STRIDE):
-        distance = np.hypot(baselines.xy[index, 0] - rear[0], baselines.xy[index, 1] - rear[1])
-        if distance < best:
-            best, found = distance, index
-    return abs(wrap_angle(_vertex_heading(baselines, found, stop) - rear[2]))
-
-
-@kernel
-def _vertex_heading(baselines: Polylines, index: int, stop: int) -> float:
-    """Direction to the next vertex; the last one repeats the one before [rad]."""
-    at = min(index, stop - 2)
-    dx = baselines.xy[at + 1, 0] - baselines.xy[at, 0]
-    return np.arctan2(baselines.xy[at + 1, 1] - baselines.xy[at, 1], dx)
 
 
 @kernel
@@ -239,14 +218,14 @@ def _cut(baselines: Polylines, path: IntArray, x: float, y: float) -> tuple[Floa
         stop = baselines.ptr[edge + 1]
         for index in range(baselines.ptr[edge], stop):
             xy[row, 0], xy[row, 1] = baselines.xy[index, 0], baselines.xy[index, 1]
-            heading[row] = _vertex_heading(baselines, index, stop)
+            heading[row] = vertex_heading(baselines.xy, index, stop)
             if row > 0:
                 dx, dy = xy[row, 0] - xy[row - 1, 0], xy[row, 1] - xy[row - 1, 1]
                 progress[row] = progress[row - 1] + np.sqrt(dx * dx + dy * dy)
             row += 1
     here = project_on_polyline(xy, progress, 0, total, x, y)
     count = 0
-    # nuPlan: a vertex goes when the next one repeats it, and so does always the very last one
+    # nuPlan rule 153: of two equal vertices the second stays, and the last of all is always lost
     for row in range(total - 1):
         if progress[row + 1] - progress[row] > REPEATED:
             xy[count, 0], xy[count, 1] = xy[row, 0], xy[row, 1]
@@ -327,7 +306,7 @@ def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures
         made.valid_mask[row, :count] = True
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
     turn = np.array([[cos, -sin], [sin, cos]])
-    # padding is moved as well, as in the official features (planner-pluto.md §2.6)
+    # nuPlan rule 248: padding is moved as well
     made.position[:] = (points[..., :2] - rear[:2]) @ turn
     made.vector[:] = points[..., 2:4] @ turn
     made.orientation[:] = points[..., 4] - rear[2]

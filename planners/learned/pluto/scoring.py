@@ -1,29 +1,31 @@
-"""Scores of PLUTO's candidates, on their driven states (planner-pluto.md §5)."""
+"""Scores of PLUTO's proposals, on their driven states."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, kernel
-from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.planners.learned.pluto.collisions import (
-    OFF_ROAD,
-    ONCOMING,
+    TTC_STEPS,
     collisions,
-    judge_places,
-    near_objects,
+    run_lights,
     times_to_collision,
 )
 from shiftsim.planners.learned.pluto.reference import Drivable
-from shiftsim.planners.learned.pluto.world import SCORED, World
-from shiftsim.planners.pdm.parameters import DT, ComfortBounds
-from shiftsim.planners.pdm.scorer import place_ego
-from shiftsim.planners.proposals.areas import near_areas
-from shiftsim.planners.proposals.comfort import comfort, make_filters
-from shiftsim.planners.proposals.tracker import simulate_proposals
-from shiftsim.sim.dynamics.lqr import NUPLAN
+from shiftsim.planners.learned.pluto.world import World
+from shiftsim.planners.proposals.areas import (
+    MULTIPLE,
+    OFF_ROAD,
+    OFF_ROUTE,
+    find_places,
+    near_areas,
+)
+from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
+from shiftsim.planners.proposals.contacts import ego_box, near_others, place_ego
+from shiftsim.planners.proposals.tracker import DT, drive_proposals
 from shiftsim.world.layers import Polygons
-from shiftsim.world.state import NUM_STATE, VX, VY, VehicleParameters, X, Y
+from shiftsim.world.state import VX, VY, VehicleParameters, X, Y
 
 LEARNED_WEIGHT = 0.3
 PROGRESS_WEIGHT, TTC_WEIGHT, SPEED_WEIGHT, COMFORT_WEIGHT = 5.0, 5.0, 2.0, 2.0
@@ -32,12 +34,12 @@ SPEED_SCORE_MIN = 0.5
 MAX_OVERSPEED = 2.23  # m/s, on average
 DIRECTION_LIMITS = (4.0, 12.0)  # m on oncoming lanes
 MAX_REVERSE = 5  # frames
-ALREADY_OFF = 3  # first frames; when all candidates leave the road there, it does not count
+ALREADY_OFF = 3  # first frames; when all proposals leave the road there, it does not count
 MIN_PROGRESS = 0.1  # m
 
 
 class Scores(NamedTuple):
-    """Scores of P candidates.
+    """Scores of P proposals.
 
     Attributes:
         total: (P,) what decides.
@@ -84,84 +86,68 @@ def score(
     place: Place,
     vehicle: VehicleParameters,
 ) -> Scores:
-    """Drive candidates and score them.
+    """Drive proposals and score them.
 
     Args:
-        poses: (P, 81, 3) candidates.
+        poses: (P, 81, 3) proposals.
         learned: (P,) their scores by the network.
         ego: (11,) ego state.
         world: What is around.
         place: The map.
         vehicle: Dimensions of the ego.
     """
-    driven = drive(poses, ego, vehicle)
+    driven = drive_proposals(poses, ego, vehicle).states
     count, steps = driven.shape[:2]
     corners, centers = np.empty((count, steps, 4, 2)), np.empty((count, steps, 2))
-    place_ego(
-        driven, (vehicle.length, vehicle.width, vehicle.rear_axle_to_center), corners, centers
-    )
-    drivable = place.drivable
+    place_ego(driven, ego_box(vehicle), corners, centers)
+    drivable, others = place.drivable, world.others
     flags, limits = np.empty((count, steps, 3), np.bool_), np.empty((count, steps))
-    lanes = near_areas(drivable.areas, drivable.admitted, corners)
-    judge_places(drivable.areas, lanes, drivable.limits, corners, driven, flags, limits)
-    near = near_objects(corners, driven, world)
-    clear, fault_times, ttc = np.empty(count), np.empty(count), np.empty(count)
-    collisions(driven, corners, flags, world, near, place.edges, clear, fault_times)
-    times_to_collision(driven, corners, flags, world, near, ttc)
+    lanes = near_areas(drivable.areas, drivable.selected, corners)
+    rear = np.ascontiguousarray(driven[..., :2])
+    find_places(drivable.areas, lanes, drivable.limits, corners, rear, flags, limits)
+    off_lane = flags[..., MULTIPLE] | flags[..., OFF_ROAD]
+    near = near_others(driven, corners, others, steps, DT * TTC_STEPS[-1])
+    red = run_lights(corners, place.edges, world.lights)
+    clear, fault_times = collisions(driven, corners, off_lane, others, near, red)
+    ttc = np.empty(count)
+    times_to_collision(driven, corners, off_lane, others, near, ttc)
     factors = np.stack([clear, on_road(flags[..., OFF_ROAD]), direction(driven, flags)])
     progress = travel(driven, place.baseline)
-    terms = np.stack([np.empty(count), speed_score(driven, limits), comfort_score(driven), ttc])
+    is_within = comfort(driven, ComfortBounds()).is_within.all(axis=1)
+    comfortable = np.where(is_within, 1.0, 0.0)
+    terms = np.stack([np.empty(count), speed_score(driven, limits), comfortable, ttc])
     terms[0], rule = aggregate(factors, terms, progress)
     total = rule + LEARNED_WEIGHT * learned
     return Scores(total, rule, factors, terms, progress, fault_times, driven, flags, limits)
 
 
-def drive(poses: FloatArray, ego: FloatArray, vehicle: VehicleParameters) -> FloatArray:
-    """(P, 41, 11) states of candidates (P, 81, 3) as the tracker drives them."""
-    count, horizon = len(poses), poses.shape[1] - 1
-    speeds, curvatures = np.empty((count, horizon)), np.empty((count, horizon))
-    driven = np.empty((count, SCORED + 1, NUM_STATE))
-    tracker = NUPLAN._replace(wheel_base=vehicle.wheel_base)
-    simulate_proposals(poses, ego, tracker, DT, speeds, curvatures, driven)
-    return driven
-
-
 def on_road(off_road: BoolArray) -> FloatArray:
-    """(P,) factor of the drivable area, from flags (P, T) (§5.4)."""
-    # nuPlan: an ego that is off the road already may stay there
+    """(P,) factor of the drivable area, from flags (P, T)."""
+    # nuPlan rule 243: an ego that is off the road already may stay there
     if off_road[:, :ALREADY_OFF].any(axis=1).all():
         return np.ones(len(off_road))
     return np.where(off_road.any(axis=1), 0.0, 1.0)
 
 
 def direction(driven: FloatArray, flags: BoolArray) -> FloatArray:
-    """(P,) factor of the driving direction (§5.4)."""
+    """(P,) factor of the driving direction."""
     steps = np.hypot(np.diff(driven[..., X], axis=1), np.diff(driven[..., Y], axis=1))
-    astray = np.where(flags[:, 1:, ONCOMING], steps, 0.0).sum(axis=1)
+    off_route = np.where(flags[:, 1:, OFF_ROUTE], steps, 0.0).sum(axis=1)
     low, high = DIRECTION_LIMITS
-    factor = np.where(astray < low, 1.0, np.where(astray < high, 0.5, 0.0))
+    factor = np.where(off_route < low, 1.0, np.where(off_route < high, 0.5, 0.0))
     reverse = (driven[..., VX] < 0.0).sum(axis=1) > MAX_REVERSE
     return np.where(reverse, 0.0, factor)
 
 
 def speed_score(driven: FloatArray, limits: FloatArray) -> FloatArray:
-    """(P,) in [0, 1] (§5.5)."""
+    """(P,) in [0, 1]."""
     over = np.maximum(np.hypot(driven[..., VX], driven[..., VY]) - limits, 0.0)
     return np.maximum(1.0 - over.sum(axis=1) / (MAX_OVERSPEED * limits.shape[1]), 0.0)
 
 
-def comfort_score(driven: FloatArray) -> FloatArray:
-    """(P,) 0 or 1 (§5.5)."""
-    count, steps = driven.shape[:2]
-    signals, bounded = np.empty((count, 6, steps)), np.empty((count, 6), np.bool_)
-    comfort(driven, make_filters(), ComfortBounds(), signals, bounded)
-    return np.where(bounded.all(axis=1), 1.0, 0.0)
-
-
 def travel(driven: FloatArray, baseline: FloatArray) -> FloatArray:
     """(P,) progress along a line (K, 2) [m]."""
-    arc = np.zeros(len(baseline))
-    np.cumsum(np.hypot(*np.diff(baseline, axis=0).T), out=arc[1:])
+    arc = arc_lengths(baseline, np.array([0, len(baseline)]))
     out = np.empty(len(driven))
     _project_ends(driven, baseline, arc, out)
     return out
@@ -183,7 +169,7 @@ def _project_ends(
 def aggregate(
     factors: FloatArray, terms: FloatArray, progress: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Put the parts of the rule-based score together (§5.6).
+    """Put the parts of the rule-based score together.
 
     Args:
         factors: (3, P) of `Scores`.
@@ -204,7 +190,7 @@ def aggregate(
 
 
 def normalise(progress: FloatArray, product: FloatArray) -> FloatArray:
-    """(P,) progress in [0, 1] from metres and the product of all factors (§5.6)."""
+    """(P,) progress in [0, 1] from metres and the product of all factors."""
     valid = progress * product
     most = float(valid.max())
     if most > MIN_PROGRESS:

@@ -1,23 +1,20 @@
-"""What PLUTO's candidates can collide with: static objects, predicted agents, red lights.
-
-The objects are at known places at 0, 0.1, … 4 s (planner-pluto.md §5.2). Array axes: T = 41 times,
-O objects, static ones first.
-"""
+"""What PLUTO's proposals can collide with: static objects, predicted agents, red lights."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.geometry.boxes import box_corners, boxes_to_corners
-from shiftsim.geometry.rings import convex_intersect
+from shiftsim.geometry.boxes import box_corners, boxes_to_corners, meets_bounds
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
+from shiftsim.planners.proposals.contacts import Others, touches_boxes
+from shiftsim.planners.proposals.tracker import SCORED
+from shiftsim.planners.routes.lanes import red_lanes
 from shiftsim.sim.planner import Observation
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import AgentKind, LightStatus, Tracks
+from shiftsim.world.state import AgentKind, Tracks
 
-SCORED = 40  # steps of 0.1 s
 STATIC_KINDS = (
     AgentKind.CZONE_SIGN,
     AgentKind.BARRIER,
@@ -44,25 +41,29 @@ class StaticObjects(NamedTuple):
     distances: FloatArray
 
 
-class World(NamedTuple):
-    """Everything a candidate can hit.
+class Agents(NamedTuple):
+    """Where the agents are now and will be, in the map frame. A agents.
 
     Attributes:
-        boxes: (T, O, 4, 2) corners [m].
-        centers: (T, O, 2) centres [m].
-        speeds: (T, O) [m/s].
-        radii: (O,) half diagonals [m].
-        is_agent: (O,) whether an object is an agent.
-        touched: (O,) whether it touches the ego now.
+        poses: (A, 81, 3) centre x [m], y [m], heading [rad], every 0.1 s from now on.
+        speeds: (A, 81) [m/s].
+        sizes: (A, 2) length, width [m].
+    """
+
+    poses: FloatArray
+    speeds: FloatArray
+    sizes: FloatArray
+
+
+class World(NamedTuple):
+    """Everything a proposal can hit.
+
+    Attributes:
+        others: Static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored.
         lights: Connectors of the route whose light is red.
     """
 
-    boxes: FloatArray
-    centers: FloatArray
-    speeds: FloatArray
-    radii: FloatArray
-    is_agent: BoolArray
-    touched: BoolArray
+    others: Others
     lights: IntArray
 
 
@@ -78,7 +79,7 @@ def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> St
     here, distances = here[distances <= SEEN_RADIUS], distances[distances <= SEEN_RADIUS]
     if len(here):
         corners = boxes_to_corners(poses[here], sizes[here])
-        on_road = _touch_areas(drivable.areas.polygons, drivable.admitted, corners)
+        on_road = _touch_areas(drivable.areas.polygons, drivable.selected, corners)
         here, distances = here[on_road], distances[on_road]
     order = np.argsort(categories[here], kind="stable")
     here = here[order]
@@ -86,86 +87,61 @@ def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> St
 
 
 @kernel
-def _touch_areas(polygons: Polygons, admitted: IntArray, corners: FloatArray) -> BoolArray:
-    """(S,) whether a box (S, 4, 2) shares a point with an admitted area."""
+def _touch_areas(polygons: Polygons, selected: IntArray, corners: FloatArray) -> BoolArray:
+    """(S,) whether a box (S, 4, 2) shares a point with an selected area."""
     out = np.zeros(len(corners), np.bool_)
     for index in range(len(corners)):
         box = corners[index]
-        for area in admitted:
-            if bounds_meet(polygons.bounds[area], box) and meets_convex(polygons, area, box):
+        for area in selected:
+            if meets_bounds(box, polygons.bounds[area]) and meets_convex(polygons, area, box):
                 out[index] = True
                 break
     return out
 
 
-@kernel
-def bounds_meet(bounds: FloatArray, box: FloatArray) -> bool:
-    """Whether the bounds of a polygon and of a box (4, 2) overlap."""
-    return (
-        max(box[0, 0], box[1, 0], box[2, 0], box[3, 0]) >= bounds[0]
-        and max(box[0, 1], box[1, 1], box[2, 1], box[3, 1]) >= bounds[1]
-        and min(box[0, 0], box[1, 0], box[2, 0], box[3, 0]) <= bounds[2]
-        and min(box[0, 1], box[1, 1], box[2, 1], box[3, 1]) <= bounds[3]
-    )
-
-
 def red_lights(road: VectorMap, route: RouteLanes, observation: Observation) -> IntArray:
     """Connectors of the route whose light is red."""
-    red = [name for name, s in observation.traffic_lights.items() if s == LightStatus.RED]
-    edges = [road.edges.index[name] for name in red if name in road.edges.index]
-    return np.array([edge for edge in edges if route.is_on[edge]], np.int64)
+    red = red_lanes(road, observation.traffic_lights)
+    return np.array([lane for lane in red if route.is_on[lane]], np.int64)
 
 
 def make_world(
-    static: StaticObjects,
-    agents: tuple[FloatArray, FloatArray, FloatArray],
-    lights: IntArray,
-    footprint: FloatArray,
+    static: StaticObjects, agents: Agents, lights: IntArray, footprint: FloatArray
 ) -> World:
     """Put everything in its place.
 
     Args:
         static: Static objects.
-        agents: Poses (A, 81, 3), speeds (A, 81) and sizes (A, 2) length, width of the agents.
+        agents: The agents.
         lights: Connectors whose light is red.
         footprint: (4, 2) corners of the ego now [m].
     """
-    near = static.distances <= SCORED_RADIUS
-    poses, speeds, sizes = agents
-    num_static, count = int(near.sum()), int(near.sum()) + len(poses)
-    world = World(
-        np.empty((SCORED + 1, count, 4, 2)),
-        np.empty((SCORED + 1, count, 2)),
-        np.zeros((SCORED + 1, count)),
-        np.empty(count),
-        np.arange(count) >= num_static,
-        np.zeros(count, np.bool_),
-        lights,
+    near, rows = static.distances <= SCORED_RADIUS, SCORED + 1
+    standing, count = static.poses[near], int(near.sum())
+    still = np.zeros((rows, count))
+    poses = np.concatenate(
+        [np.broadcast_to(standing, (rows, count, 3)), agents.poses[:, :rows].swapaxes(0, 1)], axis=1
     )
-    _place(static.poses[near], static.sizes[near], poses, speeds, sizes, footprint, world)
-    return world
+    sizes = np.concatenate([static.sizes[near], agents.sizes])
+    centers = np.ascontiguousarray(poses[..., :2])
+    boxes = np.empty((*poses.shape[:2], 4, 2))
+    _place(poses, sizes, boxes)
+    others = Others(
+        boxes=boxes,
+        centers=centers,
+        centroids=centers,
+        speeds=np.concatenate([still, agents.speeds[:, :rows].T], axis=1),
+        radii=0.5 * np.hypot(sizes[:, 0], sizes[:, 1]),
+        is_agent=np.arange(len(sizes)) >= count,
+        ignored=touches_boxes(footprint, boxes[0]),
+    )
+    return World(others, lights)
 
 
 @kernel
-def _place(
-    static_poses: FloatArray,
-    static_sizes: FloatArray,
-    poses: FloatArray,
-    speeds: FloatArray,
-    sizes: FloatArray,
-    footprint: FloatArray,
-    out: World,
-) -> None:
-    """Fill in the boxes of all times."""
-    num_static = len(static_poses)
-    for index in range(len(out.radii)):
-        agent = index - num_static
-        length, width = sizes[agent] if agent >= 0 else static_sizes[index]
-        out.radii[index] = 0.5 * np.hypot(length, width)
-        for step in range(len(out.boxes)):
-            pose = poses[agent, step] if agent >= 0 else static_poses[index]
-            out.centers[step, index, 0], out.centers[step, index, 1] = pose[0], pose[1]
-            box_corners(pose[0], pose[1], pose[2], length, width, out.boxes[step, index])
-            if agent >= 0:
-                out.speeds[step, index] = speeds[agent, step]
-        out.touched[index] = convex_intersect(out.boxes[0, index], footprint)
+def _place(poses: FloatArray, sizes: FloatArray, boxes: FloatArray) -> None:
+    """Write the corners (T, O, 4, 2) of boxes with poses (T, O, 3) and sizes (O, 2)."""
+    for step in range(len(boxes)):
+        for index in range(len(sizes)):
+            x, y, heading = poses[step, index, 0], poses[step, index, 1], poses[step, index, 2]
+            box_corners(x, y, heading, sizes[index, 0], sizes[index, 1], boxes[step, index])

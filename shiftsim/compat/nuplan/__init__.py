@@ -8,40 +8,17 @@ the `nuplan.*` module names in this process.
 """
 
 import functools
-import importlib.util
 import inspect
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from shiftsim.compat.nuplan.finder import StandInFinder, stand_ins_are_installed
+from shiftsim.compat.nuplan.finder import install as install
 from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:
     from shiftsim.compat.nuplan.bridge.planner import NuplanPlanner
 
-_PROBE = "nuplan.planning.simulation.planner.abstract_planner"
 _METHODS = ("name", "initialize", "observation_type", "compute_planner_trajectory")
-
-
-def install() -> bool:
-    """Make `import nuplan…` work in this process; call it before importing a planner's module.
-
-    Returns:
-        Whether the stand-ins are used: false where nuPlan's devkit is there.
-    """
-    if stand_ins_are_installed():
-        return True
-    try:
-        if importlib.util.find_spec(_PROBE) is not None:
-            return False
-    except ModuleNotFoundError:
-        pass
-    # a folder named nuplan, of data for instance, counts as an empty package: drop it
-    for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
-        del sys.modules[name]
-    sys.meta_path.insert(0, StandInFinder())
-    return True
 
 
 def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":

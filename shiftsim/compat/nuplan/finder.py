@@ -1,5 +1,6 @@
 """Makes `import nuplan…` find the stand-ins, and says clearly what they do not have."""
 
+import importlib.util
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -143,7 +144,7 @@ class StandInFinder(MetaPathFinder, Loader):
             return None
         if name in MODULES or name in _PACKAGES:
             return ModuleSpec(name, self, is_package=True)
-        raise MissingExtraError(_lacking(name), hint=_HINT)
+        raise MissingExtraError(_missing(name), hint=_HINT)
 
     def create_module(self, spec: ModuleSpec) -> None:
         """The ordinary kind of module."""
@@ -158,15 +159,30 @@ class StandInFinder(MetaPathFinder, Loader):
             vars(module).update((name, known[name]) for name in wanted)
 
         def missing(name: str) -> Any:
-            raise AttributeError(f"{_lacking(f'{module.__name__}.{name}')}; {_HINT}")
+            raise AttributeError(f"{_missing(f'{module.__name__}.{name}')}; {_HINT}")
 
         vars(module)["__getattr__"] = missing
 
 
-def stand_ins_are_installed() -> bool:
-    """Whether `import nuplan` finds the stand-ins in this process."""
-    return any(isinstance(finder, StandInFinder) for finder in sys.meta_path)
+def install() -> bool:
+    """Make `import nuplan…` work in this process; call it before importing a planner's module.
+
+    Returns:
+        Whether the stand-ins are used: false where nuPlan's devkit is there.
+    """
+    if any(isinstance(finder, StandInFinder) for finder in sys.meta_path):
+        return True
+    try:
+        if importlib.util.find_spec(f"{_SIMULATION}planner.abstract_planner") is not None:
+            return False
+    except ModuleNotFoundError:
+        pass
+    # a folder named nuplan, of data for instance, counts as an empty package: drop it
+    for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
+        del sys.modules[name]
+    sys.meta_path.insert(0, StandInFinder())
+    return True
 
 
-def _lacking(name: str) -> str:
+def _missing(name: str) -> str:
     return f"{name!r} is not among shiftsim's stand-ins for nuPlan's devkit"

@@ -1,8 +1,7 @@
 """Kinematic bicycle model at the rear axle, with nuPlan's low-pass filters on the command.
 
 One forward Euler step: the pose moves with the old speed, heading and steering angle; the yaw rate
-follows from the new ones (nuplan-simulation.md §7). Speed may become negative; only the steering
-angle is limited.
+follows from the new ones. Speed may become negative; only the steering angle is limited.
 """
 
 import numpy as np
@@ -32,11 +31,8 @@ WHEEL_BASE = PACIFICA.wheel_base  # m
 
 @lean_kernel
 def step_seconds(now_us: int, next_us: int) -> float:
-    """Seconds from one time stamp to another, for the motion model.
-
-    nuPlan: a difference of time points, so microseconds times 1e-6: 100000 us are
-    0.09999999999999999 s (nuplan-simulation.md §12 Q1).
-    """
+    """Seconds from one time stamp to another, for the motion model."""
+    # nuPlan rule 11: microseconds times 1e-6, so 100000 us are 0.09999999999999999 s
     return (next_us - now_us) * 1e-6
 
 
@@ -67,9 +63,9 @@ def step_bicycle(
     filtered = steering + dt / (dt + STEERING_TIME_CONSTANT) * (ideal - steering)
     rate = (filtered - steering) / dt
 
-    new_speed = speed + new_accel * dt
-    # nuPlan: the pose uses the old steering angle, the yaw rate the new one (§12 Q7); the stored
-    # rate is the one before clipping (Q8)
+    new_speed = speed + new_accel * dt  # nuPlan rule 23: also below 0
+    # nuPlan rule 15: the pose uses the old steering angle, the yaw rate the new one; the stored
+    # rate is the one before clipping
     new_steering = min(max(steering + rate * dt, -MAX_STEERING), MAX_STEERING)
     yaw_rate = new_speed * np.tan(new_steering) / wheel_base
     out[X] = state[X] + speed * np.cos(heading) * dt

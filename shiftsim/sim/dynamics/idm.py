@@ -1,6 +1,6 @@
 """Intelligent Driver Model: acceleration behind a lead, and nuPlan's forward Euler step.
 
-Used by reactive agents and by the IDM planner (nuplan-simulation.md §10.3).
+Used by reactive agents and by the IDM planner.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def idm_acceleration(
         accel_max: Largest acceleration [m/s^2].
         decel_max: Comfortable deceleration, positive [m/s^2].
     """
-    # nuPlan: the desired gap is not clamped at zero, it is squared
+    # nuPlan rule 21: the desired gap is not clamped at zero, it is squared
     desired = (
         min_gap
         + speed * headway

@@ -2,7 +2,7 @@
 
 The plan is resampled at 0.1 s. Displacements along the heading give a smoothed speed profile,
 heading changes a smoothed curvature profile; the speed one second ahead and the curvatures of the
-next second are the references of two small LQR problems (nuplan-simulation.md §6).
+next second are the references of two small LQR problems.
 
 nuPlan fits (initial speed, accelerations) and (initial curvature, curvature rates) by the
 pseudo-inverse of dense normal equations. Here the unknowns are the profiles themselves, which makes
@@ -23,6 +23,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
 from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
@@ -34,7 +35,26 @@ TRACKED, NOT_COVERED, TOO_SHORT = 0, 1, 2  # what the kernels return
 
 
 class LqrParameters(NamedTuple):
-    """Weights and times of the tracker; the defaults are nuPlan's."""
+    """Weights and times of the tracker; the defaults are those of nuPlan's configuration.
+
+    Each of the two problems minimises q (error at the end of the horizon)^2 + r (command)^2, the
+    command being held for all of it.
+
+    Attributes:
+        q_longitudinal: Cost of the speed error [s^2/m^2].
+        r_longitudinal: Cost of the acceleration [s^4/m^2].
+        q_lateral_error: Cost of the distance beside the plan [1/m^2].
+        q_heading_error: Cost of the heading error [1/rad^2].
+        q_steering: Cost of the steering angle [1/rad^2].
+        r_lateral: Cost of the steering rate [s^2/rad^2].
+        step_us: Discretisation time [us].
+        horizon: Its steps.
+        jerk_penalty: Of the speed profile, against displacements [s^4].
+        curvature_rate_penalty: Of the curvature profile, against heading changes [s^2 m^2].
+        stopping_gain: Acceleration per speed error of the stop controller [1/s].
+        stopping_speed: Where speed and plan are not above it, the stop controller acts [m/s].
+        wheel_base: Distance between the axles [m].
+    """
 
     q_longitudinal: float = 10.0
     r_longitudinal: float = 1.0
@@ -42,13 +62,13 @@ class LqrParameters(NamedTuple):
     q_heading_error: float = 10.0
     q_steering: float = 0.0
     r_lateral: float = 1.0
-    step_us: int = 100_000  # us, discretisation time
-    horizon: int = 10  # steps
+    step_us: int = 100_000
+    horizon: int = 10
     jerk_penalty: float = 1e-4
     curvature_rate_penalty: float = 1e-2
-    stopping_gain: float = 0.5  # 1/s
-    stopping_speed: float = 0.2  # m/s
-    wheel_base: float = PACIFICA.wheel_base  # m
+    stopping_gain: float = 0.5
+    stopping_speed: float = 0.2
+    wheel_base: float = PACIFICA.wheel_base
 
 
 NUPLAN = LqrParameters()
@@ -99,11 +119,10 @@ def resample_poses(
         span = float(traj_time_us[end] - traj_time_us[begin])
         ahead = float(query - traj_time_us[begin])
         x, y, heading = traj_states[begin, X], traj_states[begin, Y], traj_states[begin, HEADING]
-        out[row, 0] = (traj_states[end, X] - x) / span * ahead + x
-        out[row, 1] = (traj_states[end, Y] - y) / span * ahead + y
-        heading += turn
+        out[row, 0] = between(x, traj_states[end, X], span, ahead)
+        out[row, 1] = between(y, traj_states[end, Y], span, ahead)
         last = traj_states[end, HEADING] + next_turn
-        out[row, 2] = wrap_angle((last - heading) / span * ahead + heading)
+        out[row, 2] = wrap_angle(between(heading + turn, last, span, ahead))
         query += step_us
 
 
@@ -182,11 +201,8 @@ def fit_curvature(
 
 @lean_kernel
 def profile_at(profile: FloatArray, start_us: int, step_us: int, seconds: float) -> float:
-    """Value of a profile sampled at whole steps, at a time [s]; clamped at both ends.
-
-    nuPlan: the sample times are microseconds / 1e6, the queried time microseconds * 1e-6; with
-    epoch-size stamps the two differ by up to 2.4e-7 s (nuplan-simulation.md §12 Q1).
-    """
+    """Value of a profile sampled at whole steps, at a time [s]; clamped at both ends."""
+    # nuPlan rule 11: the sample times are microseconds / 1e6, the queried time microseconds * 1e-6
     last = len(profile) - 1
     if seconds <= start_us / 1e6:
         return profile[0]
@@ -209,6 +225,7 @@ def fit_profiles(
     traj_time_us: IntArray, traj_states: FloatArray, params: LqrParameters
 ) -> tuple[FloatArray, FloatArray]:
     """Speed [m/s] and curvature [1/m] profiles (M,) at whole steps from the plan's start."""
+    # nuPlan rule 20: the whole plan is fitted, not the second that the tracker looks ahead
     dt = params.step_us / 1e6
     poses = np.empty((num_resampled(traj_time_us, params.step_us), 3))
     resample_poses(traj_time_us, traj_states, params.step_us, poses)
@@ -253,7 +270,8 @@ def reference(
 
 @lean_kernel
 def is_stopping(speed: float, reference_speed: float, params: LqrParameters) -> bool:
-    """Whether the stop controller acts; signed speeds, so also when reversing (§12 Q9)."""
+    """Whether the stop controller acts."""
+    # nuPlan rule 18: speeds are compared with their sign, so it also acts when reversing
     return reference_speed <= params.stopping_speed and speed <= params.stopping_speed
 
 
@@ -290,7 +308,8 @@ def steering_rate(
 
 @lean_kernel
 def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[float, float]:
-    """Acceleration [m/s^2] and steering rate [rad/s] that follow the reference; no limits."""
+    """Acceleration [m/s^2] and steering rate [rad/s] that follow the reference."""
+    # nuPlan rule 22: neither of them is limited
     speed = state[VX]
     if is_stopping(speed, ref.speed, params):
         return -params.stopping_gain * (speed - ref.speed), 0.0

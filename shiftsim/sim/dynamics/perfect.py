@@ -2,7 +2,7 @@
 
 nuPlan interpolates linearly over microseconds; headings are unwrapped over the whole trajectory
 first and wrapped afterwards; yaw rate, yaw acceleration and steering rate are not carried and come
-out as 0; nothing is extrapolated (nuplan-simulation.md §4).
+out as 0; nothing is extrapolated.
 """
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
 from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.world.state import (
     HEADING,
     NUM_STATE,
@@ -28,10 +29,8 @@ SAMPLE_US = 100_000  # us, spacing of the poses of a plan that a rollout keeps
 
 @lean_kernel
 def unwrap_correction(before: float, after: float) -> float:
-    """What to add to a heading (and all later ones) to make the step from the one before small.
-
-    nuPlan: numpy.unwrap, whose steps of exactly half a turn keep their sign.
-    """
+    """What to add to a heading (and all later ones) to make the step from the one before small."""
+    # nuPlan rule 16: as numpy.unwrap, whose steps of exactly half a turn keep their sign
     step = after - before
     if abs(step) < np.pi:
         return 0.0
@@ -60,9 +59,6 @@ def interpolate(
 ) -> bool:
     """State of a trajectory at one time.
 
-    nuPlan also interpolates the time stamp and truncates it to whole microseconds; over its own
-    abscissa the slope is exactly 1, so the result is the queried stamp (§12 Q15).
-
     Args:
         traj_time_us: (H,) strictly increasing time stamps, H >= 2 [us].
         traj_states: (H, 11) columns of `state.STATE_COLUMNS`.
@@ -77,19 +73,18 @@ def interpolate(
         return False
     end = segment_end(traj_time_us, query_us)
     begin = end - 1
-    # nuPlan: slope times distance plus start, also where the query is a knot (scipy's interp1d)
     span = float(traj_time_us[end] - traj_time_us[begin])
     ahead = float(query_us - traj_time_us[begin])
     for column in range(STEERING + 1):
-        first = traj_states[begin, column]
-        out[column] = (traj_states[end, column] - first) / span * ahead + first
+        out[column] = between(traj_states[begin, column], traj_states[end, column], span, ahead)
     turn = 0.0
     for knot in range(1, end):
         turn += unwrap_correction(traj_states[knot - 1, HEADING], traj_states[knot, HEADING])
     first = traj_states[begin, HEADING] + turn
     turn += unwrap_correction(traj_states[begin, HEADING], traj_states[end, HEADING])
     last = traj_states[end, HEADING] + turn
-    out[HEADING] = wrap_angle((last - first) / span * ahead + first)
+    out[HEADING] = wrap_angle(between(first, last, span, ahead))
+    # nuPlan rule 17: yaw rate, yaw acceleration and steering rate are not carried
     out[STEERING_RATE] = 0.0
     out[YAW_RATE] = 0.0
     out[YAW_ACCEL] = 0.0

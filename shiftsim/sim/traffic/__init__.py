@@ -11,17 +11,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
-from shiftsim.arrays import FloatArray
-from shiftsim.errors import ConfigError
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 
 _MODELS = {
-    "nonreactive": "shiftsim.sim.traffic.replay:LogReplay",
+    "nonreactive": "shiftsim.sim.traffic:LogReplay",
     "reactive": "shiftsim.sim.traffic.idm.model:IdmTraffic",
     "constant-velocity": "shiftsim.sim.traffic.constant_velocity:ConstantVelocity",
-    # not nuPlan's, never for benchmarks
-    "reactive-fixed": "shiftsim.sim.traffic.idm.model:FixedIdmTraffic",
 }
 _SHORT = {"nr": "nonreactive", "r": "reactive"}
 
@@ -49,6 +47,18 @@ class Traffic(Protocol):
         """
 
 
+class LogReplay:
+    """Non-reactive traffic: everyone does what the recording did, which the buffer holds."""
+
+    def start(
+        self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
+    ) -> None:
+        """Nothing to prepare."""
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Nothing to do."""
+
+
 def traffic_name(name: str) -> str:
     """The full name of a traffic mode: `nr` and `r` are accepted.
 
@@ -56,12 +66,7 @@ def traffic_name(name: str) -> str:
         ConfigError: The name is unknown.
     """
     full = _SHORT.get(name, name)
-    if full not in _MODELS and ":" not in full:
-        raise ConfigError(
-            f"traffic {name!r} unknown",
-            hint=f"available: {', '.join(sorted(_MODELS))}, or package.module:Model of your own",
-        )
-    return full
+    return full if ":" in full else one_of("traffic", full, [*_MODELS, "package.module:Model"])
 
 
 def make_traffic(name: str) -> Traffic:

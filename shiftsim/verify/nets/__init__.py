@@ -1,15 +1,16 @@
 """The nets folder: the learned planners with deterministic weights against the official code."""
 
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from shiftsim.verify.files import read_json, verify_files
+from shiftsim.verify.files import Source, read_arrays, read_fields, read_json, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
-PARTS = {  # sub-folder → module with `FILES`: by glob pattern what is called with path and report
+PARTS = {  # sub-folder → module with `FILES`: by glob pattern what is called with file and scenes
     "carl": "carl",
     "diffusion_planner": "diffusion",
     "plantf": "plantf",
@@ -50,8 +51,23 @@ def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None
         report.skip(f"{part}: torch is not installed")
     else:
         files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
-        bound = {p: partial(compare, report=report, scenes=scenes) for p, compare in files.items()}
+        bound = {
+            pattern: partial(_verify_file, compare, report, scenes)
+            for pattern, compare in files.items()
+        }
         verify_files(folder, report, bound)
+
+
+def _verify_file(
+    compare: Callable[[Source, Scenes], None], report: Report, scenes: Scenes, path: Path
+) -> None:
+    file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
+    scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
+    if scene is not None and scene not in scenes:
+        report.skip(f"{path.name}: scene {scene}, which is not at hand")
+    else:
+        compare(file, scenes)
+        file.finish()
 
 
 def _part_of(folder: Path) -> str | None:

@@ -1,10 +1,7 @@
 """CaRL against the official code: network, decoding, and closed loops from the scenes' own logs."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +10,16 @@ from shiftsim.planners.learned.carl.planner import Carl, command_of
 from shiftsim.planners.learned.carl.view import CHANNELS, SIZE, in_picture, picture_frame
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation
-from shiftsim.verify.files import read_arrays
+from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, num_elements, verify_manifest
-from shiftsim.verify.report import Report
+from shiftsim.verify.nets.networks import (
+    make_network,
+    match_meta,
+    verify_manifest,
+)
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, NUM_STATE, AgentKind
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, NUM_STATE, AgentKind, Command
 
 NAME = Carl.name
 NETWORK = 2e-5  # network outputs
@@ -30,7 +30,7 @@ DECODED = 1e-9  # m/s^2, rad/s, from their action
 BORDER_ACTION = 1e-3  # where pixels differ
 JITTER = 1e-7  # m: vertices closer to the border of a pixel than this may fall on either side
 MAX_PIXELS = SIZE * SIZE // 1000  # of a channel that may differ for that reason
-BOUNDS = {"action": ACTION, "measurements": MEASURED}  # others: NETWORK
+BOUNDS = {"action": ACTION, "measurements": MEASURED, "": NETWORK}
 
 _DRIVE = {
     "dist_mu.0.weight, dist_sigma.0.weight": "base value, then row 0 times 4 and row 1 times 0.05",
@@ -41,37 +41,30 @@ _VALUE_MEASUREMENTS = np.ones(4, np.float32)  # what the critic is told at infer
 _RECORDED = ("measurements", "action", "alpha", "beta", "value")
 
 
-def _verify_manifest(path: Path, report: Report, scenes: Scenes) -> None:
-    from shiftsim.planners.learned.carl.network import RELEASED, build_network
+def _verify_manifest(file: Source, scenes: Scenes) -> None:
+    from shiftsim.planners.learned.carl.network import RELEASED
 
-    network = build_network()
-    layers, value_head = list(network.features_extractor.cnn), network.value_head
-    parameters = {
-        "parameters": network.state_dict().values(),
-        "parameters_trainable": network.parameters(),
-        "parameters_value_head": value_head.parameters(),
-        "parameters_cnn_layernorm": [p for norm in layers[1::3] for p in norm.parameters()],
-        "parameters_cnn_conv": [p for layer in layers[:-1:3] for p in layer.parameters()],
+    counts = {
+        "parameters": "",
+        "parameters_trainable": "",
+        "parameters_value_head": "value_head",
+        "parameters_cnn_layernorm": r"features_extractor\.cnn\.(1|4|7|10|13|16|19)\.",
+        "parameters_cnn_conv": r"features_extractor\.cnn\.(0|3|6|9|12|15|18)\.",
     }
-    counts = {name: num_elements(tensors) for name, tensors in parameters.items()}
-    others = {**counts, "checkpoint": None, "hyper": RELEASED, "drive_overrides": _DRIVE}
-    verify_manifest(path, report, NAME, others)
+    others = {"checkpoint": None, "hyper": RELEASED, "drive_overrides": _DRIVE}
+    verify_manifest(file, NAME, counts, others)
 
 
-def _verify_forward(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_forward(file: Source, scenes: Scenes) -> None:
     """The network on stored inputs, with each variant of the weights."""
-    file = read_arrays(path, report)
-    meta = json.loads(str(file["meta"]))
     variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
-    expected = {"case": path.stem.removeprefix("forward_"), "variants": variants}
-    report.compare(f"{NAME} meta", path.name, expected, meta)
+    match_meta(file, NAME, {"case": file.name.removeprefix("forward_"), "variants": variants})
     names = ("bev_semantics", "measurements", "value_measurements")
     see, feel, tell = (file[f"in.{name}"][None] for name in names)
     for variant in variants:
         parts, heads = _outputs(variant, see, feel, tell)
         for start, ours in (("out.", parts), (f"out.{variant}.", heads)):
-            file.below(start).match(f"{path.stem} {variant}", ours, _bounds(ours), quantity=NAME)
-    file.finish()
+            file.below(start).match(f"{file.name} {variant}", ours, BOUNDS, quantity=NAME)
 
 
 def _outputs(
@@ -101,29 +94,22 @@ def _outputs(
             "log_prob": distribution.log_prob(distribution.mean).sum(dim=1),
             "entropy": distribution.entropy().sum(dim=1),
         }
-    return _to_numpy(parts), _to_numpy(heads)
+    return parts, heads
 
 
-def _to_numpy(tensors: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value.numpy() for name, value in tensors.items()}
+def _verify_decoding(file: Source, scenes: Scenes) -> None:
+    match_meta(file, NAME, {"columns": list(FILE_COLUMNS), "dt": 0.1})
+    states = file.take("in.state", -1, NUM_STATE)
+    after, commands = np.empty(states.shape), np.empty((len(states), 2))
+    for row, (ego, action) in enumerate(zip(states, file["in.action"], strict=True)):
+        commands[row] = _numbers(command_of(action, ego))
+        step_bicycle(ego, *commands[row], WHEEL_BASE, 0.1, after[row])
+    ours = {"command": commands, "next_state": after}
+    file.below("out.").match_rows(ours, DECODED, where=file.name)
 
 
-def _bounds(names: Mapping[str, Any]) -> dict[str, float]:
-    return {name: BOUNDS.get(name, NETWORK) for name in names}
-
-
-def _verify_decoding(path: Path, report: Report, scenes: Scenes) -> None:
-    file = read_arrays(path, report)
-    meta = json.loads(str(file["meta"]))
-    report.compare(f"{NAME} meta", path.name, {"columns": list(FILE_COLUMNS), "dt": 0.1}, meta)
-    states, out = file.take("in.state", -1, NUM_STATE), np.empty(NUM_STATE)
-    for row, ego in enumerate(states):
-        command = command_of(file["in.action"][row], ego)
-        numbers = (command.acceleration, command.steering_rate)
-        step_bicycle(ego, *numbers, WHEEL_BASE, 0.1, out)
-        ours = {"out.command": numbers, "out.next_state": out}
-        file.at(row).match(f"{path.stem} {row}", ours, DECODED, quantity=NAME)
-    file.finish()
+def _numbers(command: Command) -> tuple[float, float]:
+    return command.acceleration, command.steering_rate
 
 
 def _compare(loop: Loop) -> None:
@@ -136,14 +122,15 @@ def _compare(loop: Loop) -> None:
     ours = {name: value[0] for name, value in heads.items()}
     ours |= {"measurements": measured, "action": loop.output}
     for name in _RECORDED:
-        atol = _bounds(ours)[name] if equal or name == "measurements" else BORDER_ACTION
+        exact = equal or name == "measurements"
+        atol = BOUNDS.get(name, NETWORK) if exact else BORDER_ACTION
         loop.compare(name, ours[name], loop.recorded(name), atol)
     # the next step goes on from their action: standing still, each step multiplies a difference
     decoded = loop.planner.decode(loop.recorded("action"), loop.seen)
     atol = COMMAND if equal else BORDER_ACTION * 10.0
     for whose, command, bound in (("our", loop.plan, atol), ("their", decoded, DECODED)):
-        numbers = (command.acceleration, command.steering_rate)
-        loop.compare(f"command of {whose} action", numbers, loop.recorded("command"), bound)
+        theirs = loop.recorded("command")
+        loop.compare(f"command of {whose} action", _numbers(command), theirs, bound)
 
 
 def _compare_pictures(loop: Loop, ours: np.ndarray) -> bool:

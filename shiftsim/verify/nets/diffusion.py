@@ -3,12 +3,10 @@
 Everything is made from the scene's own log and map; stored features are only compared with.
 """
 
-import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,10 +30,14 @@ from shiftsim.planners.learned.diffusion.kernels import (
 )
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.verify.files import Source, read_arrays, read_fields, read_json
+from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import FEATURE, make_network, num_elements, verify_manifest
-from shiftsim.verify.report import Report
+from shiftsim.verify.nets.networks import (
+    FEATURE,
+    make_network,
+    match_meta,
+    verify_manifest,
+)
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
@@ -68,12 +70,7 @@ _OTHER_ARGS = {  # of training, or fixed by the features
     "device": "cpu",
 }
 _TRACK_COLUMNS = ["track", "vx", "vy", "heading", "width", "length", "x", "y"]
-_STATIC = (
-    AgentKind.CZONE_SIGN,
-    AgentKind.BARRIER,
-    AgentKind.TRAFFIC_CONE,
-    AgentKind.GENERIC_OBJECT,
-)
+_STATIC = ("CZONE_SIGN", "BARRIER", "TRAFFIC_CONE", "GENERIC_OBJECT")
 
 
 def start_noise(key: str) -> np.ndarray:
@@ -95,14 +92,11 @@ class KeyedPlanner(DiffusionPlanner):
         return replace(super().features(observation), noise=noise)
 
 
-def _verify_manifest(path: Path, report: Report, scenes: Scenes) -> None:
-    from shiftsim.planners.learned.diffusion.network import PREFIXES, build_network
+def _verify_manifest(file: Source, scenes: Scenes) -> None:
+    from shiftsim.planners.learned.diffusion.network import PREFIXES
 
-    network = build_network()
     last = "decoder.decoder.dit.final_layer.proj.4"
     others = {
-        "parameters": num_elements(network.state_dict().values()),
-        "parameters_encoder": num_elements(network.encoder.parameters()),
         "checkpoint": lambda given: {
             **given,
             "prefix": PREFIXES[0] + given["prefix"][len(PREFIXES[0]) :],
@@ -111,86 +105,71 @@ def _verify_manifest(path: Path, report: Report, scenes: Scenes) -> None:
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
         "noise": _NOISE,
     }
-    verify_manifest(path, report, NAME, others)
+    verify_manifest(file, NAME, {"parameters": "", "parameters_encoder": "encoder"}, others)
 
 
-def _verify_args(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_args(file: Source, scenes: Scenes) -> None:
     """The bundled settings must be those of the file; both normalisers too."""
     from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS
 
-    given = read_json(path)
-    rows = (1 + int(given["predicted_neighbor_num"]), 1, 1)
-    normaliser = DEFAULT_ARGS["state_normalizer"]
-    ours = {**DEFAULT_ARGS, **_OTHER_ARGS}
-    ours["state_normalizer"] = {name: np.tile(row, rows) for name, row in normaliser.items()}
-    _match_tree(Source(path.stem, "field", given, report), path.name, ours)
+    agents, normaliser = 1 + int(file["predicted_neighbor_num"]), DEFAULT_ARGS["state_normalizer"]
+    rows = {name: [[row]] * agents for name, row in normaliser.items()}
+    ours = {**DEFAULT_ARGS, **_OTHER_ARGS, "state_normalizer": rows}
+    file.match(file.name, ours, quantity=f"{NAME} args")
 
 
-def _match_tree(given: Source, where: str, ours: Mapping[str, Any]) -> None:
-    for name, value in ours.items():
-        if isinstance(value, Mapping) and name in given:
-            (part,) = given.each(name)
-            _match_tree(part, f"{where} {name}", value)
-        else:
-            given.match(where, {name: value}, quantity=f"{NAME} args")
-    given.finish()
-
-
-def _verify_sampler(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_sampler(file: Source, scenes: Scenes) -> None:
     from shiftsim.planners.learned.diffusion.network import sampler
 
-    made, given = sampler.SCHEDULE, read_fields(path, report)
+    made, count = sampler.SCHEDULE, sampler.STEPS
     ours = {
-        "timesteps": made.times.numpy(),
-        "lambda": made.half_snr.numpy(),
-        "log_alpha": made.log_alpha.numpy(),
-        "alpha": made.alpha.numpy(),
-        "sigma": made.sigma.numpy(),
+        "timesteps": made.times,
+        "lambda": made.half_snr,
+        "log_alpha": made.log_alpha,
+        "alpha": made.alpha,
+        "sigma": made.sigma,
         "final_denoise_t": sampler.LAST_TIME,
     }
-    given.match(path.name, ours, SCHEDULE, quantity=NAME)
-    steps = given.each("steps")
-    report.compare(f"{NAME} sampler steps", path.name, sampler.STEPS, len(steps))
-    for i, step in enumerate(steps):
-        ours = {
-            "step": i + 1,
-            "order": 1 if i == 0 else 2,
-            "t": float(made.times[i + 1]),
-            "h": float(made.h[i]),
-            "c_x": float(made.c_x[i]),
-            "c_x0": float(made.c_x0[i]),
-            "r0": np.nan if i == 0 else float(made.r0[i - 1]),
-        }
-        step.match(f"step {i + 1}", ours, SCHEDULE, quantity=f"{NAME} sampler")
-    given.finish()
+    steps = {
+        "step": np.arange(count) + 1,
+        "order": np.minimum(np.arange(count) + 1, 2),
+        "t": made.times[1:],
+        "h": made.h,
+        "c_x": made.c_x,
+        "c_x0": made.c_x0,
+        "r0": np.array([np.nan, *made.r0.tolist()]),
+    }
+    file.match(file.name, ours, SCHEDULE, quantity=NAME)
+    listed = file["steps"]
+    theirs = {name: [step[name] for step in listed] for name in listed[0]}
+    table = Source("sampler steps", "field", theirs, file.report)
+    table.match(file.name, steps, SCHEDULE, quantity=f"{NAME} sampler")
+    table.finish()
 
 
-def _verify_forward(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_forward(file: Source, scenes: Scenes) -> None:
     """The network on stored inputs."""
     import torch
 
-    file = read_arrays(path, report)
-    case, given = path.stem.removeprefix("forward_"), file.below("in.")
+    case, given = file.name.removeprefix("forward_"), file.below("in.")
     variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
-    meta = {"case": case, "variants": variants}
+    match_meta(file, NAME, {"case": case, "variants": variants})
     limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
-    report.compare(f"{NAME} meta", path.name, meta, json.loads(str(file["meta"])))
-    given.match(path.stem, {"noise": start_noise(case)[None], **known}, quantity=NAME)
+    given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
         network = make_network(NAME, "base")
         scene = network.normalise(inputs)
-        normalised = {name: scene[name].numpy() for name in network.normalisers}
-        file.below("norm.").match(path.stem, normalised, NORMALISED, quantity=f"{NAME} normalised")
+        normalised = {name: scene[name] for name in network.normalisers}
+        file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
         encoded = {
-            "encoding": network.encode(scene).numpy(),
-            "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]).numpy(),
+            "encoding": network.encode(scene),
+            "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]),
         }
-        file.below("out.").match(path.stem, encoded, NETWORK, quantity=NAME)
+        file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
         for variant in variants:
             _verify_sampling(file, variant, scene, inputs)
-    file.finish()
 
 
 def _verify_sampling(
@@ -229,8 +208,7 @@ def _verify_sampling(
         guided = with_guidance(call, network, inputs["neighbor_agents_past"], absent)
         ours["guided_prediction"] = (sampled(guided), bound)
     for name, (value, atol) in ours.items():
-        where = f"{file.name} {variant}"
-        stored.match(where, {name: value.numpy()}, atol, quantity=NAME)
+        stored.match(f"{file.name} {variant}", {name: value}, atol, quantity=NAME)
 
 
 def _compare(loop: Loop) -> None:
@@ -241,19 +219,17 @@ def _compare(loop: Loop) -> None:
     if not list(loop.stored):
         return
     features, road, tokens = loop.features, loop.scenario.map, loop.scenario.tracks.tokens
-    loop.match(
-        {
-            "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
-            "agent_tokens": [tokens[track] for track in features.agents.tolist()],
-            "corrected_route_ids": [road.blocks.ids[block] for block in features.route or ()],
-        }
-    )
-    route = [f"route_lanes_{name}" for name in ("speed_limit", "has_speed_limit")]
-    read = {f"feature/{name}": getattr(features, name) for name in (*INPUTS, *route)}
-    loop.match(read, FEATURE)
-    loop.match({"prediction": loop.output}, bound)
+    names = (*INPUTS, "route_lanes_speed_limit", "route_lanes_has_speed_limit")
+    ours = {
+        "lane_ids": [road.edges.ids[edge] for edge in features.edges.tolist()],
+        "agent_tokens": [tokens[track] for track in features.agents.tolist()],
+        "corrected_route_ids": [road.blocks.ids[block] for block in features.route or ()],
+        "prediction": loop.output,
+        **{f"feature/{name}": getattr(features, name) for name in names},
+    }
     if "encoding" in loop.stored:
-        loop.match({"encoding": _encoding(loop.variant, features)}, NETWORK)
+        ours["encoding"] = _encoding(loop.variant, features)
+    loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
 
 
 def _encoding(variant: str, features: Features) -> Any:
@@ -263,20 +239,17 @@ def _encoding(variant: str, features: Features) -> Any:
     network = make_network(NAME, variant)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
-        return network.encode(network.normalise(inputs))[0].numpy()
+        return network.encode(network.normalise(inputs))[0]
 
 
-def _verify_agents(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_agents(file: Source, scenes: Scenes) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
-    file = read_arrays(path, report)
-    meta = json.loads(str(file["meta"]))
-    report.compare(f"{NAME} meta", path.name, {"frame_columns": _TRACK_COLUMNS}, meta)
+    match_meta(file, NAME, {"frame_columns": _TRACK_COLUMNS})
     if f"in.frame{SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
     made = agent_features(_tracks(file), file.take("in.anchor", 3))
     ours = dict(zip(("agents", "static", "selected"), made, strict=True))
-    file.below("out.").match(path.stem, ours, FEATURE, quantity=f"{NAME} many")
-    file.finish()
+    file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
 
 def _tracks(file: Source) -> Tracks:
@@ -289,7 +262,9 @@ def _tracks(file: Source) -> Tracks:
             if kinds.setdefault(int(track), kind) != kind:
                 raise DataError("a track changes its type")
     static = file.take("in.static", -1, 5)
-    static_kinds = [_STATIC[kind] for kind in file.take("in.static_type", len(static)).tolist()]
+    static_kinds = [
+        AgentKind[_STATIC[kind]] for kind in file.take("in.static_type", len(static)).tolist()
+    ]
     column = {track: index for index, track in enumerate(kinds)}
     shape = (len(frames), len(column) + len(static))
     values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)
@@ -304,11 +279,9 @@ def _tracks(file: Source) -> Tracks:
     return Tracks(valid, poses, velocities, sizes, codes, tuple(map(str, range(shape[1]))))
 
 
-def _verify_lanes(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_lanes(file: Source, scenes: Scenes) -> None:
     """Which lanes and route lanes are kept where there are too many, and their rows."""
-    file = read_arrays(path, report)
-    meta = json.loads(str(file["meta"]))
-    report.compare(f"{NAME} meta", path.name, {"light": "green, yellow, red, unknown"}, meta)
+    match_meta(file, NAME, {"light": "green, yellow, red, unknown"})
     anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
     lines, left, right = (_lines(file, n) for n in ("lane", "left_boundary", "right_boundary"))
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
@@ -320,7 +293,9 @@ def _verify_lanes(path: Path, report: Report, scenes: Scenes) -> None:
     point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
     edges = nearest_lanes(np.arange(len(owner)), point, lines, anchor[0], anchor[1], LANES)
     lights = file.take("in.light", len(owner), 4)
-    report.compare(f"{NAME} lights", path.name, lights.sum(axis=1), np.ones(len(owner), np.int64))
+    file.report.compare(
+        f"{NAME} lights", file.name, lights.sum(axis=1), np.ones(len(owner), np.int64)
+    )
     rows = lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, LANES)
     on_route = lanes_on_route(
         lanes.blocks[edges], [index.get(name, -1) for name in file["in.route"].tolist()]
@@ -329,8 +304,7 @@ def _verify_lanes(path: Path, report: Report, scenes: Scenes) -> None:
     for name, array in list(ours.items()):
         ours[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
         ours[f"route_{name}"][: len(on_route)] = array[on_route]
-    file.below("out.").match(path.stem, ours, FEATURE, quantity=f"{NAME} many")
-    file.finish()
+    file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
 
 def _lines(file: Source, name: str) -> Polylines:

@@ -7,7 +7,6 @@ import hashlib
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,7 @@ import numpy as np
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.observation import HISTORY_SAMPLES, observe_log, past_rows, scene_info
-from shiftsim.sim.planner import Observation
-from shiftsim.verify.files import Source, read_arrays
-from shiftsim.verify.report import Report
+from shiftsim.verify.files import Source
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
 
@@ -51,12 +48,6 @@ class Loop:
         output: What its network said of them.
         plan: What it made of that.
     """
-
-    stored: Source
-    seen: Observation
-    features: Any
-    output: Any
-    plan: Any
 
     def __init__(self, file: Source, planner: Any, scenes: Scenes) -> None:
         self.file, self.planner, self.name = file, planner, planner.name
@@ -151,8 +142,7 @@ class Loop:
 
 
 def verify_loop(
-    path: Path,
-    report: Report,
+    file: Source,
     scenes: Scenes,
     make: Callable[[str], Any],
     compare: Callable[[Loop], None],
@@ -161,24 +151,19 @@ def verify_loop(
     """Make every step of a closed loop again and compare.
 
     Args:
-        path: The file.
-        report: Receives the comparisons.
+        file: The file.
         scenes: The scenes.
         make: Makes the planner from the name of its weights.
         compare: Compares one step.
         recorded: Names of the arrays with a row for every plan.
     """
-    file = read_arrays(path, report)
-    if (scene := str(file["meta/scene"])) not in scenes:
-        report.skip(f"{path.name}: scene {scene}, which is not at hand")
-        return
     loop = Loop(file, _planner(make, f"deterministic:{file['meta/variant']}").fork(), scenes)
     loop.compare_scene(scenes)
     counts = [len(file[f"out/{name}"]) for name in recorded]
     loop.compare("plans", counts, counts[:1] * len(counts))
     where, _, error = str(file["meta/error"]).partition(": ")
     if error not in ("", *KNOWN_ERRORS):
-        report.skip(f"{path.name}: the official failure {error!r}")
+        file.report.skip(f"{file.name}: the official failure {error!r}")
     loop.compare("failure", f"iteration {counts[0]}" if counts[0] < len(loop.ego) else "", where)
     for number in range(len(loop.ego)):
         loop.step(number)
@@ -187,7 +172,6 @@ def verify_loop(
         if number < counts[0]:
             compare(loop)
     loop.compare_driven()
-    file.finish()
 
 
 @cache

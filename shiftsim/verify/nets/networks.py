@@ -1,16 +1,16 @@
 """Networks with deterministic weights, and the manifests that say how they are made."""
 
+import json
+import re
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import DataError
 from shiftsim.planners.learned.checkpoint import load_weights
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
-from shiftsim.verify.files import read_fields
-from shiftsim.verify.report import Report
+from shiftsim.verify.files import Source
 
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
 OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale up, by variant
@@ -20,10 +20,7 @@ OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale u
 def make_network(planner: str, variant: str, **args: Any) -> Any:
     """The network of a planner with deterministic weights, ready to be called.
 
-    Args:
-        planner: Its name.
-        variant: `base` or `drive`.
-        args: Hyper-parameters that differ from the released ones.
+    `variant` is that of the weights, `args` are hyper-parameters that differ from the released.
     """
     if variant not in OUTPUT:
         raise DataError(f"unknown variant {variant!r} of the weights")
@@ -32,28 +29,31 @@ def make_network(planner: str, variant: str, **args: Any) -> Any:
     return network.eval()
 
 
-def num_elements(tensors: Any) -> int:
-    """How many numbers tensors hold together."""
-    return sum(int(tensor.numel()) for tensor in tensors)
+def match_meta(file: Source, planner: str, ours: Mapping[str, object]) -> None:
+    """Compare the JSON text in the array `meta`."""
+    file.report.compare(f"{planner} meta", file.name, ours, json.loads(str(file["meta"])))
 
 
-def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[str, Any]) -> None:
+def verify_manifest(
+    manifest: Source, planner: str, counts: Mapping[str, str], others: Mapping[str, Any]
+) -> None:
     """Compare the manifest of a network: names, shapes, types, rules and weights.
 
     Args:
-        path: The file `state_dict.json`.
-        report: Receives the comparisons.
+        manifest: The file `state_dict.json`.
         planner: Name of the planner.
+        counts: By field that is the size of all weights, or of the trainable ones if it says so:
+            pattern of their names.
         others: Further fields: our value, a function that makes it from theirs, or None for a text
             that need not be compared.
     """
-    manifest, module = read_fields(path, report), network_module(planner)
+    report, module = manifest.report, network_module(planner)
     network = module.build_network(None)
     built = {name: value.detach().numpy() for name, value in network.state_dict().items()}
     rules = getattr(module, "RULES", None) or {}
     entries = manifest.each("keys" if "keys" in manifest else "entries")
     names = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
-    report.compare(f"{planner} state names", path.name, sorted(built), sorted(names))
+    report.compare(f"{planner} state names", manifest.name, sorted(built), sorted(names))
     parameters = {name for name, _ in network.named_parameters()}
     for name, entry in zip(names, entries, strict=True):
         if name not in built:
@@ -80,11 +80,13 @@ def verify_manifest(path: Path, report: Report, planner: str, others: Mapping[st
         for name in check:
             first = weights[name].ravel()[: len(check[name])].astype(float)
             report.compare(f"{planner} selfcheck", name, first, check[name])
-    for name, ours in others.items():
-        if ours is None:
-            manifest.note("description", name)
-        else:
-            value = ours(manifest[name]) if callable(ours) else ours
-            manifest.match(path.name, {name: value}, quantity=f"{planner} manifest")
+    sizes = {field: 0 for field in counts}
+    for field, pattern in counts.items():
+        some = parameters if "trainable" in field else built
+        sizes[field] = sum(built[name].size for name in some if re.match(pattern, name))
+    made = {name: ours(manifest[name]) if callable(ours) else ours for name, ours in others.items()}
+    for name in [name for name, ours in made.items() if ours is None]:
+        manifest.note("description", name)
+        del made[name]
+    manifest.match(manifest.name, sizes | made, quantity=f"{planner} manifest")
     manifest.used.add("planner")
-    manifest.finish()

@@ -1,7 +1,6 @@
 """PLUTO: network, features, scores of the proposals, emergency brake and plans."""
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import stack
 from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS, Choice, Pluto, Sight
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, aggregate, nearest_line, score
-from shiftsim.verify.files import read_arrays
+from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import (
     FILE_COLUMNS,
     HEADING,
@@ -22,7 +21,7 @@ from shiftsim.verify.nets.loops import (
     verify_loop,
 )
 from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network
-from shiftsim.verify.nets.vectors import (
+from shiftsim.verify.nets.plantf import (
     INPUTS,
     compare_features,
     compare_outputs,
@@ -31,7 +30,6 @@ from shiftsim.verify.nets.vectors import (
     verify_forward,
     verify_vector_manifest,
 )
-from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
@@ -53,19 +51,16 @@ SCORES = {  # stored array → field of `Scores`, tolerance where proposals are 
 }
 
 
-def _verify_brake(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_brake(file: Source, scenes: Scenes) -> None:
     """Unit cases of the emergency brake."""
-    file = read_arrays(path, report)
-    egos, poses = file.take("ego", -1, NUM_STATE), file.take("candidate", -1, 81, 3)
+    egos, poses, times = file.take("ego", -1, NUM_STATE), file["candidate"], file["fault_time"]
+    speeds = np.hypot(egos[:, VX], egos[:, VY])
+    must = [must_brake(*pair) for pair in zip(speeds.tolist(), times.tolist(), strict=True)]
+    states = np.full((len(egos), 81, NUM_STATE), np.nan)
+    for case in np.flatnonzero(must).tolist():
+        states[case] = brake(poses[case], egos[case], float(times[case]), PACIFICA)
     file.match("file", {"columns": list(FILE_COLUMNS)})
-    for case, (ego, time) in enumerate(zip(egos, file["fault_time"], strict=True)):
-        speed = float(np.hypot(ego[VX], ego[VY]))
-        must, states = must_brake(speed, float(time)), np.full((81, NUM_STATE), np.nan)
-        if must:
-            states = brake(poses[case], ego, float(time), PACIFICA)
-        ours = {"speed": speed, "braked": must, "states": states}
-        file.at(case).match(f"case {case}", ours, {"speed": LINE, "states": STATE})
-    file.finish()
+    file.match_rows({"speed": speeds, "braked": must, "states": states}, {"speed": LINE, "": STATE})
 
 
 def _compare(loop: Loop) -> None:
@@ -142,8 +137,8 @@ def _compare_choice(loop: Loop, choice: Choice) -> None:
     ours = {
         "cand": (choice.poses, POSITION),
         "lscore": (choice.learned, SCORE),
-        "agents_pred": (choice.agents[0], POSITION),
-        "agents_vel": (choice.agents[1], OUTPUT[loop.variant]),
+        "agents_pred": (choice.agents.poses, POSITION),
+        "agents_vel": (choice.agents.speeds, OUTPUT[loop.variant]),
         **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
     }
     for name, (value, atol) in ours.items():
@@ -168,7 +163,10 @@ def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     line = nearest_line(sight.lines, ego)
     ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
     stored.match(loop.where, ours, EXACT, quantity=NAME)
-    world = loop.planner.world_of(loop.seen, (stored["agents_pred"], stored["agents_vel"]))
+    agents = loop.planner.choice.agents._replace(
+        poses=stored["agents_pred"], speeds=stored["agents_vel"]
+    )
+    world = loop.planner.world_of(loop.seen, agents)
     place = Place(sight.drivable, scenario.map.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
     scores: Scores = score(proposals, stored["lscore"], ego, world, place, PACIFICA)

@@ -1,18 +1,15 @@
 """Corrected routes of the learned planners (`route_correction_*.json`)."""
 
-from pathlib import Path
-
 import numpy as np
 
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.route_correction import (
+from shiftsim.planners.routes.correction import (
     RouteCorrector,
     correct_route,
     find_start,
     known_blocks,
 )
-from shiftsim.verify.files import Source, read_fields
-from shiftsim.verify.report import Report
+from shiftsim.verify.files import Source
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, center_poses
@@ -21,19 +18,14 @@ SQUARE = 1.0  # m, half width
 NAME = "corrected route"
 
 
-def _verify_routes(path: Path, report: Report, scenes: Scenes) -> None:
+def _verify_routes(file: Source, scenes: Scenes) -> None:
     """Correct every route of a file again and compare."""
-    file = read_fields(path, report)
-    scene, cases = str(file["scene"]), file.each("cases")
-    if scene not in scenes:
-        report.skip(f"{path.name}: scene {scene}, which is not at hand", len(cases))
-        return
-    file.match(path.name, {"map": scenes[scene].map.name}, quantity=NAME)
-    for number, case in enumerate(cases):
-        where = f"{path.name} {number} ({case['case']})"
-        with report.attempt(NAME, where):
-            _verify_case(case, where, scenes[scene])
-    file.finish()
+    scenario = scenes[str(file["scene"])]
+    file.match(file.name, {"map": scenario.map.name}, quantity=NAME)
+    for number, case in enumerate(file.each("cases")):
+        where = f"{file.name} {number} ({case['case']})"
+        with file.report.attempt(NAME, where):
+            _verify_case(case, where, scenario)
 
 
 def _verify_case(case: Source, where: str, scenario: Scenario) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.nuplan.log import Log, open_log, read_boxes, read_ego
+from shiftsim.data.nuplan.boxes import read_boxes
+from shiftsim.data.nuplan.log import Log, open_log, read_ego
 from shiftsim.data.nuplan.scenarios import find_maps
 from shiftsim.verify.files import Groups, Source, read_json
 from shiftsim.verify.nuplan.maps import METRES, RADIANS, verify_maps

@@ -16,7 +16,6 @@ from shiftsim.sim.loop import simulate
 from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.sim.planner import Observation, Planner
 from shiftsim.sim.traffic.idm.agents import order_observed
-from shiftsim.sim.traffic.idm.model import IdmParameters
 from shiftsim.verify.files import TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import known_scores
 from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
@@ -101,8 +100,7 @@ def _compare_objects(
     heights: dict[tuple[int, str], float],
 ) -> None:
     tracks = log.tracks
-    open_loop = IdmParameters().open_loop
-    orders = [order_observed(tracks.kinds, row, open_loop) for row in tracks.valid]
+    orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
     track = np.concatenate(orders)
     ours = object_columns(tracks, iteration, track)

@@ -47,12 +47,13 @@ def _compare_outputs(
     route, path = planner.route_plan, planner.path
     assert route is not None
     assert path is not None
+    end = [*path.driven.xy[-1].tolist(), float(path.driven.heading[-1])]
     ours = {
-        "edges": [scenario.map.edges.ids[edge] for edge in route.edges],
+        "edges": [scenario.map.edges.ids[edge] for edge in route.path],
         "path_found": route.found,
         "target_velocity": planner.target_velocity,
-        "path_points": len(path.progress),
-        "path_end": [path.end, *path.xy[-1].tolist(), wrap_angle(float(path.heading[-1]))],
+        "path_points": len(path.driven.progress),
+        "path_end": [path.end, *end[:2], wrap_angle(end[2])],
         "polyline_length": float(path.line_arc[-1]),
     }
     call.match(where, ours, TOLERANCE, quantity="IDM")

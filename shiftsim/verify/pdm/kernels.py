@@ -10,15 +10,14 @@ import shapely
 from shapely.ops import substring
 
 from shiftsim.errors import DataError
+from shiftsim.geometry.paths import make_path, project, window
 from shiftsim.planners.pdm.brake import brake_poses
-from shiftsim.planners.pdm.parameters import DEFAULT, DT, SCORED
-from shiftsim.planners.pdm.path import interpolate, make_path, offset_poses, project, window
-from shiftsim.planners.pdm.rollout import follow_many
-from shiftsim.planners.pdm.route import search_lanes
-from shiftsim.planners.proposals.comfort import SIGNALS, comfort, make_filters
-from shiftsim.planners.proposals.tracker import simulate_proposals
-from shiftsim.planners.route_correction import search
-from shiftsim.sim.dynamics.lqr import NUPLAN
+from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.rollout import follow, read_pose
+from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.proposals.comfort import SIGNALS, comfort
+from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
+from shiftsim.planners.routes.search import search_cheapest, search_levels
 from shiftsim.verify.files import TOLERANCE, Source, read_arrays, read_json, verify_files
 from shiftsim.verify.pdm.steps import verify_step, verify_summary
 from shiftsim.verify.report import Report
@@ -52,33 +51,29 @@ def _verify_file(report: Report, part: Callable[[Source], None], path: Path) -> 
 def _idm(file: Source) -> None:
     limits = file.take("speed_limit_mps", -1)
     limits = np.where(np.isnan(limits), DEFAULT.fallback_velocity, limits)
-    ours = follow_many(
-        file.take("prev_progress_velocity", len(limits), 2),
-        file.take("lead_progress_velocity_rear", len(limits), 3),
-        np.array(DEFAULT.speed_fractions)[file.take("policy_idx", len(limits))] * limits,
-        DEFAULT.following,
-    )
+    targets = np.array(DEFAULT.speed_fractions)[file.take("policy_idx", len(limits))] * limits
+    before = file.take("prev_progress_velocity", len(limits), 2)
+    leads = file.take("lead_progress_velocity_rear", len(limits), 3)
+    ours = np.empty((len(limits), 2))
+    for case, target in enumerate(targets):
+        follow(before[case], leads[case], target, DEFAULT.following, ours[case])
     file.match_rows({"next_progress_velocity": ours}, TOLERANCE)
 
 
 def _tracker(file: Source) -> None:
     poses = file.take("proposal_poses", -1, -1, SCORED + 1, 3)
-    shape = poses.shape[:2]
+    egos = file.take("ego_state", len(poses), NUM_STATE)
+    driven = [drive_proposals(*case) for case in zip(poses, egos, strict=True)]
+    names = ("velocity_profile", "curvature_profile", "simulated_states")
     ours = {
-        "velocity_profile": np.empty((*shape, SCORED)),
-        "curvature_profile": np.empty((*shape, SCORED)),
-        "simulated_states": np.empty((*shape, SCORED + 1, NUM_STATE)),
+        name: np.stack(rows) for name, rows in zip(names, zip(*driven, strict=True), strict=True)
     }
-    for case, ego in enumerate(file.take("ego_state", shape[0], NUM_STATE)):
-        simulate_proposals(poses[case], ego, NUPLAN, DT, *(out[case] for out in ours.values()))
     file.match_rows(ours, TOLERANCE)
 
 
 def _comfort(file: Source) -> None:
     states = file.take("states", -1, SCORED + 1, NUM_STATE)
-    signals = np.empty((len(states), len(SIGNALS), SCORED + 1))
-    bounded = np.empty((len(states), len(SIGNALS)), np.bool_)
-    comfort(states, make_filters(), DEFAULT.comfort, signals, bounded)
+    signals, bounded = comfort(states, DEFAULT.comfort)
     ours = dict(zip(SIGNALS, signals.transpose(1, 0, 2), strict=True))
     file.match_rows({"is_comfortable": bounded, **ours}, SIGNAL_TOLERANCE)
     file.note("states: all but heading, ax and ay are not read by the test")
@@ -98,7 +93,7 @@ def _path(file: Source) -> None:
         path = make_path(poses)
         at = np.empty((len(given["query_s"]), 3))
         for row, progress in enumerate(given.take("query_s", -1).tolist()):
-            interpolate(path, progress, at[row])
+            read_pose(path, progress, at[row])
         points = given.take("query_xy", -1, 2).tolist()
         along = [project(path, x, y, 0)[0] for x, y in points]
         given.match(where, {"progress": path.progress, "projection": along}, TOLERANCE)
@@ -137,7 +132,7 @@ def _search_blocks(case: Source) -> tuple[bool, list[int]]:
     after, before = _neighbours(case)
     goals, forward = {int(target) for target in case["targets"]}, case["forward"]
     neighbours = after if forward else before
-    found = search(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
+    found = search_levels(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
     return found.found, found.path if forward else found.path[::-1]
 
 
@@ -147,13 +142,13 @@ def _search_lanes(case: Source) -> tuple[bool, list[int]]:
     if not len(lengths) == len(blocks) == case["n"]:
         raise DataError("a lane has no length or no block")
     allowed = {int(lane) for lane in case["candidates"]}
-    found = search_lanes(
+    found = search_cheapest(
         case["start"],
         lambda lane: [n for n in after[lane] if n in allowed],
         lengths.__getitem__,
         lambda lane: blocks[lane] == target,
     )
-    return found.found, found.edges
+    return found.found, found.path
 
 
 _SEARCHES = {"bfs_roadblock": _search_blocks, "lane_dijkstra": _search_lanes}

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.planners.pdm.parameters import STEP_US, STEPS
-from shiftsim.planners.pdm.path import make_path
+from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.planner import PdmClosed
+from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.sim.observation import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
@@ -107,7 +107,7 @@ def _compare_calls(
         step = planner.step(observation)
         sight, road = planner.seen, seen.scenario.map
         assert sight is not None
-        planned = Planned(seen.ego[index], sight.tokens, sight.occupants, sight.road, step)
+        planned = Planned(seen.ego[index], sight.tokens, sight.forecast, sight.place, step)
         rows, theirs = steps.at(index), proposals.at(np.arange(per_call) + index * per_call)
         ours: dict[str, Any] = {
             "time_us": observation.time_us,
@@ -115,12 +115,12 @@ def _compare_calls(
             "speed_limit_mps": float(road.speed_limits[sight.lane]),
             "collided_ids": ",".join(planner.collided),
             "n_map_tokens": len(sight.tokens),
-            "n_drivable_tokens": len(sight.road.admitted),
+            "n_drivable_tokens": len(sight.place.selected),
         }
         rows.match(at, ours, quantity="PDM step")
         best = {"best_score": float(theirs["score"].max())}
         rows.match(at, best, TOLERANCE, quantity="PDM")
-        ends = {column: step.driven[:, -1, number] for column, number in _DRIVEN.items()}
+        ends = {column: step.driven.states[:, -1, number] for column, number in _DRIVEN.items()}
         theirs.match(at, ends, STEP_TOLERANCE, quantity="PDM")
         if compare_scores(at, planned, theirs, (int(rows["best"]), bool(rows["braked"]))):
             report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
@@ -131,7 +131,7 @@ def _compare_calls(
         arrays["proposals"] = arrays.pop("proposal_poses")
         tokens = {
             "map_tokens": sight.tokens,
-            "drivable_tokens": [ids[area] for area in sight.road.admitted.tolist()],
+            "drivable_tokens": [ids[area] for area in sight.place.selected.tolist()],
         }
         stored = {f"{name}_{index}": array for name, array in {**arrays, **tokens}.items()}
         file.match(at, stored, STEP_TOLERANCE)

@@ -6,11 +6,18 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.path import make_path
-from shiftsim.planners.pdm.planner import current_lane, in_index_order, lanes_at, start_route
-from shiftsim.planners.pdm.route import centerline, follow_route
-from shiftsim.planners.proposals.areas import admit
+from shiftsim.planners.pdm.route import (
+    centerline,
+    current_lane,
+    follow_route,
+    in_index_order,
+    lanes_at,
+    start_route,
+)
+from shiftsim.planners.proposals.areas import select_areas
+from shiftsim.planners.proposals.contacts import ego_box
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
@@ -40,16 +47,15 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
     ego[:3] = case["rear_axle"]
     route = start_route(road, tuple(case["route"]), ego, scenario.token)
     center = center_poses(ego[None, :3])[0]
-    admitted = admit(road, route.areas, center[0], center[1], DEFAULT.map_radius)
-    under, errors = lanes_at(road, route, admitted, ego)
-    ordered = in_index_order(route, admitted, under)
-    size = (PACIFICA.length, PACIFICA.width)
-    lane = current_lane(road, route, admitted, ego, center, size)
-    line = centerline(road, follow_route(road, route.corrected, lane).edges)
+    selected = select_areas(road, center[0], center[1], DEFAULT.map_radius)
+    under, errors = lanes_at(road, route, selected, ego)
+    ordered = in_index_order(route, selected, under)
+    lane = current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
+    line = centerline(road, follow_route(road, route.corrected, lane).path)
     edge_ids, block_ids = road.edges.ids, road.blocks.ids
     return {
         "start_block": block_ids[route.start.block],
-        "start_candidates": [block_ids[block] for block in route.start.candidates],
+        "start_candidates": [block_ids[block] for block in route.start.others],
         "corrected": [block_ids[block] for block in route.corrected],
         "route_lanes": [edge_ids[edge] for edge in route.lanes.tolist()],
         "intersecting_lanes": [edge_ids[route.areas.edge[area]] for area in ordered],

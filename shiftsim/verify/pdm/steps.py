@@ -7,20 +7,22 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
-    Occupants,
-    make_occupants,
+    Forecast,
+    make_forecast,
     select_tracks,
     touched,
-    touches_boxes,
 )
-from shiftsim.planners.pdm.parameters import DEFAULT, DT, SCORED, STEP_US, STEPS
-from shiftsim.planners.pdm.path import make_path, offset_poses
-from shiftsim.planners.pdm.scorer import TTC_STEPS, Road, Scores, place_ego, score, weigh
+from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.rollout import Scene
+from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
 from shiftsim.planners.pdm.step import Step, plan_step
-from shiftsim.planners.proposals.areas import areas_of, near_areas, on_multiple_lanes
-from shiftsim.planners.proposals.comfort import make_filters
+from shiftsim.planners.proposals.areas import areas_of
+from shiftsim.planners.proposals.contacts import Others, ego_box, touches_boxes
+from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
 from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, read_fields, read_json
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
@@ -49,8 +51,8 @@ class Planned(NamedTuple):
 
     ego: FloatArray
     tokens: list[str]
-    occupants: Occupants
-    road: Road
+    forecast: Forecast
+    place: Place
     step: Step
 
 
@@ -65,7 +67,7 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
     planned, collided = _plan(inputs)
-    boxes = planned.occupants.boxes[[index // 2 for index in SHOWN_FORECASTS]]
+    boxes = planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
     times = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
     ours = {
         "map_tokens": planned.tokens,
@@ -111,19 +113,20 @@ def _plan(inputs: Source) -> tuple[Planned, list[str]]:
     rings = [np.array(part["exterior"], np.float64) for part in parts]
     on_route = np.array([part["on_route"] for part in parts], np.bool_)
     areas = areas_of(make_polygons([[ring] for ring in rings]), on_route, np.arange(len(ids)))
-    occupants = make_occupants(tracks, chosen, [_open(rings[ids.index(name)]) for name in reds])
+    forecast = make_forecast(tracks, chosen, [_open(rings[ids.index(name)]) for name in reds])
     tokens = [*(tracks.tokens[i] for i in chosen.tolist()), *(LIGHT_TOKEN + name for name in reds)]
-    hit = touched(occupants, boxes_to_corners(center, np.array([PACIFICA.length, PACIFICA.width])))
-    occupants.ignored[hit] = True
+    hit = touched(forecast, boxes_to_corners(center, np.array([PACIFICA.length, PACIFICA.width])))
+    forecast.ignored[hit] = True
     line = np.array(inputs["centerline"], np.float64)
     paths = [make_path(line), *(make_path(offset_poses(line, s)) for s in DEFAULT.lateral_offsets)]
     crossings = make_polygons([[np.array(r, np.float64)] for r in inputs["intersections"]])
     limit = inputs["speed_limit_mps"]
     limit = DEFAULT.fallback_velocity if limit is None else limit
-    road = Road(areas, np.arange(len(ids)), crossings, paths[0])
+    place = Place(areas, np.arange(len(ids)), crossings, paths[0])
     targets = limit * np.array(DEFAULT.speed_fractions)
-    step = plan_step(ego, targets, paths, occupants, road, PACIFICA, DEFAULT)
-    return Planned(ego, tokens, occupants, road, step), [tokens[i] for i in hit]
+    scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
+    step = plan_step(ego, targets, scene, place, PACIFICA, DEFAULT)
+    return Planned(ego, tokens, forecast, place, step), [tokens[i] for i in hit]
 
 
 def _open(ring: FloatArray) -> FloatArray:
@@ -133,21 +136,14 @@ def _open(ring: FloatArray) -> FloatArray:
 def step_arrays(planned: Planned) -> dict[str, np.ndarray]:
     """Proposals, leads, driven states and areas of a step by the names of the reference."""
     step, made, scored = planned.step, planned.step.proposals, slice(0, SCORED + 1)
-    shape = step.driven.shape[:2]
-    corners, centers = np.empty((*shape, 4, 2)), np.empty((*shape, 2))
-    size = (PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center)
-    place_ego(step.driven, size, corners, centers)
-    areas = planned.road.areas
-    lanes = near_areas(areas, planned.road.admitted, corners)
-    multiple = [on_multiple_lanes(areas, lanes, box) for box in corners.reshape(-1, 4, 2)]
-    flags = [np.reshape(multiple, shape), step.scores.off_road, step.scores.oncoming]
+    shape = step.driven.states.shape[:2]
     # the best proposal goes on to 8 s; what is recorded ends where proposals are compared
     return {
         "proposal_poses": made.poses[:, :, scored].reshape(*shape, 3),
         "idm": made.motion[:, :, scored].reshape(*shape, 2),
         "lead": made.leads[:, :, scored].reshape(*shape, 3),
-        "simulated": step.driven,
-        "ego_areas": np.stack(flags, axis=-1),
+        "simulated": step.driven.states,
+        "ego_areas": step.scores.flags,
     }
 
 
@@ -184,14 +180,14 @@ def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
     ours, given, index = planned.step.scores, theirs["ttc"], theirs["ttc_idx"]
     exempt = np.zeros(len(given), np.bool_)
     for row in np.flatnonzero((ours.ttc != given) | (ours.ttc_index != index)).tolist():
-        first = _unstable(planned.step.driven[row], planned.occupants)
+        states, others = planned.step.driven.states, planned.forecast.others
+        first = _unstable(states[row], others)
         if not first:
             continue
-        ignored: BoolArray = planned.occupants.ignored.copy()
+        ignored: BoolArray = others.ignored.copy()
         ignored[list(first)] = True
-        blind = planned.occupants._replace(ignored=ignored)
-        driven = planned.step.driven
-        rest = score(driven, planned.road, blind, PACIFICA, DEFAULT, make_filters())
+        blind = others._replace(ignored=ignored)
+        rest = score(states, planned.place, blind, ego_box(PACIFICA), DEFAULT)
         is_hit = np.isfinite(index[row])
         if index[row] in {rest.ttc_index[row], *first.values()} and is_hit == (given[row] < 1.0):
             exempt[row] = True
@@ -206,13 +202,13 @@ def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
     )
 
 
-def _unstable(driven: FloatArray, occupants: Occupants) -> dict[int, float]:
+def _unstable(driven: FloatArray, others: Others) -> dict[int, float]:
     """Boxes exactly ahead or behind when the projected ego first touches them.
 
     Returns:
         Time index of the touch by box.
     """
-    seen = occupants.ignored[: len(occupants.kinds)].copy()
+    seen = others.ignored.copy()
     size = np.array([PACIFICA.length, PACIFICA.width])
     corners = boxes_to_corners(center_poses(driven[:, :3]), size)
     out: dict[int, float] = {}
@@ -222,9 +218,9 @@ def _unstable(driven: FloatArray, occupants: Occupants) -> dict[int, float]:
         for later in TTC_STEPS:
             forecast = (index + later) // 2
             box = corners[index] + later * travel
-            for hit in np.flatnonzero(touches_boxes(box, occupants.boxes[forecast]) & ~seen):
+            for hit in np.flatnonzero(touches_boxes(box, others.boxes[forecast]) & ~seen):
                 seen[hit] = True
-                dx, dy = occupants.centers[forecast, hit] - row[[X, Y]]
+                dx, dy = others.centers[forecast, hit] - row[[X, Y]]
                 turn = np.arctan2(abs(cos * dy - sin * dx), abs(cos * dx + sin * dy))
                 if turn < UNSTABLE_BEARING:
                     out[int(hit)] = float(index)

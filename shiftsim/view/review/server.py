@@ -6,21 +6,18 @@ is looked up on disk by name, and the only file written is the review.
 """
 
 import hmac
-import html
 import json
 import secrets
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from threading import Lock
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from shiftsim.errors import ShiftsimError
-from shiftsim.view.page import asset, fill
+from shiftsim.view.page import framed
 from shiftsim.view.review.service import Desk
 
-_HERE = Path(__file__).parent
 HOST = "127.0.0.1"
 TOKEN_HEADER = "X-Shiftsim-Token"
 MAX_BODY = 1 << 20  # bytes
@@ -165,10 +162,10 @@ def _is_route(values: Any) -> bool:
 
 def review_page(store: str) -> str:
     """The page; it fetches everything else."""
-    scripts = (asset("codec.js"), asset("world.js"), asset("review.js", _HERE))
-    return fill(
-        asset("review.html", _HERE),
-        title=html.escape(f"{store} · review"),
-        style=asset("replay.css") + asset("review.css", _HERE),
-        script="\n".join(scripts),
+    return framed(
+        "review/review.html",
+        title=f"{store} · review",
+        meta='<meta name="referrer" content="no-referrer">',
+        styles=["replay.css", "review/review.css"],
+        scripts=["codec.js", "world.js", "review/review.js"],
     )

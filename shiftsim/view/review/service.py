@@ -25,7 +25,15 @@ from shiftsim.errors import ConfigError
 from shiftsim.runs.filter import read_verdicts
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised, pack
-from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
+from shiftsim.view.scene import (
+    Fields,
+    Replay,
+    Shown,
+    describe_scene,
+    indices_near,
+    rollout_fields,
+    scene_fields,
+)
 from shiftsim.world.scenario import Scenario
 
 MAX_COMMENT = 4000  # characters
@@ -194,15 +202,12 @@ def _as_recorded(scenario: Scenario) -> SimulationLog:
 
 def _blocks_near(replay: Replay) -> list[int]:
     """Blocks that share a point with the box that is drawn, and those of the route."""
-    bounds = replay.scenario.map.blocks.polygons.bounds
-    low, high = replay.box[:2], replay.box[2:]
-    near = (bounds[:, :2] <= high).all(axis=1) & (bounds[:, 2:] >= low).all(axis=1)
-    index = replay.scenario.map.blocks.index
-    route = [index[name] for name in replay.scenario.route if name in index]
-    return sorted({*np.flatnonzero(near).tolist(), *route})
+    layer = replay.scenario.map.blocks
+    route = (layer.index[name] for name in replay.scenario.route if name in layer.index)
+    return sorted({*indices_near(layer, replay.box), *route})
 
 
-def _block_fields(replay: Replay, blocks: list[int]) -> dict[str, Quantised | np.ndarray]:
+def _block_fields(replay: Replay, blocks: list[int]) -> Fields:
     """Outlines of the blocks: rings per block, vertices per ring, vertices."""
     layer = replay.scenario.map.blocks
     rings = [layer.rings(block) for block in blocks]

@@ -187,7 +187,7 @@ def test_what_a_map_lacks_is_said(road):
 
 
 def test_progress_along_a_baseline_is_that_of_the_simulator(rng):
-    lane = BridgeMap(_bent()).edge(0)
+    lane = BridgeMap(_bent()).object("edges", 0)
     for x, y in rng.uniform(-5.0, 25.0, (50, 2)):
         found = lane.baseline_path.get_nearest_arc_length_from_position(Point2D(x, y))
         assert found == pytest.approx(lane._map.source.progress_on(0, x, y), abs=1e-9)

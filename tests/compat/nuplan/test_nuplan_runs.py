@@ -13,7 +13,7 @@ from worlds import cruise_scenario
 
 import shiftsim
 from shiftsim.compat import nuplan
-from shiftsim.runs.planners import can_travel, planner_entry
+from shiftsim.planners.registry import run_planner
 
 nuplan.install()
 import nuplan_planners as planners  # noqa: E402  # the names must exist first
@@ -72,9 +72,9 @@ def test_a_planner_of_the_main_script_stays_at_home(monkeypatch):
         pass
 
     monkeypatch.setattr(Mine, "__module__", "__main__")
-    entry = planner_entry(nuplan.wrap(Mine()), {})
+    entry = run_planner(nuplan.wrap(Mine()), {})
     assert entry.name == "Mine"
-    assert not can_travel(entry)
+    assert not entry.can_travel
     assert shiftsim.simulate(cruise_scenario(iterations=5), entry.make()).ego.shape == (4, 11)
 
 
@@ -101,5 +101,5 @@ def test_maps_and_their_objects_outlive_a_scenario():
     lanes = set()
     for _ in range(3):
         shiftsim.simulate(scenario, wrapped)
-        lanes.add(id(wrapped._planner._road.edge(0)))
+        lanes.add(id(wrapped._planner._road.object("edges", 0)))
     assert len(lanes) == 1

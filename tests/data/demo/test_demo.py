@@ -13,7 +13,7 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.filter import FilterConfig, judge_scenario
-from shiftsim.runs.splits import find_split
+from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.loop import simulate
 
 TOWNS = ("avenue", "junction", "parking", "roundabout", "shared", "street")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter, read_flat_yaml
+from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter
 from shiftsim.errors import ConfigError
 
 FILTER = """
@@ -48,28 +48,33 @@ def test_a_token_list_may_have_comments(tmp_path: Path) -> None:
     assert read_filter(path).tokens == frozenset(["026c317cfdcf519a", "1111111111111111"])
 
 
-def test_inline_lists_and_indented_items_are_read() -> None:
-    values = read_flat_yaml(Path("f"), "a: [x, 'y', 3]\nb:\n- 1.5\n- true\nc: []\n")
-    assert values == {"a": ["x", "y", 3], "b": [1.5, True], "c": []}
+def test_inline_lists_and_items_that_are_not_indented_are_read(tmp_path: Path) -> None:
+    text = "scenario_types: [x, 'y']\nmap_names:\n- z\nlog_names: []\n"
+    found = read_filter(write(tmp_path, text))
+    assert (found.types, found.maps) == (frozenset("xy"), frozenset("z"))
+    assert found.logs == frozenset()
+
+
+def test_a_token_of_digits_without_quotes_keeps_its_zeros(tmp_path: Path) -> None:
+    path = write(tmp_path, "scenario_tokens: [0123456701234567, 12e4567890123456]")
+    assert read_filter(path).tokens == frozenset(["0123456701234567", "12e4567890123456"])
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "a:\n  b: 1\n",
-        "a: {b: 1}\n",
-        "a: [1, 2\n",
-        "a: &x 1\n",
-        "a: !!python/object:os.system x\n",
-        "- a\n",
-        "a: 'b\n",
-        "a: |\n  text\n",
-        "a: 1\na: 2\n",
+        "map_names: [1, 2\n",
+        "map_names: !!python/object:os.system x\n",
+        "- map_names\n",
+        "map_names: 'b\n",
+        "map_names: [a]\nmap_names: [b]\n",
+        "map_names: *x\n",
+        "map_names: @x\n",
     ],
 )
-def test_anything_beyond_flat_yaml_is_refused_with_its_line(text: str) -> None:
-    with pytest.raises(ConfigError, match="line"):
-        read_flat_yaml(Path("f.yaml"), text)
+def test_what_cannot_be_read_is_refused_with_its_line(text: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"filter\.yaml: line \d"):
+        read_filter(write(tmp_path, text))
 
 
 @pytest.mark.parametrize(
@@ -81,6 +86,10 @@ def test_anything_beyond_flat_yaml_is_refused_with_its_line(text: str) -> None:
         "something_new: 1\n",
         "scenario_tokens:\n  - abc\n",
         "scenario_types: left\n",
+        "map_names:\n  b: 1\n",
+        "map_names: {b: 1}\n",
+        "map_names: |\n  text\n",
+        "map_names: &x 1\n",
     ],
 )
 def test_what_is_not_supported_is_named(text: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def edit(path: Path, *statements: str) -> None:
     connection.close()
 
 
-def read(path: Path, road: VectorMap, flaws: dict[str, int] | None = None) -> Scenario:
+def read(path: Path, road: VectorMap, flaws: Counter[str] | None = None) -> Scenario:
     return read_scenario(path, TOKEN, road, FROM_START, flaws)
 
 
@@ -127,9 +128,9 @@ def test_a_track_listed_twice_in_a_frame_is_counted_and_the_last_kept(
         "INSERT INTO lidar_box SELECT x'ff', lidar_pc_token, track_token, next_token, prev_token,"
         " x + 1, y, z, width, length, height, vx, vy, vz, yaw, confidence FROM lidar_box LIMIT 1",
     )
-    flaws: dict[str, int] = {}
+    flaws: Counter[str] = Counter()
     changed = read(log_path, road, flaws).tracks
-    assert flaws == {"track listed twice in a frame: the last one is kept": 1}
+    assert +flaws == {"track listed twice in a frame: the last one is kept": 1}
     original = read_scenario(
         GOLDEN / "logs" / "fixture_log_0001.db", TOKEN, road, FROM_START
     ).tracks

@@ -11,9 +11,9 @@ from shiftsim.data.opendrive.lanes import LaneKey, lane_links, runs_forward, sec
 from shiftsim.data.opendrive.records import OpenDrive
 
 
-def borders(od: OpenDrive, number: int, *s: float, mend: bool = False) -> np.ndarray:
+def borders(od: OpenDrive, number: int, *s: float, repair: bool = False) -> np.ndarray:
     """(2, K) inner and outer border of a lane of the first section of road 1."""
-    found = section_borders(od.roads["1"], 0, np.array(s), mend=mend)
+    found = section_borders(od.roads["1"], 0, np.array(s), repair=repair)
     return np.stack([found.inner[number], found.outer[number]])
 
 
@@ -62,12 +62,12 @@ def test_width_wins_over_border():
 def test_negative_width_counts_as_zero_when_mended():
     od = parse(road(sections=section(lane(-1, width=-1), lane(-2, width=2))))
     np.testing.assert_allclose(borders(od, -2, 50)[:, 0], [1, -1])
-    np.testing.assert_allclose(borders(od, -2, 50, mend=True)[:, 0], [0, -2])
+    np.testing.assert_allclose(borders(od, -2, 50, repair=True)[:, 0], [0, -2])
 
 
 def test_right_border_given_on_the_left_is_mirrored_when_mended():
     od = parse(road(sections=section(lane(-1, width=0, inner='<border sOffset="0" a="3"/>'))))
-    np.testing.assert_allclose(borders(od, -1, 50, mend=True)[1], [-3])
+    np.testing.assert_allclose(borders(od, -1, 50, repair=True)[1], [-3])
 
 
 @pytest.mark.parametrize(("rule", "forward"), [("RHT", -1), ("LHT", 1)])

@@ -16,8 +16,10 @@ from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
 from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store import schema
 from shiftsim.data.store.check import check_store
-from shiftsim.data.store.reading import StoreWriter, open_store, schema
+from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
@@ -325,7 +327,7 @@ def test_a_foreign_folder_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_window_without_its_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="lacks"), StoreWriter(tmp_path / "s") as writer:
+    with pytest.raises(DataError, match="does not have"), StoreWriter(tmp_path / "s") as writer:
         writer.add_window(make_window("a", 0, 50))
     assert not (tmp_path / "s" / "store.json").exists()
 

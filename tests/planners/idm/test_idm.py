@@ -11,17 +11,10 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.idm.corridor import (
-    CLEAR,
-    HIT,
-    OPEN,
-    UNKNOWN,
-    Occupants,
-    find_lead,
-    find_sides,
-)
-from shiftsim.planners.idm.path import _search
+from shiftsim.geometry.corridors import CLEAR, HIT, OPEN
+from shiftsim.planners.idm.corridor import UNKNOWN, Objects, find_lead, find_sides
 from shiftsim.planners.idm.planner import Idm
+from shiftsim.planners.routes.search import search_levels
 from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.layers import make_lists
 from shiftsim.world.state import VX, AgentKind, TrafficLights
@@ -61,7 +54,7 @@ def test_the_path_keeps_to_the_lane_it_starts_in_and_loses_its_last_vertex():
     scenario = cruise_scenario(start=(10.0, 3.5, 0.0))
     planner = started(scenario)
     planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
-    assert [scenario.map.edges.ids[e] for e in planner.route_plan.edges] == ["10", "20", "30"]
+    assert [scenario.map.edges.ids[e] for e in planner.route_plan.path] == ["10", "20", "30"]
     assert planner.route_plan.found
     assert planner.path.end == 419.0
     assert planner.path.line_arc[-1] == 420.0
@@ -95,7 +88,6 @@ def test_what_is_beside_behind_or_far_away_changes_nothing(pose):
 
 
 def test_an_object_that_touches_the_ego_from_behind_brakes_it_fully():
-    # nuPlan: idm-planner.md §5 I4
     _, speeds = roll_out(with_objects((8.0, 0.0, 0.0), kind=AgentKind.GENERIC_OBJECT))
     assert speeds[1] == 8.0 - 0.5 * 3.0
 
@@ -134,7 +126,7 @@ def test_a_start_outside_the_route_takes_the_nearest_lane():
     scenario = cruise_scenario(start=(-20.0, -6.0, 0.0))
     planner = started(scenario)
     planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
-    assert scenario.map.edges.ids[planner.route_plan.edges[0]] == "11"
+    assert scenario.map.edges.ids[planner.route_plan.path[0]] == "11"
 
 
 @pytest.mark.parametrize("route", [("1", "2", "2", "3"), ("1", "3"), ("1", "2", "3", "1")])
@@ -180,7 +172,7 @@ def test_moving_the_world_does_not_change_the_speeds(x, y, speed):
 
 
 def naive_search(road, start, goal_block, goal_depth, allowed):
-    """The queue without a visited set, word for word as in idm-planner.md §3."""
+    """The queue without a visited set, as nuPlan has it."""
     queue, parents, end, depth = deque([(start, 1)]), {}, (start, 1), 1
     found = False
     while queue:
@@ -215,15 +207,23 @@ def graphs(draw):
 @given(graphs())
 def test_the_search_by_levels_equals_the_queue_without_a_visited_set(case):
     path, found = naive_search(*case)
-    plan = _search(*case)
-    assert (plan.edges, plan.found) == (path, found)
+    road, start, goal_block, goal_depth, allowed = case
+    goals = set(np.flatnonzero(road.block_of == goal_block).tolist())
+    plan = search_levels(
+        lambda lane: [after for after in road.outgoing.at(lane).tolist() if after in allowed],
+        start,
+        goals,
+        goal_depth,
+        only_last=True,
+    )
+    assert plan == (path, found)
 
 
-def occupants_of(poses, sizes) -> Occupants:
+def objects_of(poses, sizes) -> Objects:
     boxes = boxes_to_corners(poses, sizes)
     radii = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
     nothing = np.zeros(len(poses))
-    return Occupants(
+    return Objects(
         boxes.reshape(-1, 2),
         np.arange(len(poses) + 1) * 4,
         np.column_stack([poses[:, :2], radii]),
@@ -244,9 +244,9 @@ def test_distances_decide_as_the_buffered_path_does(rng, offset):
         index = rng.integers(0, 30, 150)
         poses = np.c_[line[index] + rng.normal(0.0, 3.0, (150, 2)), rng.uniform(-3, 3, 150)]
         sizes = rng.uniform(0.2, 5.0, (150, 2))
-        occupants = occupants_of(poses, sizes)
+        objects = objects_of(poses, sizes)
         sides = np.full(150, UNKNOWN)
-        find_sides(line, half_width, footprint, occupants, sides)
+        find_sides(line, half_width, footprint, objects, sides)
         corridor = shapely.LineString(line).buffer(half_width, cap_style="square")
         corridor = corridor.union(shapely.Polygon(footprint))
         truth = shapely.intersects(shapely.polygons(boxes_to_corners(poses, sizes)), corridor)
@@ -260,13 +260,13 @@ def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
     footprint = boxes_to_corners(np.array([0.0, 0.0, 0.3]), np.array([5.176, 2.297]))
     poses = np.c_[rng.uniform(-12, 12, (500, 2)), rng.uniform(-3, 3, 500)]
     sizes = rng.uniform(0.2, 5.0, (500, 2))
-    occupants = occupants_of(poses, sizes)
+    objects = objects_of(poses, sizes)
     polygons = shapely.polygons(boxes_to_corners(poses, sizes))
     truth = shapely.distance(polygons, shapely.Polygon(footprint))
     for index in range(500):
         sides = np.full(500, CLEAR)
         sides[index] = HIT
-        found, gap = find_lead(footprint, occupants, sides)
+        found, gap = find_lead(footprint, objects, sides)
         assert found == index
         assert gap == pytest.approx(truth[index], abs=1e-12)
 

@@ -118,7 +118,7 @@ def test_lights_are_drawn_on_their_connector(planner, status, value):
 
 def test_a_light_of_unknown_status_is_not_drawn_and_the_step_counts_as_degraded(planner):
     near, far = cruise_scenario(start=(180.0, 0.0, 0.0)), cruise_scenario()
-    for scenario, text in ((near, "a light in the picture has an unknown status"), (far, "")):
+    for scenario, text in ((near, "a light in the raster has an unknown status"), (far, "")):
         picture, _, seen = look(planner, scenario, lights_of(c20=LightStatus.UNKNOWN))
         assert not picture[carl_view.LIGHTS].any()
         planner.plan(seen)
@@ -153,7 +153,7 @@ def test_off_the_map_the_planner_goes_on_and_says_so(planner):
     assert not picture[: carl_view.VEHICLES].any()
     command = planner.plan(seen)
     assert np.isfinite([command.acceleration, command.steering_rate]).all()
-    assert planner.degraded == "no road within the picture"
+    assert planner.degraded == "no road within the raster"
 
 
 def test_the_ego_is_measured_at_its_centre_after_the_last_action(planner):

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from shiftsim.planners.learned.carl.raster import (
     draw_line,
-    draw_polyline,
     fill_area,
     fill_box,
     make_crossings,
@@ -30,7 +29,8 @@ def draw(kind, points):
     picture = np.zeros((SIZE, SIZE), np.uint8)
     xy = np.array(points, np.int64).reshape(-1, 2)
     if kind == LINE:
-        draw_polyline(picture, xy, 1)
+        for (x0, y0), (x1, y1) in pairwise(xy.tolist()):
+            draw_line(picture, x0, y0, x1, y1, 1)
     elif kind == AREA:
         fill_area(picture, xy, 1, CROSSINGS)
     else:
@@ -143,6 +143,6 @@ def test_a_square_of_three_pixels_is_filled_to_its_borders():
 def test_later_shapes_are_drawn_over_earlier_ones():
     picture = np.zeros((SIZE, SIZE), np.uint8)
     fill_area(picture, np.array([[1, 1], [9, 1], [9, 9], [1, 9]]), 7, CROSSINGS)
-    draw_polyline(picture, np.array([[0, 4], [12, 4]]), 9)
+    draw_line(picture, 0, 4, 12, 4, 9)
     assert picture[4, :13].tolist() == [9] * 13
     assert picture[5, 5] == 7

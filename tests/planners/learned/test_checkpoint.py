@@ -62,8 +62,6 @@ def test_a_published_container_loads_with_every_tensor(tmp_path, planner):
     path = write_published(tmp_path, planner, state)
     weights = load_weights(str(path), planner)
     assert_same(weights.state, state)
-    assert weights.source == str(path)
-    assert not weights.meaningless
 
 
 @pytest.mark.parametrize("planner", LEARNED)

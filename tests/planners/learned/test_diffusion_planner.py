@@ -18,7 +18,7 @@ pytestmark = pytest.mark.learned
 from plain_diffusion import plain_sample  # noqa: E402  # needs torch
 
 from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS, build_network  # noqa: E402
-from shiftsim.planners.learned.diffusion.planner import INPUTS, DiffusionPlanner  # noqa: E402
+from shiftsim.planners.learned.diffusion.planner import DiffusionPlanner  # noqa: E402
 
 NUM_ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`
 START = (60.0, 0.0, 0.0)
@@ -84,9 +84,8 @@ def test_a_batch_agrees_with_one_by_one(weights, rng):
 def test_what_is_reused_changes_nothing(planner, rng):
     features = [features_of(planner, scene) for scene in (traffic(rng, 6), traffic(rng, 60))]
     with torch.inference_mode():
-        inputs = {n: torch.from_numpy(np.stack([getattr(f, n) for f in features])) for n in INPUTS}
-        noise = torch.from_numpy(np.stack([f.noise for f in features]))
-        plain = plain_sample(planner._network, inputs, noise).numpy()
+        inputs, noise = planner.batch(features)
+        plain = plain_sample(planner.network, inputs, noise).numpy()
     np.testing.assert_allclose(np.array(planner.infer(features)), plain, atol=1e-4)  # m
 
 

@@ -37,8 +37,9 @@ def demo(tmp_path_factory):
     """The first scenarios of one demo town, cut short."""
     folder = tmp_path_factory.mktemp("demo")
     with pytest.MonkeyPatch.context() as patch:
-        site = next(site for site in demo_files.SITES if site.name == "junction")
-        patch.setattr(demo_files, "SITES", (replace(site, scenes=site.scenes[:1]),))
+        site = next(site for site in demo_files.demo_sites() if site.name == "junction")
+        sites = (replace(site, scenes=site.scenes[:1]),)
+        patch.setattr(demo_files, "demo_sites", lambda: sites)
         demo_files.write_sites(folder / "recordings")
     convert_dsc3d(folder / "recordings" / "junction", folder / "store", site="junction")
     store = open_store(folder / "store")

@@ -136,7 +136,7 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
     one = two._replace(**{name: getattr(two, name)[:1] for name in of_lines})
     official, ours = build_network({"misordered_masks": True}), build_network()
     for network in (official, ours):
-        network.load_state_dict(rough._network.state_dict())
+        network.load_state_dict(rough.network.state_dict())
         network.eval()
     alike, unlike = (
         [network(Inputs(*stack(batch, "cpu"))).trajectory for network in (official, ours)]

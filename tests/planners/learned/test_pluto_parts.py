@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from worlds import standing_tracks, straight_road
 
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
-from shiftsim.planners.learned.pluto.collisions import is_at_fault
-from shiftsim.planners.learned.pluto.proposals import Output, candidates, predicted_agents
+from shiftsim.planners.learned.pluto.proposals import Output, best_proposals, predicted_agents
 from shiftsim.planners.learned.pluto.reference import (
     drivable_near,
     line_features,
@@ -18,11 +17,12 @@ from shiftsim.planners.learned.pluto.reference import (
     route_lanes,
 )
 from shiftsim.planners.learned.pluto.scoring import Place, aggregate, normalise, on_road, score
-from shiftsim.planners.learned.pluto.world import make_world, static_objects
+from shiftsim.planners.learned.pluto.world import Agents, make_world, static_objects
+from shiftsim.planners.proposals.contacts import Others, is_at_fault
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.state import AX, NUM_STATE, PACIFICA, VX, AgentKind, center_poses
 
-NOBODY = (np.zeros((0, 81, 3)), np.zeros((0, 81)), np.zeros((0, 2)))
+NOBODY = Agents(np.zeros((0, 81, 3)), np.zeros((0, 81)), np.zeros((0, 2)))
 NO_LIGHTS = np.zeros(0, np.int64)
 FOOTPRINT = np.array([[5.0, 1.0], [0.0, 1.0], [0.0, -1.0], [5.0, -1.0]])
 
@@ -47,7 +47,7 @@ def ego_state(x, y=0.0, heading=0.0, speed=8.0):
     return state
 
 
-def straight_candidates(speeds, x, y=0.0):
+def straight_proposals(speeds, x, y=0.0):
     """(P, 81, 3) poses along +x."""
     poses = np.zeros((len(speeds), 81, 3))
     poses[:, :, 0] = x + 0.1 * np.arange(81) * np.asarray(speeds)[:, None]
@@ -127,7 +127,7 @@ def test_ways_that_run_together_count_once(gap, count):
 def test_a_car_park_has_the_speed_limit_of_the_last_lane(x, limit):
     forked = fork(8.0)
     near = drivable_near(forked, lanes_of(forked, ("A", "B")), x, 0.0)
-    assert near.admitted[-1] == len(forked.edges)
+    assert near.selected[-1] == len(forked.edges)
     assert near.limits[-1] == limit
 
 
@@ -160,8 +160,8 @@ def test_static_objects_count_where_they_touch_a_lane(road):
     assert found.categories.tolist() == [1, 1]
 
 
-def test_a_candidate_on_its_lane_gets_full_marks(road):
-    scores = scores_of(road, straight_candidates([8.0, 4.0], 100.0), ego_state(100.0))
+def test_a_proposal_on_its_lane_gets_full_marks(road):
+    scores = scores_of(road, straight_proposals([8.0, 4.0], 100.0), ego_state(100.0))
     assert (scores.factors == 1.0).all()
     assert scores.terms[0, 0] == 1.0
     assert 0.0 < scores.terms[0, 1] < 1.0
@@ -171,21 +171,21 @@ def test_a_candidate_on_its_lane_gets_full_marks(road):
 
 
 def test_lanes_beside_each_other_and_the_grass_are_told_apart(road):
-    between = scores_of(road, straight_candidates([8.0], 100.0, 1.75), ego_state(100.0, 1.75))
+    between = scores_of(road, straight_proposals([8.0], 100.0, 1.75), ego_state(100.0, 1.75))
     assert between.flags[0, :, 0].all()
     assert not between.flags[0, :, 1].any()
-    beside = scores_of(road, straight_candidates([8.0], 100.0, -1.5), ego_state(100.0, -1.5))
+    beside = scores_of(road, straight_proposals([8.0], 100.0, -1.5), ego_state(100.0, -1.5))
     assert beside.flags[0, :, 1].all()
-    # all candidates are off the road from the start, so it does not count
+    # all proposals are off the road from the start, so it does not count
     assert (beside.factors[1] == 1.0).all()
 
 
 def test_driving_on_lanes_off_the_route_counts_by_distance(road):
     ego = ego_state(100.0, speed=10.0)
-    poses = straight_candidates([10.0], 100.0)
+    poses = straight_proposals([10.0], 100.0)
     assert scores_of(road, poses, ego, ids=("3",)).factors[2, 0] == 0.0
     slow = ego_state(100.0, speed=2.0)
-    assert scores_of(road, straight_candidates([2.0], 100.0), slow, ids=("3",)).factors[2, 0] == 0.5
+    assert scores_of(road, straight_proposals([2.0], 100.0), slow, ids=("3",)).factors[2, 0] == 0.5
 
 
 @pytest.mark.parametrize(
@@ -193,14 +193,14 @@ def test_driving_on_lanes_off_the_route_counts_by_distance(road):
 )
 def test_hitting_a_static_object_halves_the_score(road, kind, factor):
     static = standing_tracks(1, np.array([[120.0, 0.0, 0.0]]), [kind])
-    scores = scores_of(road, straight_candidates([8.0, 0.5], 100.0), ego_state(100.0), static)
+    scores = scores_of(road, straight_proposals([8.0, 0.5], 100.0), ego_state(100.0), static)
     assert scores.factors[0, 0] == factor
     assert 1.2 < scores.fault_times[0] < 2.2
 
 
 def test_what_touches_the_ego_at_the_start_is_ignored(road):
     static = standing_tracks(1, np.array([[105.0, 0.0, 0.0]]), [AgentKind.BARRIER])
-    scores = scores_of(road, straight_candidates([8.0], 100.0), ego_state(100.0), static)
+    scores = scores_of(road, straight_proposals([8.0], 100.0), ego_state(100.0), static)
     assert (scores.factors[0] == 1.0).all()
     assert (scores.terms[3] == 1.0).all()
 
@@ -208,11 +208,11 @@ def test_what_touches_the_ego_at_the_start_is_ignored(road):
 def agent_at(x, y, speed):
     poses = np.zeros((1, 81, 3))
     poses[:, :, 0], poses[:, :, 1] = x + 0.1 * speed * np.arange(81), y
-    return poses, np.full((1, 81), abs(speed)), np.array([[4.5, 2.0]])
+    return Agents(poses, np.full((1, 81), abs(speed)), np.array([[4.5, 2.0]]))
 
 
 def test_an_agent_ahead_is_hit_and_one_behind_hits(road):
-    poses, ego = straight_candidates([8.0], 100.0), ego_state(100.0)
+    poses, ego = straight_proposals([8.0], 100.0), ego_state(100.0)
     ahead = scores_of(road, poses, ego, agents=agent_at(115.0, 0.0, 1.0))
     behind = scores_of(road, poses, ego, agents=agent_at(90.0, 0.0, 10.5))
     assert ahead.factors[0, 0] == 0.0
@@ -223,18 +223,21 @@ def test_an_agent_ahead_is_hit_and_one_behind_hits(road):
 def test_a_red_connector_is_a_fault_also_when_the_ego_stands_on_it(road):
     light = np.array([road.edge("21")])
     ego = ego_state(210.0, speed=0.0)
-    scores = scores_of(road, straight_candidates([0.0], 210.0), ego, lights=light)
+    scores = scores_of(road, straight_proposals([0.0], 210.0), ego, lights=light)
     assert scores.factors[0, 0] == 0.0
     assert scores.fault_times[0] == pytest.approx(0.1)
 
 
 @given(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
 def test_a_standing_ego_is_never_at_fault_and_a_standing_object_never_to_blame(x, y):
-    ring = FOOTPRINT + np.array([x, y])
-    center = np.array([x + 2.5, y])
+    center = np.array([[[x + 2.5, y]]])
+    moves, none = np.array([[3.0]]), np.zeros(1, np.bool_)
+    moving = Others(FOOTPRINT + center - [2.5, 0.0], center, center, moves, np.ones(1), none, none)
+    moving = moving._replace(boxes=moving.boxes[None])
     still, driving = ego_state(0.0, speed=0.0), ego_state(0.0, speed=5.0)
-    assert not is_at_fault(still, FOOTPRINT, ring, center, 3.0, True)
-    assert is_at_fault(driving, FOOTPRINT, ring, center, 0.0, False)
+    assert not is_at_fault(still, FOOTPRINT, True, moving, 0, 0)
+    standing = moving._replace(speeds=np.array([[0.0]]))
+    assert is_at_fault(driving, FOOTPRINT, False, standing, 0, 0)
 
 
 def test_progress_is_compared_only_if_anybody_makes_some():
@@ -282,19 +285,19 @@ def test_the_brake_is_for_slow_egos_with_a_fault_ahead(speed, time, brakes):
 @pytest.mark.parametrize(("time", "low", "high"), [(0.1, -4.5, -4.4), (2.9, -4.0, -3.0)])
 def test_the_brake_ends_in_standstill_and_is_soft_where_there_is_time(time, low, high):
     ego = ego_state(0.0, speed=5.0)
-    states = brake(straight_candidates([5.0], 0.0)[0], ego, time, PACIFICA)
+    states = brake(straight_proposals([5.0], 0.0)[0], ego, time, PACIFICA)
     np.testing.assert_array_equal(states[0], ego)
     assert low <= states[:, AX].min() <= high
     assert abs(states[-1, VX]) < 0.3
 
 
-def test_candidates_are_sorted_by_logit_and_moved_to_the_map():
+def test_proposals_are_sorted_by_logit_and_moved_to_the_map():
     rng = np.random.default_rng(0)
     trajectory = rng.standard_normal((2, 12, 80, 6)).astype(np.float32)
     logits = rng.standard_normal((2, 12)).astype(np.float32)
     free = rng.standard_normal((80, 4)).astype(np.float32)
     output = Output(trajectory, logits, np.zeros((0, 80, 6), np.float32), free)
-    poses, scores = candidates(output, np.array([100.0, 50.0, np.pi / 2.0]))
+    poses, scores = best_proposals(output, np.array([100.0, 50.0, np.pi / 2.0]))
     best = trajectory.reshape(-1, 80, 6)[logits.argmax()]
     np.testing.assert_allclose(poses[0, 1:, 0], 100.0 - best[:, 1], atol=1e-12)
     np.testing.assert_allclose(poses[0, 1:, 1], 50.0 + best[:, 0], atol=1e-12)

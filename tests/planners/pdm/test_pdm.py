@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straight_road
 
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.planners.idm.corridor import HIT
-from shiftsim.planners.pdm.corridor import corridor_polygon, fill_corridor, make_corridor
-from shiftsim.planners.pdm.forecast import make_occupants, ring_of, select_tracks
+from shiftsim.geometry.corridors import HIT
+from shiftsim.geometry.paths import make_path, project
+from shiftsim.planners.pdm.corridor import corridor_shape, fill_corridor, make_corridor
+from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
-from shiftsim.planners.pdm.path import make_path, project
 from shiftsim.planners.pdm.planner import PdmClosed
-from shiftsim.planners.proposals.areas import admit, covering, index_ranks, make_areas
+from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
 from shiftsim.planners.proposals.tracker import fit_speed
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.observation import observe_log, scene_info
@@ -42,7 +42,7 @@ def test_an_empty_road_is_driven_at_the_limit_on_the_centerline():
     _, step = one_step(cruise_scenario())
     assert (step.best, step.braked) == (4, False)
     np.testing.assert_allclose(step.poses[:, 1:], 0.0, atol=1e-9)
-    # nuPlan: every proposal brakes in its first 0.1 s, then it speeds up (pdm-closed.md §11 Q3)
+    # nuPlan: every proposal brakes in its first 0.1 s, then it speeds up
     advance = np.diff(step.poses[:, 0])
     assert advance[0] == pytest.approx(0.8)
     assert advance[1] == pytest.approx(0.1 * (8.0 - 0.3))
@@ -85,7 +85,7 @@ def test_an_object_that_touches_the_ego_is_ignored_from_then_on():
 def test_a_far_object_changes_nothing():
     _, alone = one_step(cruise_scenario())
     _, step = one_step(scenario_with([[-200.0, 0.0, 0.0]], [VEHICLE]))
-    np.testing.assert_array_equal(alone.driven, step.driven)
+    np.testing.assert_array_equal(alone.driven.states, step.driven.states)
 
 
 @settings(max_examples=8)
@@ -157,7 +157,7 @@ def test_parameters_are_plain_data():
     scenario = cruise_scenario()
     planner.reset(scene_info(scenario))
     step = planner.step(observe_log(scenario, 0, ego=scenario.expert[0], samples=1))
-    assert step.driven.shape == (2, 41, 11)
+    assert step.driven.states.shape == (2, 41, 11)
     assert planner.parameters == PdmParameters(speed_fractions=(0.5, 1.0), lateral_offsets=())
 
 
@@ -189,7 +189,7 @@ def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
-def test_occupants_of_a_corridor_are_those_its_polygon_touches(seed):
+def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
     rng = np.random.default_rng(seed)
     heading = np.cumsum(rng.normal(0.0, 0.05, 60))
     steps = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -198,15 +198,15 @@ def test_occupants_of_a_corridor_are_those_its_polygon_touches(seed):
     poses[:, :2] = path.xy[rng.integers(0, 60, 40)] + rng.uniform(-4, 4, (40, 2))
     tracks = standing_tracks(1, poses, [VEHICLE] * 40)
     tracks.velocities[:] = rng.normal(0.0, 3.0, (1, 40, 2))
-    occupants = make_occupants(tracks, np.arange(40), [])
+    forecast = make_forecast(tracks, np.arange(40), [])
     corridor = make_corridor(10.3, 42.0, 1.1485, 40)
-    fill_corridor(path, corridor, occupants, 0, 21)
-    polygon = corridor_polygon(path, corridor)
-    for forecast in range(21):
+    fill_corridor(path, corridor, forecast, 0, 21)
+    polygon = corridor_shape(path, corridor)
+    for row in range(21):
         touches = [
-            polygon.intersects(shapely.Polygon(ring_of(occupants, i, forecast))) for i in range(40)
+            polygon.intersects(shapely.Polygon(ring_of(forecast, i, row))) for i in range(40)
         ]
-        np.testing.assert_array_equal(corridor.sides[forecast] == HIT, touches)
+        np.testing.assert_array_equal(corridor.sides[row] == HIT, touches)
 
 
 @settings(max_examples=30)
@@ -226,8 +226,8 @@ def test_projection_is_the_nearest_point_of_the_line(seed):
 def test_areas_and_their_order_are_those_of_the_map():
     road = straight_road()
     areas = make_areas(road, [1, 3])
-    admitted = admit(road, areas, 195.0, 0.0, 10.0)
-    ids = [road.edges.ids[i] for i in admitted]
+    selected = select_areas(road, 195.0, 0.0, 10.0)
+    ids = [road.edges.ids[i] for i in selected]
     assert ids == ["10", "11", "20", "21"]
     found = np.empty(8, np.int64)
     for x, y, expected in (
@@ -236,7 +236,7 @@ def test_areas_and_their_order_are_those_of_the_map():
         (195.0, 1.75, ["10", "11"]),
         (195.0, 5.3, []),
     ):
-        under = found[: covering(areas, admitted, x, y, found)]
+        under = found[: covering(areas, selected, x, y, found)]
         assert [road.edges.ids[i] for i in under] == expected
 
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import TrafficError
-from shiftsim.sim.traffic import make_traffic
-from shiftsim.sim.traffic.idm.model import FixedIdmTraffic, IdmParameters, IdmTraffic
+from shiftsim.sim.traffic.idm.model import IdmTraffic
+from shiftsim.sim.traffic.idm.scene import IdmParameters
 from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
@@ -108,25 +108,6 @@ def test_bicycles_late_vehicles_and_those_off_the_road_vanish() -> None:
     assert np.isnan(tracks.poses[:, 1:]).all()
 
 
-def test_fixed_variant_keeps_them() -> None:
-    scenario = scene(
-        [(40.0, 0.0, 0.0), (60.0, 9.0, 0.0), (100.0, 0.0, 0.0)], [VEHICLE, VEHICLE, BICYCLE]
-    )
-
-    tracks = drive(scenario, steps=20, traffic=FixedIdmTraffic())
-
-    assert tracks.valid[:21].all()
-
-
-def test_fixed_variant_follows_a_walking_pedestrian() -> None:
-    scenario = scene([(40.0, 0.0, 0.0), (60.0, 0.0, 0.0)], [VEHICLE, PEDESTRIAN], speed=3.0)
-
-    wall = drive(scenario, steps=1)
-    walking = drive(scenario, steps=1, traffic=FixedIdmTraffic())
-
-    assert walking.velocities[1, 0, 0] > wall.velocities[1, 0, 0]
-
-
 def test_vehicle_without_room_on_its_lane_is_not_simulated() -> None:
     tracks = drive(scene([(40.0, 0.0, 0.0), (42.0, 0.3, 0.0)], [VEHICLE, VEHICLE]), steps=1)
 
@@ -164,11 +145,6 @@ def test_a_scene_without_vehicles_runs() -> None:
     tracks = drive(scene([(40.0, 0.0, 0.0)], [CONE]), steps=3)
 
     assert tracks.valid.all()
-
-
-def test_both_variants_have_a_name() -> None:
-    assert isinstance(make_traffic("reactive"), IdmTraffic)
-    assert isinstance(make_traffic("reactive-fixed"), FixedIdmTraffic)
 
 
 CROWD = [(40.0, 0.2, 0.0), (60.0, 3.3, 0.0), (90.0, -0.2, 0.0), (75.0, 2.4, 0.5), (95.0, 5.0, 1.0)]
@@ -243,8 +219,6 @@ def test_start_on_a_baseline_too_short_for_a_path_fails_the_scenario() -> None:
     with pytest.raises(TrafficError, match="baseline of 1"):
         drive(scenario, steps=1)
 
-    assert drive(scenario, steps=1, traffic=FixedIdmTraffic()).valid[1].all()
-
 
 def test_agent_outside_of_its_own_corridor_fails_the_scenario() -> None:
     scenario = scene([(250.0, 0.0, 0.0)], [VEHICLE])
@@ -253,8 +227,6 @@ def test_agent_outside_of_its_own_corridor_fails_the_scenario() -> None:
 
     with pytest.raises(TrafficError, match="outside of its own path at iteration 1"):
         drive(scenario, steps=1)
-
-    assert drive(scenario, steps=3, traffic=FixedIdmTraffic()).valid[3].all()
 
 
 @given(st.permutations([3, 4, 5, 6]))

@@ -7,22 +7,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import offsets, seeds
 
-from shiftsim.sim.traffic.idm.buffer import buffer_curve, curve_room
+from shiftsim.sim.traffic.idm.buffer import buffer_curve, curve_capacity
 from shiftsim.sim.traffic.idm.shapes import (
     APART,
     MEETING,
     PIECE,
     UNSURE,
     bound_pieces,
+    bound_ring,
     num_pieces,
-    ring_bounds,
     ring_gap,
     touches_corridor,
 )
 
 
 def outline(line: np.ndarray, distance: float) -> np.ndarray:
-    out = np.zeros((curve_room(len(line)), 2))
+    out = np.zeros((curve_capacity(len(line)), 2))
     count = buffer_curve(line, len(line), distance, np.zeros(len(line), np.bool_), out)
     return out[:count]
 
@@ -106,7 +106,7 @@ def test_quick_corridor_answers_are_those_of_the_exact_buffer(
     spin = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     ring = np.ascontiguousarray(box @ spin + [x, y])
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    ring_bounds(ring, 4, bounds)
+    bound_ring(ring, 4, bounds)
     pieces = np.zeros((len(line) // PIECE + 1, 4))
     bound_pieces(line, len(line), pieces)
 

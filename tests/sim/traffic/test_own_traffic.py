@@ -5,11 +5,10 @@ import pytest
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import ConfigError
-from shiftsim.sim.traffic import Traffic, make_traffic
+from shiftsim.sim.traffic import LogReplay, Traffic, make_traffic
 from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
-from shiftsim.sim.traffic.idm.model import FixedIdmTraffic, IdmTraffic
+from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.mixed import Mixed
-from shiftsim.sim.traffic.replay import LogReplay
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -92,8 +91,8 @@ def test_idm_agents_react_to_what_other_policies_move(scenario: Scenario) -> Non
         def step(self, iteration, ego, tracks, row) -> None:
             tracks.poses[row, self.own] = 50.0, 0.0, 0.0
 
-    free = drive(scenario, Mixed(([VEHICLE], FixedIdmTraffic())))
-    blocked = drive(scenario, Mixed(([BICYCLE], Block()), ([VEHICLE], FixedIdmTraffic())))
+    free = drive(scenario, Mixed(([VEHICLE], IdmTraffic())))
+    blocked = drive(scenario, Mixed(([BICYCLE], Block()), ([VEHICLE], IdmTraffic())))
 
     assert blocked.valid[:41, 3].all()
     assert blocked.poses[40, 0, 0] < 50.0 - 4.5

@@ -47,7 +47,7 @@ def quick(monkeypatch, made):
 
     def infer_once(planner, features):
         parts = [getattr(features[0], name) for name in (*INPUTS, "noise")]
-        key = (id(planner._network), b"".join(part.tobytes() for part in parts))
+        key = (id(planner.network), b"".join(part.tobytes() for part in parts))
         if key not in made:
             made[key] = infer(planner, features)
         return made[key]

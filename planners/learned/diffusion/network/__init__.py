@@ -1,9 +1,8 @@
-"""The Diffusion Planner's network: scene encoder and diffusion decoder (planner-diffusion.md §3).
+"""The Diffusion Planner's network: scene encoder and diffusion decoder.
 
 `state_dict()` has the keys, shapes and types of the official checkpoint.
 """
 
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.errors import CheckpointError
+from shiftsim.planners.learned.deterministic import keyed_normals
 from shiftsim.planners.learned.diffusion.network.decoder import DiT, Prepared
 from shiftsim.planners.learned.diffusion.network.encoder import SceneEncoder
 from shiftsim.planners.learned.diffusion.network.parts import store_by_columns
@@ -88,25 +88,9 @@ class DiffusionNetwork(nn.Module):
         super().__init__()
         hidden, heads = int(args["hidden_dim"]), int(args["num_heads"])
         self.num_agents = 1 + int(args["predicted_neighbor_num"])
-        self.encoder = nn.ModuleDict(
-            {
-                "encoder": SceneEncoder(
-                    hidden=hidden,
-                    heads=heads,
-                    depth=int(args["encoder_depth"]),
-                    samples=int(args["time_len"]),
-                    points=int(args["lane_len"]),
-                )
-            }
-        )
-        dit = DiT(
-            hidden=hidden,
-            heads=heads,
-            depth=int(args["decoder_depth"]),
-            steps=1 + int(args["future_len"]),
-            lanes=int(args["route_num"]),
-            points=int(args["route_len"]),
-        )
+        encoder = SceneEncoder(hidden, heads, int(args["encoder_depth"]))
+        dit = DiT(hidden, heads, int(args["decoder_depth"]))
+        self.encoder = nn.ModuleDict({"encoder": encoder})
         self.decoder = nn.ModuleDict({"decoder": nn.ModuleDict({"dit": dit})})
         self.dit = [dit]  # in a list, so that its parameters have one name only
         self.normalisers = nn.ModuleDict(
@@ -154,7 +138,7 @@ class DiffusionNetwork(nn.Module):
         """Trajectories of the ego and its neighbours.
 
         Args:
-            inputs: Features of a batch by name (planner-diffusion.md §2).
+            inputs: Features of a batch by name.
             noise: (B, A, T, 4) standard normal start noise.
 
         Returns:
@@ -194,34 +178,34 @@ def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
 
 
 def _check(args: Mapping[str, Any]) -> None:
-    hint = "use the args.json that was published with the checkpoint"
     for name, value in DEFAULT_ARGS.items():
         if name not in args:
-            raise CheckpointError(f"args of diffusion-planner: {name!r} is missing", hint)
+            raise _wrong(f"{name!r} is missing")
         if name in _FIXED and args[name] != value:
-            what = f"args of diffusion-planner: {name} is {args[name]!r}, the features have {value}"
-            raise CheckpointError(what, hint)
+            raise _wrong(f"{name} is {args[name]!r}, the features have {value}")
     kind = args.get("diffusion_model_type", "x_start")
     if kind != "x_start":
-        raise CheckpointError(
-            f"args of diffusion-planner: diffusion_model_type is {kind!r}, known is 'x_start'", hint
-        )
+        raise _wrong(f"diffusion_model_type is {kind!r}, known is 'x_start'")
     given = {**args["observation_normalizer"], "state": args["state_normalizer"]}
     known = {**DEFAULT_ARGS["observation_normalizer"], "state": DEFAULT_ARGS["state_normalizer"]}
     for name, row in known.items():
         for part in ("mean", "std"):
             values = np.asarray(given.get(name, {}).get(part, []), np.float64)
             if values.ndim == 0 or values.shape[-1] != len(row[part]) or not values.size:
-                what = f"args of diffusion-planner: {part} of the normaliser of {name!r} has shape "
-                raise CheckpointError(f"{what}{values.shape}, not ({len(row[part])},)", hint)
+                what = f"{part} of the normaliser of {name!r} has shape {values.shape}"
+                raise _wrong(f"{what}, not ({len(row[part])},)")
+
+
+def _wrong(what: str) -> CheckpointError:
+    hint = "use the args.json that was published with the checkpoint"
+    return CheckpointError(f"args of diffusion-planner: {what}", hint)
 
 
 def drive_overrides(state: dict[str, np.ndarray]) -> None:
     """Turn the last layer of deterministic weights into a ramp forward, in place."""
     weight, bias = state[f"{_FINAL}.weight"], state[f"{_FINAL}.bias"]
     steps = len(bias) // STATE
-    key = zlib.crc32(f"{_FINAL}.weight#drive".encode())
-    rows = np.random.Generator(np.random.PCG64(key)).standard_normal((STATE, weight.shape[1]))
+    rows = keyed_normals(f"{_FINAL}.weight#drive", (STATE, weight.shape[1]))
     rows /= np.sqrt(weight.shape[1])
     ramp = np.arange(steps)[:, None] / (steps - 1) * np.array(_DRIVE_AMPLITUDES)
     made = (ramp[:, :, None] * rows).reshape(weight.shape)

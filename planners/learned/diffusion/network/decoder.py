@@ -2,7 +2,7 @@
 
 What does not depend on the noisy trajectories is computed once per plan (`DiT.prepare`): the route
 encoding, the modulation at every time of the sampler, the keys and values of the scene's tokens.
-`Prepared` is called for every step of the sampler (planner-diffusion.md §3.2).
+`Prepared` is called for every step of the sampler.
 """
 
 import math
@@ -14,18 +14,16 @@ from torch.nn import functional
 
 from shiftsim.planners.learned.diffusion.network.parts import (
     EPS,
-    Attention,
     Mixer,
-    Mlp,
     Norm,
     Product,
-    gelu_,
     norm,
     product,
-    tanh_gelu_,
 )
-from shiftsim.planners.learned.network.rows import Linear
+from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp, gelu_, tanh_gelu_
 
+POSES = 81  # of a trajectory, the present one included
+ROUTE_LANES, POINTS = 25, 20
 ROUTE_COLUMNS, ROUTE_TOKENS, ROUTE_CHANNELS = 4, 32, 64
 FREQUENCIES, LONGEST = 128, 10000.0  # of the time embedding
 NO_KEY = float("-inf")
@@ -69,7 +67,7 @@ class Block:
         x = torch.addcmul(x, gate1, self._among(y, len(x)).view_as(x))
         y = torch.addcmul(shift2, norm2(x), scale2).flatten(0, 1)
         x = torch.addcmul(x, gate2, _mlp(self.mlp1, y).view_as(x))
-        # the second half has no residual
+        # nuPlan rule 339: the second half has no residual
         return _mlp(self.mlp2, norm4(self._at_scene(norm3(x)))).view_as(x)
 
     def _among(self, x: Tensor, scenes: int) -> Tensor:
@@ -145,11 +143,10 @@ class Prepared:
 class RouteEncoder(nn.Module):
     """Lanes of the route to one vector."""
 
-    def __init__(self, lanes: int, points: int, hidden: int) -> None:
-        """Make it for `lanes` lanes of `points` points."""
+    def __init__(self, hidden: int) -> None:
         super().__init__()
         self.channel_pre_project = Mlp(ROUTE_COLUMNS, ROUTE_CHANNELS, ROUTE_CHANNELS)
-        self.token_pre_project = Mlp(lanes * points, ROUTE_TOKENS, ROUTE_TOKENS)
+        self.token_pre_project = Mlp(ROUTE_LANES * POINTS, ROUTE_TOKENS, ROUTE_TOKENS)
         self.Mixer = Mixer(ROUTE_TOKENS, ROUTE_CHANNELS)
         self.norm = nn.LayerNorm(ROUTE_CHANNELS, EPS)
         self.emb_project = Mlp(ROUTE_CHANNELS, hidden, hidden)
@@ -166,7 +163,6 @@ class TimeEmbedder(nn.Module):
     """Diffusion times to vectors."""
 
     def __init__(self, hidden: int) -> None:
-        """Make it."""
         super().__init__()
         self.mlp = nn.Sequential(Linear(2 * FREQUENCIES, hidden), nn.SiLU(), Linear(hidden, hidden))
 
@@ -182,7 +178,6 @@ class DiTBlock(nn.Module):
     """Agents look at each other, then at the scene; the second half has no residual."""
 
     def __init__(self, hidden: int, heads: int) -> None:
-        """Make it."""
         super().__init__()
         self.norm1 = nn.LayerNorm(hidden, EPS)
         self.attn = Attention(hidden, heads)
@@ -196,16 +191,20 @@ class DiTBlock(nn.Module):
 
     def at_hand(self, context: Tensor, modulation: list[tuple[Tensor, ...]], mask: Tensor) -> Block:
         """The block for one plan: tokens of the scene (B, N, hidden), the rest as in `Block`."""
-        first = self.cross_attn.channels
-        weight, bias = self.cross_attn.in_proj_weight, self.cross_attn.in_proj_bias
-        keys, values = self.cross_attn.keys_values(context)
+        attend = self.cross_attn
+        first, weight, bias = (
+            attend.out_proj.in_features,
+            attend.in_proj_weight,
+            attend.in_proj_bias,
+        )
+        keys, values = (attend.heads(part) for part in attend.keys_values(context))
         return Block(
             norms=tuple(norm(getattr(self, f"norm{number}")) for number in (1, 2, 3, 4)),
             packed=Product(self.attn.in_proj_weight.t(), self.attn.in_proj_bias),
             joined=product(self.attn.out_proj),
             mlp1=(product(self.mlp1.fc1), product(self.mlp1.fc2)),
             query=Product(weight[:first].t(), bias[:first]),
-            looked=product(self.cross_attn.out_proj),
+            looked=product(attend.out_proj),
             mlp2=(product(self.mlp2.fc1), product(self.mlp2.fc2)),
             modulation=modulation,
             keys=(keys * keys.shape[-1] ** -0.5).mT.flatten(0, 1).contiguous(),
@@ -218,7 +217,6 @@ class FinalLayer(nn.Module):
     """Tokens of the agents to trajectories."""
 
     def __init__(self, hidden: int, outputs: int) -> None:
-        """Make it."""
         super().__init__()
         self.norm_final = nn.LayerNorm(hidden, EPS)
         self.proj = nn.Sequential(
@@ -234,27 +232,15 @@ class FinalLayer(nn.Module):
 class DiT(nn.Module):
     """The whole decoder."""
 
-    def __init__(
-        self, *, hidden: int, heads: int, depth: int, steps: int, lanes: int, points: int
-    ) -> None:
-        """Make it.
-
-        Args:
-            hidden: Channels.
-            heads: Of the attentions.
-            depth: Blocks.
-            steps: Poses of a trajectory, the present one included.
-            lanes: Of the route.
-            points: Of a lane.
-        """
+    def __init__(self, hidden: int, heads: int, depth: int) -> None:
         super().__init__()
         self.heads = heads
-        self.route_encoder = RouteEncoder(lanes, points, hidden)
+        self.route_encoder = RouteEncoder(hidden)
         self.agent_embedding = nn.Embedding(2, hidden)
-        self.preproj = Mlp(4 * steps, 512, hidden)
+        self.preproj = Mlp(4 * POSES, 512, hidden)
         self.t_embedder = TimeEmbedder(hidden)
         self.blocks = nn.ModuleList(DiTBlock(hidden, heads) for _ in range(depth))
-        self.final_layer = FinalLayer(hidden, 4 * steps)
+        self.final_layer = FinalLayer(hidden, 4 * POSES)
 
     def prepare(self, context: Tensor, route: Tensor, absent: Tensor, times: Tensor) -> Prepared:
         """What the calls at all `times` share.

@@ -1,17 +1,18 @@
 """Encoder of the Diffusion Planner: agents, static objects and lanes to one token each.
 
 Unused rows make zero tokens. Rows that are used are gathered first, so that an empty road costs
-little (planner-diffusion.md §3.1).
+little.
 """
 
 import torch
 from torch import Tensor, nn
 
-from shiftsim.planners.learned.diffusion.network.parts import EPS, Attention, Mixer, Mlp
-from shiftsim.planners.learned.network.rows import Linear
+from shiftsim.planners.learned.diffusion.network.parts import EPS, Mixer
+from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp
 
 AGENT_COLUMNS, STATIC_COLUMNS, LANE_COLUMNS, LIGHT_COLUMNS = 8, 10, 8, 4
 AGENT_KINDS = 3
+SAMPLES, POINTS = 21, 20  # of a history, of a lane
 POSITION = 7  # x, y, cos, sin, and one-hot agent, static object, lane
 TOKENS, CHANNELS = 64, 128  # inside the mixers
 MIDDLE = 10  # point of a lane that stands for its position
@@ -23,7 +24,6 @@ class MixerEncoder(nn.Module):
     """What agents and lanes have in common: samples to tokens, mixer blocks, their mean."""
 
     def __init__(self, columns: int, samples: int, hidden: int, depth: int) -> None:
-        """Make it for (samples, columns) inputs and (hidden,) outputs."""
         super().__init__()
         self.channel_pre_project = Mlp(columns, CHANNELS, CHANNELS)
         self.token_pre_project = Mlp(samples, TOKENS, TOKENS)
@@ -54,9 +54,8 @@ class MixerEncoder(nn.Module):
 class AgentEncoder(MixerEncoder):
     """Histories of agents to tokens."""
 
-    def __init__(self, samples: int, hidden: int, depth: int) -> None:
-        """Make it for histories of `samples` samples."""
-        super().__init__(AGENT_COLUMNS + 1, samples, hidden, depth)
+    def __init__(self, hidden: int, depth: int) -> None:
+        super().__init__(AGENT_COLUMNS + 1, SAMPLES, hidden, depth)
         self.type_emb = Linear(AGENT_KINDS, CHANNELS)
 
     def forward(self, agents: Tensor) -> Tensor:
@@ -71,7 +70,6 @@ class StaticEncoder(nn.Module):
     """Static objects to tokens."""
 
     def __init__(self, hidden: int) -> None:
-        """Make it."""
         super().__init__()
         self.projection = Mlp(STATIC_COLUMNS, hidden, hidden)
 
@@ -84,9 +82,8 @@ class StaticEncoder(nn.Module):
 class LaneEncoder(MixerEncoder):
     """Lanes to tokens."""
 
-    def __init__(self, points: int, hidden: int, depth: int) -> None:
-        """Make it for lanes of `points` points."""
-        super().__init__(LANE_COLUMNS, points, hidden, depth)
+    def __init__(self, hidden: int, depth: int) -> None:
+        super().__init__(LANE_COLUMNS, POINTS, hidden, depth)
         self.speed_limit_emb = Linear(1, CHANNELS)
         self.unknown_speed_emb = nn.Embedding(1, CHANNELS)
         self.traffic_emb = Linear(LIGHT_COLUMNS, CHANNELS)
@@ -99,10 +96,9 @@ class LaneEncoder(MixerEncoder):
 
 
 class FusionBlock(nn.Module):
-    """Self-attention in which keys and values are not normalised, and an MLP."""
+    """Self-attention in which keys and values are not normalised (nuPlan rule 338), and an MLP."""
 
     def __init__(self, hidden: int, heads: int) -> None:
-        """Make it."""
         super().__init__()
         self.norm1 = nn.LayerNorm(hidden, EPS)
         self.attn = Attention(hidden, heads)
@@ -111,8 +107,8 @@ class FusionBlock(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """(B, N, hidden) to the same; `mask` is added to the logits."""
-        keys, values = self.attn.keys_values(x)
-        x = x + self.attn(self.attn.query(self.norm1(x)), keys, values, mask)
+        mixed = self.attn.mixed(*self.attn.projected(self.norm1(x), x, x), mask)
+        x = x + self.attn.out_proj(mixed)
         self.mlp.add_to(x, self.norm2(x))
         return x
 
@@ -121,7 +117,6 @@ class Fusion(nn.Module):
     """All tokens look at each other."""
 
     def __init__(self, hidden: int, heads: int, depth: int) -> None:
-        """Make it."""
         super().__init__()
         self.blocks = nn.ModuleList(FusionBlock(hidden, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(hidden, EPS)
@@ -137,20 +132,11 @@ class Fusion(nn.Module):
 class SceneEncoder(nn.Module):
     """The whole encoder."""
 
-    def __init__(self, *, hidden: int, heads: int, depth: int, samples: int, points: int) -> None:
-        """Make it.
-
-        Args:
-            hidden: Channels of a token.
-            heads: Of the attention.
-            depth: Mixer blocks of an encoder, and fusion blocks.
-            samples: Of an agent's history.
-            points: Of a lane.
-        """
+    def __init__(self, hidden: int, heads: int, depth: int) -> None:
         super().__init__()
-        self.neighbor_encoder = AgentEncoder(samples, hidden, depth)
+        self.neighbor_encoder = AgentEncoder(hidden, depth)
         self.static_encoder = StaticEncoder(hidden)
-        self.lane_encoder = LaneEncoder(points, hidden, depth)
+        self.lane_encoder = LaneEncoder(hidden, depth)
         self.fusion = Fusion(hidden, heads, depth)
         self.pos_emb = Linear(POSITION, hidden)
 

@@ -1,4 +1,4 @@
-"""Collision guidance of the Diffusion Planner's sampler (planner-diffusion.md §4).
+"""Collision guidance of the Diffusion Planner's sampler.
 
 Off in the published configuration; here to compare with its reference. Boxes that come within a
 metre of the ego's, or overlap it, push the ego sideways; the push is smoothed over time. It follows

@@ -1,86 +1,14 @@
 """Building blocks of the Diffusion Planner's network, with the names of its checkpoint."""
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.learned.network.rows import Linear, linear
+from shiftsim.planners.learned.network.rows import Attention, Mlp
 
 EPS = 1e-5  # of the layer norms; torch's default, and the official networks keep it
-_CUBIC, _TWICE = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the GELU by tanh
-
-
-class Mlp(nn.Module):
-    """Linear, GELU, Linear over the last dimension.
-
-    The activation overwrites what it reads, so that no second tensor of that size passes through
-    the cache.
-    """
-
-    def __init__(
-        self, inputs: int, hidden: int, outputs: int, *, approximate: str = "none"
-    ) -> None:
-        """Make it.
-
-        Args:
-            inputs: Channels in.
-            hidden: Channels between.
-            outputs: Channels out.
-            approximate: Of the GELU: `none` (error function) or `tanh`.
-        """
-        super().__init__()
-        self.fc1 = Linear(inputs, hidden)
-        self.fc2 = Linear(hidden, outputs)
-        self.approximate = approximate
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., inputs) to (..., outputs)."""
-        out: Tensor = self.fc2(self.hidden(x))
-        return out
-
-    def hidden(self, x: Tensor) -> Tensor:
-        """(..., hidden) what the second layer reads."""
-        return self._activated(self.fc1(x))
-
-    def over_rows(self, x: Tensor) -> Tensor:
-        """The same over the last but one dimension: (..., inputs, C) to (..., outputs, C)."""
-        return _over_rows(self.fc2, self._activated(_over_rows(self.fc1, x)))
-
-    def add_to(self, x: Tensor, read: Tensor) -> None:
-        """Add `forward(read)` to x (..., outputs)."""
-        hidden = self.hidden(read).flatten(0, -2)
-        x += self.fc2.bias
-        x.view(-1, x.shape[-1]).addmm_(hidden, self.fc2.weight.t())
-
-    def add_over_rows_to(self, x: Tensor, read: Tensor) -> None:
-        """Add `over_rows(read)` to x (..., outputs, C)."""
-        hidden = self._activated(_over_rows(self.fc1, read))
-        x += self.fc2.bias[:, None]
-        x.baddbmm_(self.fc2.weight.expand(len(x), -1, -1), hidden)
-
-    def _activated(self, x: Tensor) -> Tensor:
-        return tanh_gelu_(x) if self.approximate == "tanh" else gelu_(x)
-
-
-def tanh_gelu_(x: Tensor) -> Tensor:
-    """The GELU by tanh, in place: `1 + tanh(z)` is `2 sigmoid(2 z)`, which is computed faster."""
-    twice = torch.addcmul(x, x * x, x, value=_CUBIC).mul_(_TWICE)
-    return x.mul_(twice.sigmoid_())
-
-
-def gelu_(x: Tensor) -> Tensor:
-    """The GELU by the error function, in place."""
-    out: Tensor = torch.ops.aten.gelu_(x)
-    return out
-
-
-def _over_rows(layer: Linear, x: Tensor) -> Tensor:
-    """A linear layer over the last but one dimension of (B, inputs, C), without transposing."""
-    weight = layer.weight.expand(len(x), -1, -1)
-    return torch.baddbmm(layer.bias[:, None], weight, x)
 
 
 def store_by_columns(network: nn.Module) -> None:
@@ -121,50 +49,6 @@ class Mixer(nn.Module):
         hidden = self.channels_mlp.hidden(self.norm2(x)).mean(dim=1)
         out: Tensor = x.mean(dim=1) + self.channels_mlp.fc2(hidden)
         return out
-
-
-class Attention(nn.Module):
-    """Multi-head attention with packed input projections, as `torch.nn.MultiheadAttention`."""
-
-    def __init__(self, channels: int, heads: int) -> None:
-        """Make it."""
-        super().__init__()
-        self.in_proj_weight = nn.Parameter(torch.empty(3 * channels, channels))
-        self.in_proj_bias = nn.Parameter(torch.zeros(3 * channels))
-        self.out_proj = Linear(channels, channels)
-        self.channels, self.heads = channels, heads
-        nn.init.xavier_uniform_(self.in_proj_weight)
-
-    def forward(self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-        """Attend and project.
-
-        Args:
-            query: (B, H, Q, D) projected queries.
-            keys: (B, H, K, D) projected keys.
-            values: (B, H, K, D) projected values.
-            mask: Added to the logits, broadcast to (B, H, Q, K); None where all keys count alike.
-
-        Returns:
-            (B, Q, H * D).
-        """
-        mixed = functional.scaled_dot_product_attention(query, keys, values, attn_mask=mask)
-        out = linear(mixed.transpose(1, 2).flatten(2), self.out_proj.weight, self.out_proj.bias)
-        return out
-
-    def query(self, x: Tensor) -> Tensor:
-        """(B, H, Q, D) queries of (B, Q, C)."""
-        first = self.channels
-        return self._split(linear(x, self.in_proj_weight[:first], self.in_proj_bias[:first]))
-
-    def keys_values(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and values (B, H, K, D) of (B, K, C)."""
-        first = self.channels
-        both = linear(x, self.in_proj_weight[first:], self.in_proj_bias[first:])
-        keys, values = both.chunk(2, dim=-1)
-        return self._split(keys), self._split(values)
-
-    def _split(self, x: Tensor) -> Tensor:
-        return x.view(*x.shape[:-1], self.heads, -1).transpose(1, 2)
 
 
 class Product(NamedTuple):

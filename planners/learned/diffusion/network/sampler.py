@@ -1,7 +1,7 @@
 """The sampler of the Diffusion Planner: DPM-Solver++ of order 2 in 10 steps.
 
 Data prediction, multistep, uniform in log-SNR, for the linear variance-preserving schedule; the
-network is called once more at the end (planner-diffusion.md §4). With
+network is called once more at the end. With
 `log alpha(t) = -(b1 - b0) t^2 / 4 - b0 t / 2`, `sigma^2 = 1 - alpha^2` and
 `lambda = log(alpha / sigma)`.
 """
@@ -54,8 +54,8 @@ class Schedule:
 def make_schedule() -> Schedule:
     """The schedule of the official planner.
 
-    All of it is computed in single precision, as there: near time 0, where alpha is about 1, that
-    moves lambda by 1e-4, and with it the times at which the network is called.
+    All of it is computed in single precision (nuPlan rule 340): near time 0, where alpha is about
+    1, that moves lambda by 1e-4, and with it the times at which the network is called.
     """
     ends = _half_snr(_log_alpha(torch.tensor([FIRST_TIME, LAST_TIME])))
     wanted = torch.linspace(float(ends[0]), float(ends[1]), STEPS + 1)

@@ -4,6 +4,6 @@ They are the devkit's where it is installed and the stand-ins otherwise, so that
 same for both. Importing this package sees to it that the names exist.
 """
 
-from shiftsim.compat.nuplan import install
+from shiftsim.compat.nuplan.finder import install
 
 install()

@@ -1,10 +1,10 @@
 """The map interface over a `VectorMap`; a point is any object with x and y.
 
-In nuPlan the table of lane connectors that most queries read holds lines; their areas are in
+nuPlan rule 578: the table of lane connectors that most queries read holds lines, their areas are in
 another one: proximity, distance and `is_in_layer` mean lines, `get_all_map_objects` means areas.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
@@ -14,25 +14,28 @@ from nuplan.common.maps.abstract_map import AbstractMap
 from nuplan.common.maps.maps_datatypes import SemanticMapLayer, StopLineType
 
 from shiftsim.arrays import FloatArray
-from shiftsim.compat.nuplan.bridge.map_objects import (
-    BridgeArea,
-    BridgeIntersection,
-    BridgeLane,
-    BridgeLaneConnector,
-    BridgeRoadBlock,
-    BridgeStopLine,
-)
+from shiftsim.compat.nuplan.bridge.map_objects import KINDS, BridgeLaneConnector
 from shiftsim.world.layers import Layer, nearest_of
 from shiftsim.world.map import VectorMap
 
+_LAYERS = SemanticMapLayer
+_WHOLE = {  # layers of nuPlan that are one of ours
+    _LAYERS.STOP_LINE: "stop_polygons",
+    _LAYERS.INTERSECTION: "intersections",
+    _LAYERS.CROSSWALK: "crosswalks",
+    _LAYERS.WALKWAYS: "walkways",
+    _LAYERS.CARPARK_AREA: "car_parks",
+    _LAYERS.DRIVABLE_AREA: "drivable_areas",
+}
+
 
 class _Span(NamedTuple):
-    """One of nuPlan's layers: the objects `first` … `stop` - 1 of one of ours."""
+    """One of nuPlan's layers: the objects `first` … `stop` - 1 of one of ours, by its name."""
 
+    name: str
     layer: Layer
     first: int
     stop: int
-    make: Callable[[int], Any] | None
 
 
 class BridgeMap(AbstractMap):
@@ -53,25 +56,18 @@ class BridgeMap(AbstractMap):
 
     @cached_property
     def _spans(self) -> dict[Any, _Span]:
-        road, layers = self.source, SemanticMapLayer
-        edges, blocks = road.edges, road.blocks
-        lanes, roads = road.num_lanes, road.num_roadblocks
+        source = self.source
+        lanes, edges = source.num_lanes, len(source.edges)
+        roads, blocks = source.num_roadblocks, len(source.blocks)
         spans = {
-            layers.LANE: _Span(edges, 0, lanes, self.edge),
-            layers.LANE_CONNECTOR: _Span(edges, lanes, len(edges), self.edge),
-            layers.ROADBLOCK: _Span(blocks, 0, roads, self.block),
-            layers.ROADBLOCK_CONNECTOR: _Span(blocks, roads, len(blocks), self.block),
+            _LAYERS.LANE: _Span("edges", source.edges, 0, lanes),
+            _LAYERS.LANE_CONNECTOR: _Span("edges", source.edges, lanes, edges),
+            _LAYERS.ROADBLOCK: _Span("blocks", source.blocks, 0, roads),
+            _LAYERS.ROADBLOCK_CONNECTOR: _Span("blocks", source.blocks, roads, blocks),
         }
-        wholes = {
-            layers.STOP_LINE: (road.stop_polygons, self.stop_line),
-            layers.INTERSECTION: (road.intersections, self.intersection),
-            layers.CROSSWALK: (road.crosswalks, self._area_of("crosswalks")),
-            layers.WALKWAYS: (road.walkways, self._area_of("walkways")),
-            layers.CARPARK_AREA: (road.car_parks, self._area_of("car_parks")),
-            layers.DRIVABLE_AREA: (road.drivable_areas, None),
-        }
-        for name, (layer, make) in wholes.items():
-            spans[name] = _Span(layer, 0, len(layer), make)
+        for kind, name in _WHOLE.items():
+            layer: Layer = getattr(source, name)
+            spans[kind] = _Span(name, layer, 0, len(layer))
         return spans
 
     @cached_property
@@ -80,49 +76,30 @@ class BridgeMap(AbstractMap):
         connectors = range(self.source.num_lanes, len(self.source.edges))
         return shapely.STRtree([shapely.LineString(lines.at(edge)) for edge in connectors])
 
-    def edge(self, index: int) -> Any:
-        """Lane or lane connector number `index` of the map."""
-        kind = BridgeLaneConnector if self.source.is_connector(index) else BridgeLane
-        return self._once("edge", index, lambda: kind(self, index))
-
-    def block(self, index: int) -> Any:
-        """Roadblock or roadblock connector number `index` of the map."""
-        return self._once("block", index, lambda: BridgeRoadBlock(self, index))
-
-    def stop_line(self, index: int) -> Any:
-        """Stop polygon number `index` of the map."""
-        return self._once("stop line", index, lambda: BridgeStopLine(self, index))
-
-    def intersection(self, index: int) -> Any:
-        """Intersection number `index` of the map."""
-        return self._once("intersection", index, lambda: BridgeIntersection(self, index))
-
-    def _area_of(self, name: str) -> Callable[[int], Any]:
-        layer: Layer = getattr(self.source, name)
-        return lambda index: self._once(
-            name, index, lambda: BridgeArea(layer.ids[index], layer.shape(index))
-        )
-
-    def _once(self, kind: str, index: int, make: Callable[[], Any]) -> Any:
-        found = self._made.get((kind, index))
+    def object(self, layer: str, index: int) -> Any:
+        """Object number `index` of one of our layers, always the same one."""
+        found = self._made.get((layer, index))
         if found is None:
-            found = self._made[kind, index] = make()
+            kind: type[Any] = KINDS[layer]
+            if layer == "edges" and self.source.is_connector(index):
+                kind = BridgeLaneConnector
+            found = self._made[layer, index] = kind(self, getattr(self.source, layer), index)
         return found
 
     def get_available_map_objects(self) -> list[Any]:
         """Layers whose objects can be asked for."""
-        return [layer for layer, span in self._spans.items() if span.make is not None]
+        return [layer for layer in self._spans if layer != _LAYERS.DRIVABLE_AREA]
 
     def get_map_object(self, object_id: str, layer: Any) -> Any:
         """The object of that id, or None."""
-        span, make = self._objects(layer)
+        span = self._objects(layer)
         index = span.layer.index.get(str(object_id), -1)
-        return make(index) if span.first <= index < span.stop else None
+        return self.object(span.name, index) if span.first <= index < span.stop else None
 
     def get_all_map_objects(self, point: Any, layer: Any) -> list[Any]:
         """The objects whose areas hold a point in their interior."""
-        span, make = self._objects(layer)
-        return [make(index) for index in self._holding(span, point)]
+        span = self._objects(layer)
+        return [self.object(span.name, index) for index in self._holding(span, point)]
 
     def get_one_map_object(self, point: Any, layer: Any) -> Any:
         """The only object whose area holds a point, or None."""
@@ -142,22 +119,22 @@ class BridgeMap(AbstractMap):
         return {layer: self._near(point, radius, layer) for layer in layers}
 
     def _near(self, point: Any, radius: float, layer: Any) -> list[Any]:
-        span, make = self._objects(layer)
-        if layer == SemanticMapLayer.LANE_CONNECTOR:
-            x, y = point.x, point.y
+        span, x, y = self._objects(layer), float(point.x), float(point.y)
+        if layer == _LAYERS.LANE_CONNECTOR:
             square = shapely.box(x - radius, y - radius, x + radius, y + radius)
             found = self._connector_lines.query(square, predicate="intersects")
-            return [make(span.first + line) for line in sorted(found.tolist())]
-        near = span.layer.within_box(float(point.x), float(point.y), float(radius)).tolist()
-        return [make(index) for index in near if span.first <= index < span.stop]
+            near = sorted((span.first + found).tolist())
+        else:
+            near = span.layer.within_box(x, y, float(radius)).tolist()
+        return [self.object(span.name, i) for i in near if span.first <= i < span.stop]
 
     def is_in_layer(self, point: Any, layer: Any) -> bool:
         """Whether an object of a layer holds a point in its interior."""
-        if layer == SemanticMapLayer.TURN_STOP:
+        if layer == _LAYERS.TURN_STOP:
             kinds = self.source.stop_kinds
-            lines = self._holding(self._span(SemanticMapLayer.STOP_LINE), point)
+            lines = self._holding(self._span(_LAYERS.STOP_LINE), point)
             return any(kinds[line] == int(StopLineType.TURN_STOP) for line in lines)
-        if layer == SemanticMapLayer.LANE_CONNECTOR:
+        if layer == _LAYERS.LANE_CONNECTOR:
             place, lines = shapely.Point(point.x, point.y), self._connector_lines
             near = lines.geometries[lines.query(place)]
             return bool(shapely.contains(near, place).any())
@@ -170,7 +147,7 @@ class BridgeMap(AbstractMap):
         span = self._span(layer)
         if span.first == span.stop:
             return None, None
-        if layer == SemanticMapLayer.LANE_CONNECTOR:
+        if layer == _LAYERS.LANE_CONNECTOR:
             place, lines = shapely.Point(point.x, point.y), self._connector_lines
             index = int(lines.nearest(place))
             distance = float(lines.geometries[index].distance(place))
@@ -210,10 +187,10 @@ class BridgeMap(AbstractMap):
         self.get_raster_map_layer(layer)
 
     def _get_roadblock(self, roadblock_id: str) -> Any:  # private, and yet used by public planners
-        return self.get_map_object(roadblock_id, SemanticMapLayer.ROADBLOCK)
+        return self.get_map_object(roadblock_id, _LAYERS.ROADBLOCK)
 
     def _get_roadblock_connector(self, roadblock_connector_id: str) -> Any:
-        return self.get_map_object(roadblock_connector_id, SemanticMapLayer.ROADBLOCK_CONNECTOR)
+        return self.get_map_object(roadblock_connector_id, _LAYERS.ROADBLOCK_CONNECTOR)
 
     def _span(self, layer: Any) -> _Span:
         try:
@@ -221,11 +198,11 @@ class BridgeMap(AbstractMap):
         except KeyError:
             raise ValueError(f"maps of shiftsim have no layer {layer.name}") from None
 
-    def _objects(self, layer: Any) -> tuple[_Span, Callable[[int], Any]]:
+    def _objects(self, layer: Any) -> _Span:
         span = self._span(layer)
-        if span.make is None:
+        if layer == _LAYERS.DRIVABLE_AREA:
             raise ValueError(f"layer {layer.name} has no objects to ask for")
-        return span, span.make
+        return span
 
     def _holding(self, span: _Span, point: Any) -> list[int]:
         found = span.layer.containing(float(point.x), float(point.y)).tolist()

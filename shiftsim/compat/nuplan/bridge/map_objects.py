@@ -19,7 +19,8 @@ from nuplan.common.maps.maps_datatypes import IntersectionType, LaneConnectorTyp
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import MapError
-from shiftsim.world.map import NONE
+from shiftsim.world.layers import Layer, Lists
+from shiftsim.world.map import NONE, VectorMap
 
 if TYPE_CHECKING:
     from shiftsim.compat.nuplan.bridge.map import BridgeMap
@@ -100,65 +101,82 @@ class BridgePolyline(PolylineMapObject):
         return np.array(self.linestring.interpolate(max(arc, 0.0)).coords[0])
 
 
-class _Edge:
+class _Mapped:
+    """An object of one of our layers, `id` its id there."""
+
+    def __init__(self, owner: "BridgeMap", layer: Layer, index: int) -> None:
+        self._map, self._layer, self._index = owner, layer, index
+        self.id = layer.ids[index]
+
+    @property
+    def _source(self) -> VectorMap:
+        return self._map.source
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """Its area."""
+        return self._layer.shape(self._index)
+
+    def _linked(self, table: Lists, layer: str) -> list[Any]:
+        """The objects of a layer that a table of the map lists for this one."""
+        return [self._map.object(layer, i) for i in table.at(self._index).tolist()]
+
+
+class _Edge(_Mapped):
     """What lanes and lane connectors share."""
 
     parallel_edges = _NotInNuplan()
     get_width_left_right = _NotInNuplan()
     oriented_distance = _NotInNuplan()
 
-    def __init__(self, owner: "BridgeMap", index: int) -> None:
-        self._map, self._index = owner, index
-        self.id = owner.source.edges.ids[index]
-
     @cached_property
     def incoming_edges(self) -> list[Any]:
         """Edges that lead here."""
-        return [self._map.edge(i) for i in self._map.source.incoming.at(self._index).tolist()]
+        return self._linked(self._source.incoming, "edges")
 
     @cached_property
     def outgoing_edges(self) -> list[Any]:
         """Edges that this one leads to."""
-        return [self._map.edge(i) for i in self._map.source.outgoing.at(self._index).tolist()]
+        return self._linked(self._source.outgoing, "edges")
 
     @cached_property
-    def polygon(self) -> shapely.Polygon:
-        """Its area."""
-        return self._map.source.edges.shape(self._index)
+    def stop_lines(self) -> list[Any]:
+        """Where its lights make one stop."""
+        return self._linked(self._source.stop_lines, "stop_polygons")
 
     @cached_property
     def baseline_path(self) -> BridgePolyline:
         """Its centre line."""
-        return BridgePolyline(self.id, self._map.source.baselines.at(self._index))
+        return BridgePolyline(self.id, self._source.baselines.at(self._index))
 
     @cached_property
     def left_boundary(self) -> BridgePolyline:
         """The line on its left."""
-        return self._boundary(self._map.source.left_boundaries.at(self._index), 0)
+        return self._boundary(self._source.left_boundaries.at(self._index), 0)
 
     @cached_property
     def right_boundary(self) -> BridgePolyline:
         """The line on its right."""
-        return self._boundary(self._map.source.right_boundaries.at(self._index), 1)
+        return self._boundary(self._source.right_boundaries.at(self._index), 1)
 
     def _boundary(self, xy: FloatArray, side: int) -> BridgePolyline:
         if len(xy) < 2:
             raise MapError(
                 f"map {self._map.map_name!r}: {self.id!r} has no {('left', 'right')[side]} boundary"
             )
-        return BridgePolyline(self._map.source.boundary_ids[self._index][side], xy)
+        return BridgePolyline(self._source.boundary_ids[self._index][side], xy)
 
     @property
     def speed_limit_mps(self) -> float | None:
         """[m/s]; None where the map has none."""
-        limit = float(self._map.source.speed_limits[self._index])
+        limit = float(self._source.speed_limits[self._index])
         return None if np.isnan(limit) else limit
 
     @property
     def parent(self) -> Any:
         """Its roadblock or roadblock connector; None where the map names an unknown one."""
-        block = int(self._map.source.block_of[self._index])
-        return None if block == NONE else self._map.block(block)
+        block = int(self._source.block_of[self._index])
+        return None if block == NONE else self._map.object("blocks", block)
 
     def get_roadblock_id(self) -> str:
         """Id of its roadblock or roadblock connector."""
@@ -166,13 +184,7 @@ class _Edge:
 
     def has_traffic_lights(self) -> bool:
         """Whether lights govern it."""
-        return bool(self._map.source.has_traffic_lights[self._index])
-
-    @cached_property
-    def stop_lines(self) -> list[Any]:
-        """Where its lights make one stop."""
-        found = self._map.source.stop_lines.at(self._index).tolist()
-        return [self._map.stop_line(i) for i in found]
+        return bool(self._source.has_traffic_lights[self._index])
 
 
 class BridgeLane(_Edge, Lane):
@@ -181,7 +193,7 @@ class BridgeLane(_Edge, Lane):
     @property
     def index(self) -> int:
         """Position in the roadblock, 0 leftmost."""
-        return int(self._map.source.lane_index[self._index])
+        return int(self._source.lane_index[self._index])
 
     def is_left_of(self, other: Any) -> bool:
         """Whether it is further left in the same roadblock."""
@@ -196,9 +208,9 @@ class BridgeLane(_Edge, Lane):
     @property
     def adjacent_edges(self) -> tuple[Any, Any]:
         """The lanes on the left and on the right, or None."""
-        source, index = self._map.source, self._index
+        source, index = self._source, self._index
         sides = int(source.left_lane[index]), int(source.right_lane[index])
-        left, right = (None if side == NONE else self._map.edge(side) for side in sides)
+        left, right = (None if side == NONE else self._map.object("edges", side) for side in sides)
         return left, right
 
 
@@ -210,107 +222,78 @@ class BridgeLaneConnector(_Edge, LaneConnector):
     @property
     def turn_type(self) -> Any:
         """Where it turns."""
-        return LaneConnectorType(int(self._map.source.turn_type[self._index]))
+        return LaneConnectorType(int(self._source.turn_type[self._index]))
 
     def is_left_of(self, other: Any) -> bool:
         """False: connectors have no neighbours."""
         return False
 
-    def is_right_of(self, other: Any) -> bool:
-        """False: connectors have no neighbours."""
-        return False
+    is_right_of = is_left_of
 
 
-class BridgeRoadBlock(RoadBlockGraphEdgeMapObject):
+class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
     """A roadblock or a roadblock connector."""
 
     parallel_edges = _NotInNuplan()
     children_stop_lines = _NotInNuplan()
 
-    def __init__(self, owner: "BridgeMap", index: int) -> None:
-        self._map, self._index = owner, index
-        self.id = owner.source.blocks.ids[index]
-
-    @cached_property
-    def polygon(self) -> shapely.Polygon:
-        """Its area."""
-        return self._map.source.blocks.shape(self._index)
-
     @cached_property
     def incoming_edges(self) -> list[Any]:
         """Blocks that lead here."""
-        found = self._map.source.block_incoming.at(self._index).tolist()
-        return [self._map.block(i) for i in found]
+        return self._linked(self._source.block_incoming, "blocks")
 
     @cached_property
     def outgoing_edges(self) -> list[Any]:
         """Blocks that this one leads to."""
-        found = self._map.source.block_outgoing.at(self._index).tolist()
-        return [self._map.block(i) for i in found]
+        return self._linked(self._source.block_outgoing, "blocks")
 
     @cached_property
     def interior_edges(self) -> list[Any]:
         """Its lanes or lane connectors."""
-        return [self._map.edge(i) for i in self._map.source.block_edges.at(self._index).tolist()]
+        return self._linked(self._source.block_edges, "edges")
 
     @property
     def intersection(self) -> Any:
         """The intersection of a roadblock connector, or None."""
-        source = self._map.source
-        edges = source.block_edges.at(self._index).tolist()
-        where = {int(source.intersection_of[i]) for i in edges} - {NONE}
-        return self._map.intersection(min(where)) if where else None
+        edges = self._source.block_edges.at(self._index).tolist()
+        where = {int(self._source.intersection_of[i]) for i in edges} - {NONE}
+        return self._map.object("intersections", min(where)) if where else None
 
 
-class BridgeStopLine(StopLine):
+class BridgeStopLine(_Mapped, StopLine):
     """Where one stops."""
 
     intersection_from = _NotInNuplan()
     parent = _NotInNuplan()
 
-    def __init__(self, owner: "BridgeMap", index: int) -> None:
-        self._map, self._index = owner, index
-        source = owner.source
-        super().__init__(
-            source.stop_polygons.ids[index], StopLineType(int(source.stop_kinds[index]))
-        )
-
     @property
     def layer_type(self) -> Any:
         """Why one stops here."""
-        return self.stop_line_type
+        return StopLineType(int(self._source.stop_kinds[self._index]))
 
-    @cached_property
-    def polygon(self) -> shapely.Polygon:
-        """Its area."""
-        return self._map.source.stop_polygons.shape(self._index)
+    stop_line_type = layer_type
 
 
-class BridgeIntersection(Intersection):
+class BridgeIntersection(_Mapped, Intersection):
     """Where roads meet."""
 
     interior_edges = _NotInNuplan()
     incoming_edges = _NotInNuplan()
     is_signaled = _NotInNuplan()
-
-    def __init__(self, owner: "BridgeMap", index: int) -> None:
-        self._map, self._index = owner, index
-        # nuPlan: its map never says of which kind an intersection is
-        super().__init__(owner.source.intersections.ids[index], IntersectionType.DEFAULT)
-
-    @cached_property
-    def polygon(self) -> shapely.Polygon:
-        """Its area."""
-        return self._map.source.intersections.shape(self._index)
+    # nuPlan rule 577: its map never says of which kind an intersection is
+    intersection_type = IntersectionType.DEFAULT
 
 
-class BridgeArea(PolygonMapObject):
+class BridgeArea(_Mapped, PolygonMapObject):
     """A crosswalk, a walkway or a car park."""
 
-    def __init__(self, area_id: str, polygon: shapely.Polygon) -> None:
-        self.id, self._polygon = area_id, polygon
 
-    @property
-    def polygon(self) -> shapely.Polygon:
-        """Its area."""
-        return self._polygon
+KINDS = {  # of the objects of a layer; lane connectors, the last of the edges, have their own
+    "edges": BridgeLane,
+    "blocks": BridgeRoadBlock,
+    "stop_polygons": BridgeStopLine,
+    "intersections": BridgeIntersection,
+    "crosswalks": BridgeArea,
+    "walkways": BridgeArea,
+    "car_parks": BridgeArea,
+}

@@ -11,7 +11,6 @@ from nuplan.common.actor_state.state_representation import StateSE2
 from nuplan.planning.simulation.observation.observation_type import DetectionsTracks
 from nuplan.planning.simulation.planner.abstract_planner import PlannerInitialization
 
-from shiftsim.compat.nuplan import install, wrap
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
 from shiftsim.errors import ConfigError, PlannerError
@@ -95,18 +94,8 @@ class NuplanPlanner:
         kind = self._source if inspect.isclass(self._source) else type(self._source)
         if kind.__module__ == "__main__":
             raise pickle.PicklingError(f"{kind.__name__} is defined in the main script")
-        return _rebuild, (_Names(), self._source, self._arguments)
-
-
-class _Names:
-    """Travels ahead of a planner: where it arrives, the `nuplan.*` names exist."""
-
-    def __reduce__(self) -> Any:
-        return install, ()
-
-
-def _rebuild(_: bool, source: Any, arguments: Mapping[str, Any]) -> NuplanPlanner:
-    return wrap(source, **arguments)
+        # where it arrives this class comes first, and with its package the `nuplan.*` names
+        return NuplanPlanner, (self._source, self._arguments)
 
 
 def _hash_of_code(kind: type) -> str:

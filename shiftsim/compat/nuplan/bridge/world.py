@@ -95,7 +95,7 @@ class SeenTracks(DetectionsTracks):
         if tracks.kinds[track] > LAST_AGENT_KIND:
             return StaticObject(kind, box, metadata)
         velocity = StateVector2D(*tracks.velocities[0, track].tolist())
-        # nuPlan: objects of a log come with an unknown angular velocity and no predictions
+        # nuPlan rule 579: objects of a log come with an unknown angular velocity and no predictions
         return Agent(kind, box, velocity, metadata, angular_velocity=np.nan, predictions=[])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2
+from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2, part
 from shiftsim.compat.nuplan.stand_ins.transforms import (
     translate_longitudinally,
     translate_longitudinally_and_laterally,
@@ -17,22 +17,29 @@ from shiftsim.compat.nuplan.stand_ins.transforms import (
 from shiftsim.world.state import PACIFICA
 
 
-@dataclass
-class BoxParameters:
-    """Width and length [m]."""
+class _Halves:
+    """What follows from width and length."""
 
-    width: float
-    length: float
+    width: Any
+    length: Any
 
     @property
     def half_width(self) -> float:
         """Half the width [m]."""
-        return self.width / 2.0
+        return float(self.width / 2.0)
 
     @property
     def half_length(self) -> float:
         """Half the length [m]."""
-        return self.length / 2.0
+        return float(self.length / 2.0)
+
+
+@dataclass
+class BoxParameters(_Halves):
+    """Width and length [m]."""
+
+    width: float
+    length: float
 
 
 class VehicleParameters(BoxParameters):
@@ -124,7 +131,7 @@ class Dimension:
     height: float
 
 
-class OrientedBox:
+class OrientedBox(_Halves):
     """A box by the pose of its centre and its size [m]; its polygon is made when asked for."""
 
     def __init__(self, center: StateSE2, length: float, width: float, height: float) -> None:
@@ -136,40 +143,15 @@ class OrientedBox:
         """A box of the same size elsewhere."""
         return OrientedBox(pose, *astuple(box.dimensions))
 
-    @property
-    def center(self) -> StateSE2:
-        """Pose of the centre."""
-        return self._center
-
-    @property
-    def length(self) -> float:
-        """Length [m]."""
-        return self.dimensions.length
-
-    @property
-    def width(self) -> float:
-        """Width [m]."""
-        return self.dimensions.width
-
-    @property
-    def height(self) -> float:
-        """Height [m]."""
-        return self.dimensions.height
-
-    @property
-    def half_length(self) -> float:
-        """Half the length [m]."""
-        return self.length / 2.0
-
-    @property
-    def half_width(self) -> float:
-        """Half the width [m]."""
-        return self.width / 2.0
+    center = part("_center", "Pose of the centre.")
+    length = part("dimensions.length", "Length [m].")
+    width = part("dimensions.width", "Width [m].")
+    height = part("dimensions.height", "Height [m].")
 
     @property
     def half_height(self) -> float:
         """Half the height [m]."""
-        return self.height / 2.0
+        return float(self.height / 2.0)
 
     def corner(self, point: OrientedBoxPointType) -> Point2D:
         """One point of the box."""
@@ -214,7 +196,7 @@ class CarFootprint(OrientedBox):
         """From the pose of the rear axle, which is kept as it is."""
         distance = vehicle_parameters.rear_axle_to_center
         made = cls(translate_longitudinally(rear_axle_pose, distance), vehicle_parameters)
-        made.__dict__["rear_axle"] = rear_axle_pose  # nuPlan computes it back, off by an ulp
+        made.__dict__["rear_axle"] = rear_axle_pose  # nuPlan computes it back, off by one bit
         return made
 
     @classmethod

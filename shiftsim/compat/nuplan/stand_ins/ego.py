@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.compat.nuplan.stand_ins.boxes import CarFootprint, OrientedBox, VehicleParameters
-from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, StateVector2D, TimePoint
+from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, StateVector2D, TimePoint, part
 from shiftsim.compat.nuplan.stand_ins.objects import (
     AgentState,
     SceneObjectMetadata,
@@ -34,15 +34,8 @@ class SplitState:
 class InterpolatableState(ABC):
     """A state at a moment, which an `InterpolatedTrajectory` can be made of."""
 
-    @property
-    @abstractmethod
-    def time_point(self) -> TimePoint:
-        """Its moment."""
-
-    @property
-    def time_us(self) -> int:
-        """Its moment [us]."""
-        return self.time_point.time_us
+    time_point: TimePoint
+    time_us = part("time_point.time_us", "Its moment [us].")
 
     @abstractmethod
     def to_split_state(self) -> SplitState:
@@ -54,56 +47,24 @@ class InterpolatableState(ABC):
         """A state from parts."""
 
 
+@dataclass
 class Waypoint(InterpolatableState):
     """A box at a moment, with or without a velocity [m/s]."""
 
-    def __init__(
-        self,
-        time_point: TimePoint,
-        oriented_box: OrientedBox,
-        velocity: StateVector2D | None = None,
-    ) -> None:
-        self._time_point = time_point
-        self.oriented_box, self.velocity = oriented_box, velocity
+    time_point: TimePoint
+    oriented_box: OrientedBox
+    velocity: StateVector2D | None = None
 
-    @property
-    def time_point(self) -> TimePoint:
-        """Its moment."""
-        return self._time_point
-
-    @property
-    def center(self) -> StateSE2:
-        """Pose of the box's centre."""
-        return self.oriented_box.center
-
-    @property
-    def x(self) -> float:
-        """Of the centre [m]."""
-        return self.center.x
-
-    @property
-    def y(self) -> float:
-        """Of the centre [m]."""
-        return self.center.y
-
-    @property
-    def heading(self) -> float:
-        """Of the box [rad]."""
-        return self.center.heading
+    center = part("oriented_box.center", "Pose of the box's centre.")
+    x = part("oriented_box.center.x", "Of the centre [m].")
+    y = part("oriented_box.center.y", "Of the centre [m].")
+    heading = part("oriented_box.center.heading", "Of the box [rad].")
 
     def _velocity(self) -> list[float | None]:
         return [None, None] if self.velocity is None else [self.velocity.x, self.velocity.y]
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.time_us, *self.center, *self._velocity()))
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Waypoint):
-            return NotImplemented
-        mine = (self.oriented_box, self.time_point, self.velocity)
-        return mine == (other.oriented_box, other.time_point, other.velocity)
-
-    __hash__ = None  # type: ignore[assignment]  # its velocity can be changed
 
     def serialize(self) -> list[Any]:
         """Time [us], x, y, heading, length, width, height, velocity."""
@@ -154,8 +115,8 @@ def get_acceleration_shifted(
     ref_angular_vel: float,
     ref_angular_accel: float,
 ) -> StateVector2D:
-    """Acceleration of another point of the body [m/s^2]; see nuplan-simulation.md §3."""
-    # nuPlan: not the rigid-body formula
+    """Acceleration of another point of the body [m/s^2]."""
+    # nuPlan rule 573: not the formula for a rigid body
     shift = displacement.array * ref_angular_vel**2 + displacement.array * ref_angular_accel
     return StateVector2D(*(ref_accel.array + shift))
 
@@ -206,21 +167,19 @@ class DynamicCarState:
         return self.rear_axle_acceleration_2d.magnitude()
 
 
+@dataclass(eq=False)
 class EgoState(InterpolatableState):
     """The ego at a moment."""
 
-    def __init__(
-        self,
-        car_footprint: CarFootprint,
-        dynamic_car_state: DynamicCarState,
-        tire_steering_angle: float,
-        is_in_auto_mode: bool,
-        time_point: TimePoint,
-    ) -> None:
-        self.car_footprint, self.dynamic_car_state = car_footprint, dynamic_car_state
-        self.tire_steering_angle = tire_steering_angle
-        self.is_in_auto_mode = is_in_auto_mode
-        self._time_point = time_point
+    car_footprint: CarFootprint
+    dynamic_car_state: DynamicCarState
+    tire_steering_angle: float
+    is_in_auto_mode: bool
+    time_point: TimePoint
+
+    time_seconds = part("time_point.time_s", "Its moment [s].")
+    center = part("car_footprint.center", "Pose of the box's centre.")
+    rear_axle = part("car_footprint.rear_axle", "Pose of the rear axle.")
 
     @classmethod
     def build_from_rear_axle(
@@ -272,26 +231,6 @@ class EgoState(InterpolatableState):
             angular_accel,
         )
         return cls(footprint, motion, tire_steering_angle, is_in_auto_mode, time_point)
-
-    @property
-    def time_point(self) -> TimePoint:
-        """Its moment."""
-        return self._time_point
-
-    @property
-    def time_seconds(self) -> float:
-        """Its moment [s]."""
-        return float(self.time_us * 1e-6)
-
-    @property
-    def center(self) -> StateSE2:
-        """Pose of the box's centre."""
-        return self.car_footprint.center
-
-    @property
-    def rear_axle(self) -> StateSE2:
-        """Pose of the rear axle."""
-        return self.car_footprint.rear_axle
 
     @property
     def scene_object_metadata(self) -> SceneObjectMetadata:

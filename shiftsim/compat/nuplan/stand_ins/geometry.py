@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import total_ordering
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,16 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 
 
-@total_ordering
+def part(path: str, doc: str) -> Any:
+    """A property that is an attribute of a part: `part("center.x", "Of the centre [m].")`."""
+    return property(attrgetter(path), doc=doc)
+
+
+@dataclass(init=False, order=True, unsafe_hash=True, repr=False, slots=True)
 class TimeDuration:
     """A span of time, whole microseconds; made with `from_us`, `from_ms` or `from_s`."""
 
-    __slots__ = ("time_us",)
+    time_us: int
 
     def __init__(self, *, time_us: int, _direct: bool = True) -> None:
         if _direct:
@@ -45,7 +50,7 @@ class TimeDuration:
     @property
     def time_s(self) -> float:
         """The span [s]."""
-        return self.time_us / 1e6  # nuPlan: a division here, a product in TimePoint (§12 Q1)
+        return self.time_us / 1e6  # nuPlan rule 571: a division here, a product in TimePoint
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, TimeDuration):
@@ -74,15 +79,6 @@ class TimeDuration:
             return self.from_s(self.time_s // divisor)
         return NotImplemented
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, TimeDuration) and self.time_us == other.time_us
-
-    def __lt__(self, other: object) -> Any:
-        return self.time_us < other.time_us if isinstance(other, TimeDuration) else NotImplemented
-
-    def __hash__(self) -> int:
-        return hash(self.time_us)
-
     def __repr__(self) -> str:
         return f"TimeDuration({self.time_s}s)"
 
@@ -109,7 +105,7 @@ class TimePoint:
     __radd__ = __add__
 
     def __sub__(self, other: object) -> Any:
-        # nuPlan: the difference of two time points is a time point, not a duration
+        # nuPlan rule 572: the difference of two time points is a time point, not a duration
         if isinstance(other, (TimeDuration, TimePoint)):
             return TimePoint(self.time_us - other.time_us)
         return NotImplemented
@@ -220,15 +216,9 @@ class TemporalStateSE2(StateSE2):
 
     time_point: TimePoint
 
-    @property
-    def time_us(self) -> int:
-        """Microseconds since the epoch."""
-        return self.time_point.time_us
+    time_us = part("time_point.time_us", "Microseconds since the epoch.")
 
-    @property
-    def time_seconds(self) -> float:
-        """Seconds since the epoch."""
-        return self.time_us * 1e-6
+    time_seconds = part("time_point.time_s", "Seconds since the epoch.")
 
 
 class StateVector2D:

@@ -7,7 +7,7 @@ from enum import Enum
 from typing import Any, TypeAlias
 
 from shiftsim.compat.nuplan.stand_ins.boxes import OrientedBox
-from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, StateVector2D, TimePoint
+from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, StateVector2D, TimePoint, part
 
 
 class TrackedObjectType(Enum):
@@ -95,25 +95,10 @@ class SceneObject:
             SceneObjectMetadata(timestamp_us, token, track_id, track_token),
         )
 
-    @property
-    def box(self) -> OrientedBox:
-        """Its box."""
-        return self._box
-
-    @property
-    def center(self) -> StateSE2:
-        """Pose of the box's centre."""
-        return self.box.center
-
-    @property
-    def token(self) -> str:
-        """Id of this object in this sample."""
-        return self.metadata.token
-
-    @property
-    def track_token(self) -> str | None:
-        """Id of its track."""
-        return self.metadata.track_token
+    box = part("_box", "Its box.")
+    center = part("_box.center", "Pose of the box's centre.")
+    token = part("metadata.token", "Id of this object in this sample.")
+    track_token = part("metadata.track_token", "Id of its track.")
 
 
 class StaticObject(SceneObject):

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from shiftsim.compat.nuplan.stand_ins.ego import EgoState, InterpolatableState, SplitState
-from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, TimePoint
+from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, TimePoint, part
 from shiftsim.compat.nuplan.stand_ins.map_types import AbstractMap, TrafficLightStatusData
 from shiftsim.compat.nuplan.stand_ins.objects import Observation
 from shiftsim.compat.nuplan.stand_ins.transforms import AngularInterpolator, interpolate_linearly
 
-_SAMPLING_TOLERANCE = 1e-10  # nuPlan trajectory sampling
+_SAMPLING_TOLERANCE = 1e-10  # as in nuPlan
 
 
 class AbstractTrajectory(ABC):
@@ -62,7 +62,7 @@ class AbstractTrajectory(ABC):
 
 
 class InterpolatedTrajectory(AbstractTrajectory):
-    """Linear between states (nuplan-simulation.md §4)."""
+    """Linear between states."""
 
     def __init__(self, trajectory: list[Any]) -> None:
         assert trajectory, "a trajectory needs states"
@@ -149,7 +149,7 @@ class TrajectorySampling:
         elif count and interval:
             horizon = count * interval
         elif horizon and interval:
-            count = int(horizon / interval)  # nuPlan: cut, not rounded
+            count = int(horizon / interval)  # nuPlan rule 574: cut, not rounded
             rest = math.fmod(horizon, interval)
             if min(rest, abs(interval - rest)) > _SAMPLING_TOLERANCE:
                 raise ValueError(f"the horizon is not a multiple of the interval: {self}")
@@ -210,15 +210,8 @@ class SimulationIteration:
     def __post_init__(self) -> None:
         assert self.index >= 0, f"iterations count from 0: {self.index}"
 
-    @property
-    def time_us(self) -> int:
-        """Its moment [us]."""
-        return self.time_point.time_us
-
-    @property
-    def time_s(self) -> float:
-        """Its moment [s]."""
-        return self.time_point.time_s
+    time_us = part("time_point.time_us", "Its moment [us].")
+    time_s = part("time_point.time_s", "Its moment [s].")
 
 
 class SimulationHistoryBuffer:

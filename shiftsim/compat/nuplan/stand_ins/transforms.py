@@ -54,7 +54,7 @@ def translate_laterally(pose: StateSE2, distance: float) -> StateSE2:
 
 def translate_longitudinally_and_laterally(pose: StateSE2, lon: float, lat: float) -> StateSE2:
     """A pose moved forward and to its left [m]."""
-    # nuPlan: sine and cosine of heading + pi / 2 as they come out (nuplan-simulation.md §3)
+    # nuPlan rule 575: sine and cosine of heading + pi / 2 as they come out
     left = pose.heading + np.pi / 2.0
     x = pose.x + (lat * np.cos(left) + lon * np.cos(pose.heading))
     y = pose.y + (lat * np.sin(left) + lon * np.sin(pose.heading))
@@ -106,7 +106,7 @@ def numpy_array_to_absolute_velocity(
 ) -> list[StateVector2D]:
     """(N, 2) vectors put through `numpy_array_to_absolute_pose`."""
     assert velocities.shape[1] == 2, f"velocities are (*, 2), not {velocities.shape}"
-    # nuPlan: the position of the origin is added to a velocity, too
+    # nuPlan rule 576: the position of the origin is added to a velocity, too
     padded = np.c_[np.asarray(velocities, np.float64), np.zeros(len(velocities))]
     moved = numpy_array_to_absolute_pose(origin_absolute_state, padded)
     return [StateVector2D(pose.x, pose.y) for pose in moved]

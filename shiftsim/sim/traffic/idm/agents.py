@@ -1,7 +1,7 @@
-"""Who becomes a reactive agent, and where it starts (nuplan-simulation.md §10.1).
+"""Who becomes a reactive agent, and where it starts.
 
 Vehicles of the first frame are put on the baseline of the lane or connector they are in; those for
-which there is none, or no room, are not simulated.
+which there is none, or no space, are not simulated.
 """
 
 from dataclasses import dataclass
@@ -14,13 +14,12 @@ from shiftsim.errors import TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.sim.traffic.idm.paths import (
-    MAX_ROUTE,
-    Fleet,
     append_baseline,
     clamp_progress,
     finish_path,
     pose_on_path,
 )
+from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet
 from shiftsim.world.map import VectorMap
 
 _HEADING_SPACING = 0.5  # m ahead, between the two points that give a heading, nuPlan
@@ -42,24 +41,24 @@ class Start:
     pose: FloatArray
 
 
-def find_start(road: VectorMap, pose: FloatArray) -> Start | None:
-    """The edge a vehicle follows from its pose (3,), or None where it is off the road.
+def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
+    """The edge a vehicle follows from its pose (3,), or None where it is off the map.
 
     A lane is preferred to a connector, and among several the one whose heading differs least.
     """
     x, y = float(pose[0]), float(pose[1])
-    edges = road.lanes_at(x, y)
-    if not edges and len(road.intersections.containing(x, y)):
-        edges = road.connectors_at(x, y)
+    edges = map.lanes_at(x, y)
+    if not edges and len(map.intersections.containing(x, y)):
+        edges = map.connectors_at(x, y)
     if not edges:
         return None
-    starts = [_project(road, edge, x, y) for edge in edges]
-    # nuPlan: the difference of headings is not wrapped (§10.1)
+    starts = [_project(map, edge, x, y) for edge in edges]
+    # nuPlan rule 120: the difference of headings is not wrapped
     return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
 
 
-def _project(road: VectorMap, edge: int, x: float, y: float) -> Start:
-    line = shapely.LineString(road.baselines.at(edge))
+def _project(map: VectorMap, edge: int, x: float, y: float) -> Start:
+    line = shapely.LineString(map.baselines.at(edge))
     progress = float(shapely.line_locate_point(line, shapely.Point(x, y)))
     here = _point(line, progress)
     ahead = _point(line, progress + _HEADING_SPACING)
@@ -77,21 +76,15 @@ def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
 
 
 def place_agents(
-    road: VectorMap,
-    poses: FloatArray,
-    sizes: FloatArray,
-    taken: FloatArray,
-    *,
-    skip_short: bool = False,
+    map: VectorMap, poses: FloatArray, sizes: FloatArray, taken: FloatArray
 ) -> list[Start | None]:
     """Starts of vehicles that can be simulated, in order; None for the others.
 
     Args:
-        road: The map.
+        map: The map.
         poses: (N, 3) logged box centres x [m], y [m], heading [rad].
         sizes: (N, 2) length, width [m].
         taken: (M, 4, 2) corners of boxes that must stay free, such as the ego's [m].
-        skip_short: Whether a vehicle on a baseline too short to be a path is dropped.
 
     Returns:
         N starts. A start whose box touches a taken box, or that of an earlier agent, is dropped.
@@ -102,18 +95,16 @@ def place_agents(
     occupied = list(taken)
     out: list[Start | None] = []
     for pose, size in zip(poses, sizes, strict=True):
-        start = find_start(road, pose)
+        start = find_start(map, pose)
         corners = boxes_to_corners(pose if start is None else start.pose, size)
         if start is not None and any(convex_intersect(corners, o) for o in occupied):
             start = None
-        if start is not None and len(road.baselines.at(start.edge)) < _MIN_VERTICES:
-            if not skip_short:
-                raise TrafficError(
-                    f"map {road.name}: the baseline of {road.edges.ids[start.edge]}, on which a "
-                    f"vehicle starts, has fewer than {_MIN_VERTICES} vertices",
-                    hint="nuPlan fails here as well; --traffic reactive-fixed goes on",
-                )
-            start = None
+        if start is not None and len(map.baselines.at(start.edge)) < _MIN_VERTICES:
+            raise TrafficError(
+                f"map {map.name}: the baseline of {map.edges.ids[start.edge]}, on which a "
+                f"vehicle starts, has fewer than {_MIN_VERTICES} vertices",
+                hint="nuPlan fails here as well; leave the scenario out, or use other traffic",
+            )
         if start is not None:
             occupied.append(corners)
         out.append(start)
@@ -121,7 +112,7 @@ def place_agents(
 
 
 def make_fleet(
-    road: VectorMap,
+    map: VectorMap,
     starts: list[Start],
     sizes: FloatArray,
     speeds: FloatArray,
@@ -130,14 +121,14 @@ def make_fleet(
     """Agents at their starts.
 
     Args:
-        road: The map.
+        map: The map.
         starts: A starts.
         sizes: (A, 2) length, width [m].
         speeds: (A,) speed along the path [m/s].
         default_target: Speed on a free road where no speed limit is known yet [m/s].
     """
     count = len(starts)
-    room = max([len(road.baselines.at(start.edge)) for start in starts], default=2)
+    longest = max([len(map.baselines.at(start.edge)) for start in starts], default=2)
     fleet = Fleet(
         alive=np.ones(count, np.bool_),
         size=np.ascontiguousarray(sizes, np.float64),
@@ -147,32 +138,25 @@ def make_fleet(
         pose=np.zeros((count, 3)),
         route=np.zeros((count, MAX_ROUTE), np.int64),
         route_size=np.ones(count, np.int64),
-        path=np.zeros((count, room, 4)),
+        path=np.zeros((count, longest, 4)),
         path_size=np.zeros(count, np.int64),
     )
     target = default_target
     for agent, start in enumerate(starts):
-        limit = float(road.speed_limits[start.edge])
-        # nuPlan: an agent without a limit inherits that of the agent before it (§10.1)
+        limit = float(map.speed_limits[start.edge])
+        # nuPlan rule 121: an agent without a limit inherits that of the agent before it
         target = limit if np.isfinite(limit) and limit != 0.0 else target
         fleet.target[agent] = target
         fleet.route[agent, 0] = start.edge
         path = fleet.path[agent]
-        size = finish_path(path, append_baseline(road.baselines, start.edge, path, 0))
+        size = finish_path(path, append_baseline(map.baselines, start.edge, path, 0))
         fleet.path_size[agent] = size
         fleet.pose[agent] = pose_on_path(path, size, clamp_progress(path, size, start.progress))
     return fleet
 
 
-def more_room(fleet: Fleet, needed: int) -> Fleet:
-    """The same agents with room for paths of `needed` vertices, and some to spare."""
-    path = np.zeros((len(fleet.path), 2 * needed, 4))
-    path[:, : fleet.path.shape[1]] = fleet.path
-    return fleet._replace(path=path)
-
-
-def order_observed(kinds: IntArray, valid: BoolArray, open_loop: tuple[int, ...]) -> IntArray:
+def order_observed(kinds: IntArray, valid: BoolArray) -> IntArray:
     """Indices of present tracks in nuPlan's order: agents, then replayed kinds as listed."""
-    parts = [np.flatnonzero(valid & ~np.isin(kinds, open_loop))]
-    parts += [np.flatnonzero(valid & (kinds == kind)) for kind in open_loop]
+    parts = [np.flatnonzero(valid & ~np.isin(kinds, REPLAYED_KINDS))]
+    parts += [np.flatnonzero(valid & (kinds == kind)) for kind in REPLAYED_KINDS]
     return np.concatenate(parts)

@@ -22,7 +22,7 @@ _PER_VERTEX = 4  # most curve vertices of a join, fillets apart
 
 
 @lean_kernel
-def curve_room(num_points: int) -> int:
+def curve_capacity(num_points: int) -> int:
     """Most vertices the buffer curve of a polyline can have, whatever its turns add up to."""
     return 2 * num_points * (_PER_VERTEX + 2 * QUADRANT_SEGMENTS) + 8
 

@@ -1,95 +1,130 @@
-"""Whom an agent follows: the nearest obstacle in the corridor ahead (§10.2)."""
+"""Whom an agent follows: whoever is nearest in the corridor ahead, which its path makes."""
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
-from shiftsim.sim.traffic.idm.footprints import Obstacles, Scratch, remaining_path
-from shiftsim.sim.traffic.idm.grid import list_near
-from shiftsim.sim.traffic.idm.paths import PROGRESS, Fleet, Roads
+from shiftsim.sim.traffic.idm.footprints import remaining_path
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
     PIECE,
     UNSURE,
     bound_pieces,
     last_near_piece,
+    num_pieces,
     ring_gap,
     touches_corridor,
 )
-from shiftsim.world.layers import Polygons
 from shiftsim.world.state import LightStatus
 
-FREE, LOST = -1, -2  # instead of an obstacle: nobody ahead; outside of the own corridor
+FREE, OFF_PATH = -1, -2  # instead of a footprint: nobody ahead; outside of the own corridor
 _RED = int(LightStatus.RED)
 _TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to see ties
+_MARGIN = 1.1  # corridors lie within this many half widths of their line
 
 
 @lean_kernel
-def find_lead(
-    fleet: Fleet,
-    agent: int,
-    obstacles: Obstacles,
-    count: int,
-    roads: Roads,
-    stops: Polygons,
-    status: IntArray,
-    scratch: Scratch,
-) -> tuple[int, float]:
-    """The nearest obstacle in the corridor ahead of an agent, the first one on ties, and the gap.
+def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
+    """The nearest footprint in the corridor ahead of an agent, the first one on ties, and the gap.
 
     Returns:
-        Its index, `count` for a stop line, FREE or LOST; the gap between the footprints [m].
+        Its index, the number of footprints for a stop line, FREE or OFF_PATH; the gap between the
+        footprints [m].
     """
+    fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
     half_width = 0.5 * fleet.size[agent, 1]
     size = remaining_path(fleet, agent, scratch.line)
     bound_pieces(scratch.line, size, scratch.pieces)
     path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
     if not fleet.progress[agent] < path_end and not _in_corridor(
-        obstacles, agent, half_width, size, scratch
+        footprints, agent, half_width, size, scratch
     ):
-        return LOST, 0.0  # §12 Q13
-    found = list_near(obstacles, agent, half_width, size, scratch)
+        return OFF_PATH, 0.0  # nuPlan rule 128
+    found = _list_near(footprints, agent, half_width, size, scratch)
     best, lead = np.inf, FREE
     for _ in range(found):
         nearest = 0
         for index in range(1, found):
             apart, least = scratch.apart[index], scratch.apart[nearest]
-            if apart < least or (apart == least and scratch.hits[index] < scratch.hits[nearest]):
+            if apart < least or (apart == least and scratch.near[index] < scratch.near[nearest]):
                 nearest = index
         if scratch.apart[nearest] > best:
             break
         scratch.apart[nearest] = np.inf
-        other = scratch.hits[nearest]
+        other = scratch.near[nearest]
         if best == 0.0 and other > lead:
             continue
-        gap = _gap(obstacles, agent, other, best * (1.0 + _TIE) + _TINY)
+        gap = _gap(footprints, agent, other, best * (1.0 + _TIE) + _TINY)
         closer = gap < best or (gap == best and other < lead)
-        if closer and _in_corridor(obstacles, other, half_width, size, scratch):
+        if closer and _in_corridor(footprints, other, half_width, size, scratch):
             best, lead = gap, other
+    gap = _stop_gap(scene, agent, half_width, size, best)
+    return (len(footprints.present), gap) if gap < best else (lead, best)
+
+
+@lean_kernel
+def _stop_gap(scene: Scene, agent: int, half_width: float, size: int, limit: float) -> float:
+    """Distance from an agent's footprint to the red stop lines of its route, at most `limit`."""
+    fleet, graph, scratch = scene.fleet, scene.graph, scene.scratch
+    stops, stop_lines = graph.stops, graph.stop_lines
+    best = limit
     for segment in range(fleet.route_size[agent]):
         edge = fleet.route[agent, segment]
-        if status[edge] != _RED:
+        if graph.status[edge] != _RED:
             continue
-        for entry in range(roads.stop_lines.ptr[edge], roads.stop_lines.ptr[edge + 1]):
-            corners = _copy_stop(stops, roads.stop_lines.items[entry], scratch)
-            if _meets(half_width, scratch.stop, corners, scratch.stop_bounds, size, scratch):
-                gap = _ring_gap(obstacles, agent, scratch.stop, corners, best)
-                if gap < best:
-                    best, lead = gap, count
-    return lead, best
+        for entry in range(stop_lines.ptr[edge], stop_lines.ptr[edge + 1]):
+            stop = stop_lines.items[entry]
+            shell = stops.poly_ptr[stop]
+            ring = stops.xy[stops.ring_ptr[shell] : stops.ring_ptr[shell + 1]]
+            if _meets(half_width, ring, len(ring), stops.bounds[stop], size, scratch):
+                best = _ring_gap(scene.footprints, agent, ring, len(ring), best)
+    return best
+
+
+@lean_kernel
+def _list_near(
+    footprints: Footprints, agent: int, half_width: float, size: int, scratch: Scratch
+) -> int:
+    """List footprints whose bounds come near the corridor, in `scratch.near`; returns how many.
+
+    `scratch.apart` gets lower bounds of their gaps to the agent.
+    """
+    bounds, pieces, margin = footprints.bounds, scratch.pieces, _MARGIN * half_width
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for piece in range(num_pieces(size)):
+        low_x, low_y = min(low_x, pieces[piece, 0]), min(low_y, pieces[piece, 1])
+        high_x, high_y = max(high_x, pieces[piece, 2]), max(high_y, pieces[piece, 3])
+    low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
+    found = 0
+    for other in range(len(bounds)):
+        if (
+            footprints.present[other]
+            and other != agent
+            and bounds[other, 0] <= high_x
+            and bounds[other, 1] <= high_y
+            and bounds[other, 2] >= low_x
+            and bounds[other, 3] >= low_y
+        ):
+            apart_x = max(bounds[agent, 0] - bounds[other, 2], bounds[other, 0] - bounds[agent, 2])
+            apart_y = max(bounds[agent, 1] - bounds[other, 3], bounds[other, 1] - bounds[agent, 3])
+            scratch.near[found] = other
+            scratch.apart[found] = max(apart_x, apart_y)
+            found += 1
+    return found
 
 
 @lean_kernel
 def _in_corridor(
-    obstacles: Obstacles, other: int, half_width: float, size: int, scratch: Scratch
+    footprints: Footprints, other: int, half_width: float, size: int, scratch: Scratch
 ) -> bool:
-    """Whether an obstacle meets the corridor along the first `size` vertices of `scratch.line`."""
-    bounds, box = obstacles.bounds[other], obstacles.box[other]
+    """Whether a footprint meets the corridor along the first `size` vertices of `scratch.line`."""
+    bounds, box = footprints.bounds[other], footprints.box[other]
     if _meets(half_width, box, len(box), bounds, size, scratch):
         return True
-    if other >= len(obstacles.curve) or obstacles.curve_size[other] == 0:
+    if other >= len(footprints.curve) or footprints.curve_size[other] == 0:
         return False
-    curve, curve_size = obstacles.curve[other], obstacles.curve_size[other]
+    curve, curve_size = footprints.curve[other], footprints.curve_size[other]
     return _meets(half_width, curve, curve_size, bounds, size, scratch)
 
 
@@ -114,41 +149,28 @@ def _meets(
 
 
 @lean_kernel
-def _gap(obstacles: Obstacles, agent: int, other: int, limit: float) -> float:
-    """Distance between the footprints of an agent and an obstacle, at most `limit` [m]."""
+def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
+    """Distance between the footprint of an agent and another one, at most `limit` [m]."""
     best = limit
-    if other < len(obstacles.curve) and obstacles.curve_size[other]:
-        curve, curve_size = obstacles.curve[other], obstacles.curve_size[other]
-        best = _ring_gap(obstacles, agent, curve, curve_size, best)
+    if other < len(footprints.curve) and footprints.curve_size[other]:
+        curve, curve_size = footprints.curve[other], footprints.curve_size[other]
+        best = _ring_gap(footprints, agent, curve, curve_size, best)
     if best > 0.0:
-        box = obstacles.box[other]
-        best = _ring_gap(obstacles, agent, box, len(box), best)
+        box = footprints.box[other]
+        best = _ring_gap(footprints, agent, box, len(box), best)
     return best
 
 
 @lean_kernel
 def _ring_gap(
-    obstacles: Obstacles, agent: int, ring: FloatArray, ring_size: int, limit: float
+    footprints: Footprints, agent: int, ring: FloatArray, ring_size: int, limit: float
 ) -> float:
     """Distance from an agent's footprint to a ring, at most `limit` [m]."""
     best = limit
-    if obstacles.curve_size[agent]:
-        size = obstacles.curve_size[agent]
-        best = ring_gap(obstacles.curve[agent], size, ring, ring_size, best)
+    if footprints.curve_size[agent]:
+        size = footprints.curve_size[agent]
+        best = ring_gap(footprints.curve[agent], size, ring, ring_size, best)
     if best > 0.0:
-        box = obstacles.box[agent]
+        box = footprints.box[agent]
         best = ring_gap(box, len(box), ring, ring_size, best)
     return best
-
-
-@lean_kernel
-def _copy_stop(stops: Polygons, stop: int, scratch: Scratch) -> int:
-    """Copy the outline of a stop polygon; maps are read-only, which to a kernel is another type."""
-    ring = stops.poly_ptr[stop]
-    first, last = stops.ring_ptr[ring], stops.ring_ptr[ring + 1]
-    for vertex in range(first, last):
-        scratch.stop[vertex - first, 0] = stops.xy[vertex, 0]
-        scratch.stop[vertex - first, 1] = stops.xy[vertex, 1]
-    for column in range(4):
-        scratch.stop_bounds[column] = stops.bounds[stop, column]
-    return last - first

@@ -1,77 +1,29 @@
 """Paths of reactive agents: built from baselines, extended along the lane graph, interpolated.
 
 A path is an array of vertices (K, 4): x [m], y [m], heading [rad], progress [m]. Headings are
-unwrapped along the path and wrapped when a pose is read (nuplan-simulation.md §10.1, §10.2).
+unwrapped along the path and wrapped when a pose is read.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.geometry.polylines import point_on_polyline
-from shiftsim.world.layers import Lists, Polylines
+from shiftsim.sim.traffic.idm.scene import (
+    HEADING,
+    MAX_ROUTE,
+    PROGRESS,
+    Fleet,
+    IdmParameters,
+    LaneGraph,
+)
+from shiftsim.world.layers import Polylines
 from shiftsim.world.state import LightStatus
 
-HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
-MAX_ROUTE = 5  # segments an agent remembers, nuPlan
 _SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
 _CURVATURE_SPACING = 2.0  # m between the three points of the estimate, nuPlan
 _STRAIGHT = 1e-6  # m^4, 16 times the squared area below which three points count as aligned
-_GREEN, _RED, _ABSENT = int(LightStatus.GREEN), int(LightStatus.RED), int(LightStatus.ABSENT)
-
-
-class Roads(NamedTuple):
-    """What reactive agents read of a map.
-
-    Attributes:
-        baselines: E centre lines.
-        outgoing: Edges an edge leads to.
-        speed_limits: (E,) [m/s], NaN where the map has none.
-        lights: (E,) whether lights govern the edge.
-        stop_lines: Stop polygons of an edge.
-    """
-
-    baselines: Polylines
-    outgoing: Lists
-    speed_limits: FloatArray
-    lights: BoolArray
-    stop_lines: Lists
-
-
-class Fleet(NamedTuple):
-    """State of the reactive agents, in the order of their construction. A agents.
-
-    Attributes:
-        alive: (A,) whether the agent is still simulated.
-        size: (A, 2) length, width [m].
-        progress: (A,) along the path, not clamped to it [m].
-        speed: (A,) along the path [m/s].
-        target: (A,) speed on a free road [m/s].
-        pose: (A, 3) on the path at the last propagation: x [m], y [m], heading [rad].
-        route: (A, 5) edges of the path, oldest first.
-        route_size: (A,) how many of them.
-        path: (A, K, 4) vertices of the path.
-        path_size: (A,) how many of them.
-    """
-
-    alive: BoolArray
-    size: FloatArray
-    progress: FloatArray
-    speed: FloatArray
-    target: FloatArray
-    pose: FloatArray
-    route: IntArray
-    route_size: IntArray
-    path: FloatArray
-    path_size: IntArray
-
-
-@lean_kernel
-def baseline_room(baselines: Polylines, edge: int) -> int:
-    """Number of vertices of a baseline."""
-    return baselines.ptr[edge + 1] - baselines.ptr[edge]
+_GREEN, _RED = int(LightStatus.GREEN), int(LightStatus.RED)
 
 
 @lean_kernel
@@ -102,7 +54,7 @@ def finish_path(path: FloatArray, size: int) -> int:
     """
     progress = 0.0
     kept = 0
-    for vertex in range(size - 1):  # nuPlan: the last vertex is always lost (§10.1)
+    for vertex in range(size - 1):  # nuPlan rule 122: the last vertex is always lost
         x, y = path[vertex, 0], path[vertex, 1]
         heading = path[vertex, HEADING]
         dx, dy = path[vertex + 1, 0] - x, path[vertex + 1, 1] - y
@@ -173,64 +125,48 @@ def initial_curvature(baselines: Polylines, edge: int) -> float:
 
 
 @lean_kernel
-def choose_successor(roads: Roads, edge: int, status: IntArray) -> int:
-    """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open.
-
-    Args:
-        roads: The map.
-        edge: Last edge of a route.
-        status: (E,) LightStatus codes.
-    """
+def choose_successor(graph: LaneGraph, edge: int) -> int:
+    """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open."""
     best, chosen = np.inf, -1
-    for entry in range(roads.outgoing.ptr[edge], roads.outgoing.ptr[edge + 1]):
-        following = roads.outgoing.items[entry]
-        # nuPlan: with lights only green is open, without any listed state but red (§10.2)
-        if roads.lights[following]:
-            if status[following] != _GREEN:
+    for entry in range(graph.outgoing.ptr[edge], graph.outgoing.ptr[edge + 1]):
+        following = graph.outgoing.items[entry]
+        # nuPlan rule 126: with lights only green is open, without any listed state but red
+        if graph.has_lights[following]:
+            if graph.status[following] != _GREEN:
                 continue
-        elif status[following] == _RED:
+        elif graph.status[following] == _RED:
             continue
-        curvature = initial_curvature(roads.baselines, following)
+        curvature = initial_curvature(graph.baselines, following)
         if curvature < best:
             best, chosen = curvature, following
     return chosen
 
 
 @lean_kernel
-def extend_route(
-    fleet: Fleet, agent: int, roads: Roads, status: IntArray, min_length: float, headway: float
-) -> int:
+def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmParameters) -> int:
     """Lengthen the path of an agent until it is long enough or no edge is open.
 
-    Args:
-        fleet: The agents.
-        agent: Which one.
-        roads: The map.
-        status: (E,) LightStatus codes.
-        min_length: Path length wanted at standstill [m].
-        headway: Further length per target speed [s].
-
     Returns:
-        0, or how many vertices a path needs where they do not fit; call again with more room then.
+        0, or how many vertices a path needs where they do not fit; to be called again then.
     """
     path = fleet.path[agent]
     while True:
         size = fleet.path_size[agent]
-        wanted = min_length + fleet.target[agent] * headway
+        wanted = parameters.min_path_length + fleet.target[agent] * parameters.headway
         if not path[size - 1, PROGRESS] - fleet.progress[agent] < wanted:
             return 0
-        last = fleet.route[agent, fleet.route_size[agent] - 1]
-        chosen = choose_successor(roads, last, status)
+        chosen = choose_successor(graph, fleet.route[agent, fleet.route_size[agent] - 1])
         if chosen < 0:
             return 0
-        needed = size + 1 + baseline_room(roads.baselines, chosen)
+        ptr = graph.baselines.ptr
+        needed = size + 1 + ptr[chosen + 1] - ptr[chosen]
         if needed > len(path):
             return needed
         raw = _drop_driven(path, size, clamp_progress(path, size, fleet.progress[agent]))
-        raw = append_baseline(roads.baselines, chosen, path, raw)
+        raw = append_baseline(graph.baselines, chosen, path, raw)
         fleet.path_size[agent] = finish_path(path, raw)
         fleet.progress[agent] = 0.0
-        _remember(fleet.route, fleet.route_size, agent, chosen)
+        _remember(fleet, agent, chosen)
 
 
 @lean_kernel
@@ -238,7 +174,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
     after = first_after(path, size, progress)
     if after == size:
-        # nuPlan: at its very end a path is left with its last two vertices (§12 Q13)
+        # nuPlan rule 127: at its very end a path is left with its last two vertices
         for column in range(3):
             path[0, column] = path[size - 2, column]
             path[1, column] = path[size - 1, column]
@@ -256,11 +192,12 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
 
 
 @lean_kernel
-def _remember(route: IntArray, route_size: IntArray, agent: int, edge: int) -> None:
-    size = route_size[agent]
+def _remember(fleet: Fleet, agent: int, edge: int) -> None:
+    """Append an edge to the route of an agent, and drop the oldest one where it is full."""
+    route, size = fleet.route[agent], fleet.route_size[agent]
     if size == MAX_ROUTE:
         for index in range(MAX_ROUTE - 1):
-            route[agent, index] = route[agent, index + 1]
+            route[index] = route[index + 1]
         size -= 1
-    route[agent, size] = edge
-    route_size[agent] = size + 1
+    route[size] = edge
+    fleet.route_size[agent] = size + 1

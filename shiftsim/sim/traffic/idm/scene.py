@@ -1,171 +1,174 @@
-"""The agents of one rollout with everything they look at, as the arrays that kernels take."""
+"""The arrays of one rollout with reactive traffic, as kernels take them.
 
-from dataclasses import dataclass
+A `Scene` travels whole: who drives, what is in the way, what is read of the map, and scratch.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.errors import TrafficError
-from shiftsim.sim.traffic.idm.agents import Start, more_room
-from shiftsim.sim.traffic.idm.buffer import curve_room
-from shiftsim.sim.traffic.idm.footprints import Obstacles, Scratch, move_agent, set_box
-from shiftsim.sim.traffic.idm.grid import make_grid
-from shiftsim.sim.traffic.idm.paths import Fleet, Roads
+from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.sim.traffic.idm.shapes import PIECE
-from shiftsim.sim.traffic.idm.step import (
-    DONE,
-    LONGER_CURVES,
-    LONGER_PATHS,
-    STRAYED,
-    Driving,
-    Row,
-    advance,
-    write_agents,
-)
-from shiftsim.world.layers import Polygons
+from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LightStatus, Tracks
+from shiftsim.world.state import AgentKind, LightStatus, Tracks
 
-_CURVE_ROOM = 256  # vertices of a footprint to begin with
+# Kinds that are replayed from the log, in nuPlan's order of observation.
+REPLAYED_KINDS = (
+    AgentKind.PEDESTRIAN,
+    AgentKind.BARRIER,
+    AgentKind.CZONE_SIGN,
+    AgentKind.TRAFFIC_CONE,
+    AgentKind.GENERIC_OBJECT,
+)
+HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
+MAX_ROUTE = 5  # segments an agent remembers, nuPlan
+_CURVE_CAPACITY = 256  # vertices of a footprint to begin with
 _EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the path
 
 
-@dataclass(slots=True)
-class Scene:
-    """State of the reactive traffic of one rollout.
+class IdmParameters(NamedTuple):
+    """Parameters of the reactive traffic; the defaults are nuPlan's.
 
     Attributes:
+        target_speed: Speed on a free road where the map has no limit [m/s].
+        min_gap: Gap kept at standstill [m].
+        headway: Time gap kept, and how far footprints reach ahead [s].
+        accel_max: Largest acceleration [m/s^2].
+        decel_max: Comfortable deceleration, positive [m/s^2].
+        min_path_length: Path kept ahead at standstill [m].
+        radius: Agents farther from the ego than this are removed for good [m].
+    """
+
+    target_speed: float = 10.0
+    min_gap: float = 1.0
+    headway: float = 1.5
+    accel_max: float = 1.0
+    decel_max: float = 2.0
+    min_path_length: float = 20.0
+    radius: float = 100.0
+
+
+class LaneGraph(NamedTuple):
+    """What reactive agents read of a map. E edges.
+
+    Attributes:
+        baselines: E centre lines.
+        outgoing: Edges an edge leads to.
+        speed_limits: (E,) [m/s], NaN where the map has none.
+        has_lights: (E,) whether lights govern the edge.
+        stop_lines: Stop polygons of an edge.
+        stops: The stop polygons.
+        status: (E,) LightStatus codes of the present step.
+    """
+
+    baselines: Polylines
+    outgoing: Lists
+    speed_limits: FloatArray
+    has_lights: BoolArray
+    stop_lines: Lists
+    stops: Polygons
+    status: IntArray
+
+
+class Fleet(NamedTuple):
+    """State of the reactive agents, in the order of their construction. A agents.
+
+    Attributes:
+        alive: (A,) whether the agent is still simulated.
+        size: (A, 2) length, width [m].
+        progress: (A,) along the path, not clamped to it [m].
+        speed: (A,) along the path [m/s].
+        target: (A,) speed on a free road [m/s].
+        pose: (A, 3) on the path at the last propagation: x [m], y [m], heading [rad].
+        route: (A, 5) edges of the path, oldest first.
+        route_size: (A,) how many of them.
+        path: (A, K, 4) vertices of the path: x [m], y [m], heading [rad], progress [m].
+        path_size: (A,) how many of them.
+    """
+
+    alive: BoolArray
+    size: FloatArray
+    progress: FloatArray
+    speed: FloatArray
+    target: FloatArray
+    pose: FloatArray
+    route: IntArray
+    route_size: IntArray
+    path: FloatArray
+    path_size: IntArray
+
+
+class Footprints(NamedTuple):
+    """What can be in an agent's way: A agents, then the ego, then replayed tracks; M in all.
+
+    The footprint of an agent is its box and the buffer of the piece of its path just ahead.
+
+    Attributes:
+        present: (M,) whether it is there.
+        bounds: (M, 4) min x, min y, max x, max y [m].
+        box: (M, 4, 2) corners [m].
+        curve: (A, V, 2) buffers of the path pieces just ahead of the agents [m].
+        curve_size: (A,) how many vertices of them count; 0 before the first step.
+    """
+
+    present: BoolArray
+    bounds: FloatArray
+    box: FloatArray
+    curve: FloatArray
+    curve_size: IntArray
+
+
+class Scratch(NamedTuple):
+    """Room for intermediate results of one agent.
+
+    Attributes:
+        line: (K, 2) a piece of a path [m].
+        keep: (K,) flags of its vertices.
+        pieces: (C, 4) bounding boxes of the line's pieces [m].
+        corridor: (W, 2) outline of the buffer of the path ahead [m].
+        near: (M,) footprints that may be in the corridor.
+        apart: (M,) lower bounds of the gaps to them [m].
+    """
+
+    line: FloatArray
+    keep: BoolArray
+    pieces: FloatArray
+    corridor: FloatArray
+    near: IntArray
+    apart: FloatArray
+
+
+class Scene(NamedTuple):
+    """The reactive traffic of one rollout.
+
+    Attributes:
+        parameters: How agents drive; all numbers are floats.
+        graph: The lanes.
         fleet: The agents.
         agents: (A,) their tracks.
         replayed: (R,) tracks that are replayed from the log.
-        roads: The map.
-        stops: Its stop polygons.
-        obstacles: Agents, ego, and room for all replayed tracks.
-        scratch: Room for the kernels.
-        light_edges: (C,) edges whose lights are listed.
-        lights: (T, C) LightStatus codes at the iterations.
-        status: (E,) LightStatus codes of the present step.
-        spans: (T - 1,) length of each step [s].
-        driving: Parameters.
+        footprints: Of agents, ego and replayed tracks.
+        scratch: Intermediate results.
     """
 
+    parameters: IdmParameters
+    graph: LaneGraph
     fleet: Fleet
     agents: IntArray
     replayed: IntArray
-    roads: Roads
-    stops: Polygons
-    obstacles: Obstacles
+    footprints: Footprints
     scratch: Scratch
-    light_edges: IntArray
-    lights: IntArray
-    status: IntArray
-    spans: FloatArray
-    driving: Driving
-
-    def advance(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
-        """Move the agents from one iteration to the next and write where they are.
-
-        Args:
-            iteration: The iteration that ends.
-            ego: (11,) ego state at that iteration.
-            tracks: Holds the replayed tracks.
-            row: Row of `tracks` of the next iteration.
-
-        Raises:
-            TrafficError: An agent is outside of its own corridor.
-        """
-        # nuPlan: the ego is one step old, lights and replayed objects are one step ahead (§12 Q11)
-        self.status[self.light_edges] = self.lights[iteration + 1]
-        first = 0
-        while True:
-            end, what = self._try_step(iteration, ego, row_of(tracks, row), first)
-            if end == DONE:
-                return
-            if end == STRAYED:
-                raise TrafficError(
-                    f"reactive agent {tracks.tokens[self.agents[what]]} is outside of its own path "
-                    f"at iteration {iteration + 1}",
-                    hint="nuPlan fails here as well; --traffic reactive-fixed goes on",
-                )
-            if end == LONGER_PATHS:
-                self.fleet = more_room(self.fleet, what)
-                self.scratch = make_scratch(self.fleet, self.stops, len(self.obstacles.present))
-            while end == LONGER_CURVES and self._move(what) < 0:
-                self.obstacles = _longer_curves(self.obstacles)
-            first = what + 1 if end == LONGER_CURVES else 0
-
-    def _try_step(self, iteration: int, ego: FloatArray, row: Row, first: int) -> tuple[int, int]:
-        end: tuple[int, int] = advance(
-            self.fleet,
-            self.agents,
-            self.replayed,
-            self.obstacles,
-            self.roads,
-            self.stops,
-            self.status,
-            self.driving,
-            ego,
-            row,
-            self.spans[iteration],
-            self.scratch,
-            first,
-        )
-        return end
-
-    def _move(self, agent: int) -> int:
-        made: int = move_agent(
-            self.fleet, agent, self.obstacles, self.scratch, self.driving.headway
-        )
-        return made
-
-    def write(self, tracks: Tracks, row: int) -> None:
-        """Write the agents into a row; those that are gone are not valid there."""
-        write_agents(self.fleet, self.agents, row_of(tracks, row))
 
 
-def make_scene(
-    scenario: Scenario,
-    fleet: Fleet,
-    starts: list[Start],
-    agents: IntArray,
-    replayed: IntArray,
-    driving: Driving,
-) -> Scene:
-    """The scene at iteration 0.
+class Row(NamedTuple):
+    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2)."""
 
-    Args:
-        scenario: The scenario.
-        fleet: A agents.
-        starts: Where they are on the map.
-        agents: (A,) their tracks.
-        replayed: (R,) tracks that are replayed from the log.
-        driving: Parameters.
-    """
-    road, count = scenario.map, len(agents)
-    obstacles = _make_obstacles(count, count + 1 + len(replayed))
-    poses = [start.pose for start in starts]
-    # the first gaps are measured between snapped boxes, not footprints (§10.2)
-    for agent, pose in enumerate(poses):
-        set_box(obstacles, agent, *pose, *fleet.size[agent])
-    lights = scenario.traffic_lights
-    known = [i for i, name in enumerate(lights.connector_ids) if name in road.edges.index]
-    edges = [road.edges.index[lights.connector_ids[i]] for i in known]
-    seconds = scenario.iteration_times * 1e-6  # nuPlan: a difference of epoch seconds (§12 Q1)
-    return Scene(
-        fleet=fleet,
-        agents=agents,
-        replayed=replayed,
-        roads=roads_of(road),
-        stops=road.stop_polygons.polygons,
-        obstacles=obstacles,
-        scratch=make_scratch(fleet, road.stop_polygons.polygons, len(obstacles.present)),
-        light_edges=np.array(edges, np.int64),
-        lights=lights.status[scenario.iteration_rows][:, known].astype(np.int64),
-        status=np.full(len(road.edges), LightStatus.ABSENT, np.int64),
-        spans=np.diff(seconds),
-        driving=driving,
-    )
+    valid: BoolArray
+    poses: FloatArray
+    velocities: FloatArray
+    sizes: FloatArray
 
 
 def row_of(tracks: Tracks, row: int) -> Row:
@@ -173,54 +176,60 @@ def row_of(tracks: Tracks, row: int) -> Row:
     return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
 
 
-def roads_of(road: VectorMap) -> Roads:
-    """What reactive agents read of a map."""
-    return Roads(
-        road.baselines,
-        road.outgoing,
-        road.speed_limits,
-        road.has_traffic_lights,
-        road.stop_lines,
+def lane_graph(map: VectorMap) -> LaneGraph:
+    """What agents read of a map; no light is listed yet."""
+    return LaneGraph(
+        map.baselines,
+        map.outgoing,
+        map.speed_limits,
+        map.has_traffic_lights,
+        map.stop_lines,
+        # maps are read-only, which to a kernel is another type than footprints are
+        Polygons._make(array.copy() for array in map.stop_polygons.polygons),
+        np.full(len(map.edges), LightStatus.ABSENT, np.int64),
     )
 
 
-def make_scratch(fleet: Fleet, stops: Polygons, num_obstacles: int) -> Scratch:
-    """Room for the kernels, enough for the longest path of the fleet."""
-    points = fleet.path.shape[1] + _EXTRA_POINTS
+def make_scene(
+    parameters: IdmParameters, graph: LaneGraph, fleet: Fleet, agents: IntArray, replayed: IntArray
+) -> Scene:
+    """The scene at iteration 0, with nothing in anyone's way yet (attributes as of `Scene`)."""
+    num_agents = len(agents)
+    count = num_agents + 1 + len(replayed)
+    footprints = Footprints(
+        present=np.zeros(count, np.bool_),
+        bounds=np.zeros((count, 4)),
+        box=np.zeros((count, 4, 2)),
+        curve=np.zeros((num_agents, _CURVE_CAPACITY, 2)),
+        curve_size=np.zeros(num_agents, np.int64),
+    )
+    scratch = _make_scratch(fleet.path.shape[1], count)
+    return Scene(parameters, graph, fleet, agents, replayed, footprints, scratch)
+
+
+def _make_scratch(longest_path: int, count: int) -> Scratch:
+    points = longest_path + _EXTRA_POINTS
     return Scratch(
         line=np.zeros((points, 2)),
         keep=np.zeros(points, np.bool_),
         pieces=np.zeros((points // PIECE + 1, 4)),
-        corridor=np.zeros((curve_room(points), 2)),
-        hits=np.zeros(num_obstacles, np.int64),
-        apart=np.zeros(num_obstacles),
-        stop=np.zeros((np.diff(stops.ring_ptr).max(initial=0), 2)),
-        stop_bounds=np.zeros(4),
-        grid=make_grid(num_obstacles),
+        corridor=np.zeros((curve_capacity(points), 2)),
+        near=np.zeros(count, np.int64),
+        apart=np.zeros(count),
     )
 
 
-def _make_obstacles(num_agents: int, count: int) -> Obstacles:
-    return Obstacles(
-        present=np.zeros(count, np.bool_),
-        bounds=np.zeros((count, 4)),
-        box=np.zeros((count, 4, 2)),
-        speed=np.zeros(count),
-        heading=np.zeros(count),
-        curve=np.zeros((num_agents, _CURVE_ROOM, 2)),
-        curve_size=np.zeros(num_agents, np.int64),
-    )
+def with_longer_paths(scene: Scene, needed: int) -> Scene:
+    """The same scene, for paths of `needed` vertices and more."""
+    path = np.zeros((len(scene.agents), 2 * needed, 4))
+    path[:, : scene.fleet.path.shape[1]] = scene.fleet.path
+    scratch = _make_scratch(2 * needed, len(scene.footprints.present))
+    return scene._replace(fleet=scene.fleet._replace(path=path), scratch=scratch)
 
 
-def _longer_curves(obstacles: Obstacles) -> Obstacles:
-    num_agents, room = obstacles.curve.shape[:2]
-    curve = np.zeros((num_agents, 2 * room, 2))
-    curve[:, :room] = obstacles.curve
-    return obstacles._replace(curve=curve)
-
-
-def forget(tracks: Tracks, row: int, which: BoolArray) -> None:
-    """Remove tracks (a mask) from a row on."""
-    tracks.valid[row:, which] = False
-    for values in (tracks.poses, tracks.velocities, tracks.sizes):
-        values[row:, which] = np.nan
+def with_longer_curves(scene: Scene) -> Scene:
+    """The same scene, for footprints of twice as many vertices."""
+    before = scene.footprints.curve
+    curve = np.zeros((len(before), 2 * before.shape[1], 2))
+    curve[:, : before.shape[1]] = before
+    return scene._replace(footprints=scene.footprints._replace(curve=curve))

@@ -20,7 +20,7 @@ _INNER, _OUTER = 0.97, 1.02
 
 
 @lean_kernel
-def ring_bounds(ring: FloatArray, size: int, bounds: FloatArray) -> None:
+def bound_ring(ring: FloatArray, size: int, bounds: FloatArray) -> None:
     """Widen `bounds` (4,) min x, min y, max x, max y by the first `size` vertices of a ring."""
     for vertex in range(size):
         bounds[0] = min(bounds[0], ring[vertex, 0])

@@ -1,188 +1,117 @@
-"""One step of all reactive agents, one after the other (nuplan-simulation.md §10.2)."""
-
-from typing import NamedTuple
+"""One step of all reactive agents, one after the other."""
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
-from shiftsim.sim.traffic.idm.footprints import (
-    Obstacles,
-    Scratch,
-    move_agent,
-    place_replayed,
-    set_box,
-    set_speeds,
-)
-from shiftsim.sim.traffic.idm.grid import enter, fill_grid
-from shiftsim.sim.traffic.idm.lead import LOST, find_lead
-from shiftsim.sim.traffic.idm.paths import PROGRESS, Fleet, Roads, extend_route
-from shiftsim.world.layers import Polygons
+from shiftsim.sim.traffic.idm.footprints import move_agent, set_box
+from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
+from shiftsim.sim.traffic.idm.paths import extend_route
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY
 
 DONE, LONGER_PATHS, LONGER_CURVES, STRAYED = 0, 1, 2, 3  # how a step ends
+BEGIN = -1  # instead of the agent that an interrupted step goes on with
 _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
 
-class Driving(NamedTuple):
-    """How agents drive, see `idm_policy` and `IdmParameters`; numbers are all floats.
-
-    Attributes:
-        min_gap: Gap kept at standstill [m].
-        headway: Time gap kept [s].
-        accel_max: Largest acceleration [m/s^2].
-        decel_max: Comfortable deceleration [m/s^2].
-        min_path_length: Path kept ahead at standstill [m].
-        radius: Agents farther from the ego are removed [m].
-        mended: Whether agents know the speed of replayed tracks, and brake where nuPlan fails.
-    """
-
-    min_gap: float
-    headway: float
-    accel_max: float
-    decel_max: float
-    min_path_length: float
-    radius: float
-    mended: bool
-
-
-class Row(NamedTuple):
-    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2)."""
-
-    valid: BoolArray
-    poses: FloatArray
-    velocities: FloatArray
-    sizes: FloatArray
-
-
 @lean_kernel
-def advance(
-    fleet: Fleet,
-    agents: IntArray,
-    replayed: IntArray,
-    obstacles: Obstacles,
-    roads: Roads,
-    stops: Polygons,
-    status: IntArray,
-    driving: Driving,
-    ego: FloatArray,
-    row: Row,
-    span: float,
-    scratch: Scratch,
-    first: int,
-) -> tuple[int, int]:
+def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) -> tuple[int, int]:
     """Move every agent by one step and write where it is.
 
     Args:
-        fleet: The agents.
-        agents: (A,) their tracks.
-        replayed: (R,) tracks that are replayed from the log.
-        obstacles: Agents, ego and replayed objects.
-        roads: The map.
-        stops: Its stop polygons.
-        status: (E,) LightStatus codes.
-        driving: Parameters.
-        ego: (11,) ego state.
+        scene: The traffic; its lights are those at the end of the step.
+        ego: (11,) ego state at the beginning of the step.
         row: Holds the replayed tracks at the end of the step.
         span: Length of the step [s].
-        scratch: Room.
-        first: Agent to begin with; 0, or where an interrupted step goes on.
+        first: BEGIN, or the agent that an interrupted step goes on with.
 
     Returns:
-        DONE; LONGER_PATHS and how many vertices a path needs, to be called again; LONGER_CURVES and
-        the agent whose footprint needs more, to be moved and gone on behind; STRAYED and the agent
-        that is outside of its own corridor.
+        DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
+        agent whose footprint needs more, to go on with; STRAYED and the agent that is outside of
+        its own corridor.
     """
-    count = _place(fleet, replayed, obstacles, driving, ego, row)
-    if first == 0:
+    fleet, agents = scene.fleet, scene.agents
+    heading = ego[EGO_HEADING]
+    x = ego[0] + _EGO_CENTER * np.cos(heading)
+    y = ego[1] + _EGO_CENTER * np.sin(heading)
+    set_box(scene.footprints, len(agents), x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
+    _place_replayed(scene, row)
+    if first == BEGIN:
+        _remove_far_agents(scene, x, y)
         for agent in range(len(agents)):
             if fleet.alive[agent]:
-                needed = extend_route(
-                    fleet, agent, roads, status, driving.min_path_length, driving.headway
-                )
+                needed = extend_route(fleet, agent, scene.graph, scene.parameters)
                 if needed > 0:
                     return LONGER_PATHS, needed
-    fill_grid(scratch.grid, obstacles, count)
-    for agent in range(first, len(agents)):
+    for agent in range(max(first, 0), len(agents)):
         if not fleet.alive[agent]:
             continue
-        lead, gap = find_lead(fleet, agent, obstacles, count, roads, stops, status, scratch)
-        if lead == LOST and not driving.mended:
-            return STRAYED, agent
-        _drive(fleet, agent, obstacles, count, roads, driving, span, lead, gap)
-        if move_agent(fleet, agent, obstacles, scratch, driving.headway) < 0:
+        if agent != first:
+            # nuPlan rule 123: agents move one after the other, and see where those before them went
+            lead, gap = find_lead(scene, agent)
+            if lead == OFF_PATH:
+                return STRAYED, agent
+            _drive(scene, agent, lead, gap, ego, span)
+        if move_agent(scene, agent) < 0:
             return LONGER_CURVES, agent
-        enter(scratch.grid, obstacles.bounds, agent)
     write_agents(fleet, agents, row)
     return DONE, 0
 
 
 @lean_kernel
-def _place(
-    fleet: Fleet,
-    replayed: IntArray,
-    obstacles: Obstacles,
-    driving: Driving,
-    ego: FloatArray,
-    row: Row,
-) -> int:
-    """Put ego and replayed tracks among the obstacles, remove agents far from the ego, for good.
-
-    Returns:
-        How many obstacles count.
-    """
-    place, heading = len(fleet.alive), ego[EGO_HEADING]
-    x = ego[0] + _EGO_CENTER * np.cos(heading)
-    y = ego[1] + _EGO_CENTER * np.sin(heading)
-    set_box(obstacles, place, x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
-    obstacles.speed[place] = np.hypot(ego[VX], ego[VY])
-    for agent in range(place):
-        dx, dy = fleet.pose[agent, 0] - x, fleet.pose[agent, 1] - y
-        if fleet.alive[agent] and np.sqrt(dx * dx + dy * dy) > driving.radius:
-            fleet.alive[agent] = False
-            obstacles.present[agent] = False
-    count = place_replayed(obstacles, place + 1, replayed, row.valid, row.poses, row.sizes)
-    if driving.mended:
-        set_speeds(obstacles, place + 1, replayed, row.valid, row.velocities)
-    return count
+def _place_replayed(scene: Scene, row: Row) -> None:
+    """Put the replayed tracks that are present where they are."""
+    footprints = scene.footprints
+    place = len(scene.agents)
+    for track in scene.replayed:
+        place += 1
+        footprints.present[place] = row.valid[track]
+        if row.valid[track]:
+            x, y, heading = row.poses[track, 0], row.poses[track, 1], row.poses[track, 2]
+            set_box(footprints, place, x, y, heading, row.sizes[track, 0], row.sizes[track, 1])
 
 
 @lean_kernel
-def _drive(
-    fleet: Fleet,
-    agent: int,
-    obstacles: Obstacles,
-    count: int,
-    roads: Roads,
-    driving: Driving,
-    span: float,
-    lead: int,
-    gap: float,
-) -> None:
+def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
+    """Remove agents that are far from the ego's centre, for good."""
+    fleet = scene.fleet
+    for agent in range(len(scene.agents)):
+        dx, dy = fleet.pose[agent, 0] - x, fleet.pose[agent, 1] - y
+        if fleet.alive[agent] and np.sqrt(dx * dx + dy * dy) > scene.parameters.radius:
+            fleet.alive[agent] = False
+            scene.footprints.present[agent] = False
+
+
+@lean_kernel
+def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, span: float) -> None:
     """Progress and speed of an agent after the step, behind the lead that `find_lead` gave."""
-    path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
-    lead_speed, lead_heading = 0.0, fleet.pose[agent, 2]
+    fleet, parameters = scene.fleet, scene.parameters
+    heading = fleet.pose[agent, 2]
+    lead_speed, lead_heading = 0.0, heading
     if lead < 0:
-        # nuPlan: on a free road the agent brakes for the end of its path (§10.2)
+        # nuPlan rule 124: on a free road the agent brakes for the end of its path
+        path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
         gap = path_end - fleet.progress[agent] - 0.5 * fleet.size[agent, 0]
-    elif lead < len(fleet.alive):
+    elif lead < len(scene.agents):
         lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
-    elif lead < count:
-        lead_speed, lead_heading = obstacles.speed[lead], obstacles.heading[lead]
-    limit = roads.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]
+    elif lead == len(scene.agents):
+        lead_speed, lead_heading = np.hypot(ego[VX], ego[VY]), ego[EGO_HEADING]
+    # nuPlan rule 125: replayed tracks stand still, whatever their velocity
+    limit = scene.graph.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]
     if limit > 0.0:
         fleet.target[agent] = limit
     distance, speed = idm_step(
         fleet.speed[agent],
         gap,
-        lead_speed * np.cos(wrap_angle(lead_heading - fleet.pose[agent, 2])),
+        lead_speed * np.cos(wrap_angle(lead_heading - heading)),
         fleet.target[agent],
-        driving.min_gap,
-        driving.headway,
-        driving.accel_max,
-        driving.decel_max,
+        parameters.min_gap,
+        parameters.headway,
+        parameters.accel_max,
+        parameters.decel_max,
         span,
     )
     fleet.progress[agent] += distance

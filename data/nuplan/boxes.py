@@ -1,0 +1,140 @@
+"""Objects of a nuPlan log: box by box as the log has them, and as dense tracks."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.data.nuplan.log import Log, as_numbers, read_rows, token_text
+from shiftsim.data.recording import sort_tracks
+from shiftsim.errors import ConversionError
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
+
+_KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Objects of a span of rows, box by box, each frame in the order nuPlan lists it. B boxes."""
+
+    row: IntArray  # (B,) row of the log
+    token: list[str]  # B track tokens
+    kind: IntArray  # (B,) AgentKind codes
+    # (B, 8) centre x, y [m], heading [rad], velocity x, y in the map frame [m/s], length, width,
+    # height [m]
+    values: FloatArray
+
+
+def read_boxes(log: Log, first: int, last: int) -> Boxes:
+    """Objects of the rows first … last - 1.
+
+    Raises:
+        ConversionError: A category is unknown, a pose is not finite or a box has no extent.
+    """
+    rows = read_rows(
+        log,
+        first,
+        last,
+        columns="t.token, c.name, b.x, b.y, b.yaw, b.vx, b.vy, b.length, b.width, b.height",
+        joins="JOIN lidar_box AS b ON b.lidar_pc_token = pc.token"
+        " JOIN track AS t ON b.track_token = t.token"
+        " JOIN category AS c ON t.category_token = c.token",
+        order="b.rowid",
+    )
+    unknown = sorted({str(row[2]) for row in rows} - set(_KINDS))
+    if unknown:
+        raise ConversionError(
+            f"{log.path}: table 'category': unknown category {unknown[0]!r}",
+            hint=f"known are {', '.join(_KINDS)}",
+        )
+    row = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64))
+    kind = np.array([_KINDS[r[2]] for r in rows], np.int64)
+    values = as_numbers(log.path, "lidar_box", [r[3:] for r in rows]).reshape(-1, 8)
+    order = np.lexsort((np.arange(len(rows)), kind, row))
+    token = [token_text(rows[i][1], log.path, "track") for i in order.tolist()]
+    boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
+    _check_boxes(log, boxes)
+    return boxes
+
+
+def _check_boxes(log: Log, boxes: Boxes) -> None:
+    finite = np.isfinite(boxes.values[:, :3]).all(axis=1)
+    extended = (boxes.values[:, 5:7] > 0.0).all(axis=1) & np.isfinite(boxes.values[:, 5:7]).all(
+        axis=1
+    )
+    for good, what in ((finite, "a pose that is not finite"), (extended, "no length or width")):
+        if not good.all():
+            box = int(np.flatnonzero(~good)[0])
+            raise ConversionError(
+                f"{log.path}: lidar_box of track {boxes.token[box]!r} at lidar_pc"
+                f" {log.tokens[int(boxes.row[box])]!r} has {what}",
+                hint="leave this scenario out or repair the log",
+            )
+
+
+def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tracks:
+    """Dense tracks over the rows first … last - 1 from their boxes."""
+    index: dict[str, int] = {}
+    track = np.array([index.setdefault(token, len(index)) for token in boxes.token], np.int64)
+    frame = boxes.row - first
+    kinds = np.zeros(len(index), np.int64)
+    kinds[track] = boxes.kind
+    order = order_tracks(frame, track, kinds)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    shape = (last - first, len(index))
+    valid = np.zeros(shape, np.bool_)
+    poses, velocities, sizes = (np.full((*shape, n), np.nan) for n in (3, 2, 2))
+    where = (frame, place[track])
+    valid[where] = True
+    twice = int(len(frame) - valid.sum())
+    flaws["track listed twice in a frame: the last one is kept"] += twice
+    poses[where] = boxes.values[:, :3]
+    poses[..., 2] = np.where(valid, poses[..., 2], np.nan)
+    velocities[where] = boxes.values[:, 3:5]
+    velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan  # nuPlan rule 420
+    sizes[where] = boxes.values[:, 5:7]
+    tokens = list(index)
+    return Tracks(
+        valid, poses, velocities, sizes, kinds[order], tuple(tokens[i] for i in order.tolist())
+    )
+
+
+def order_tracks(frame: IntArray, track: IntArray, kinds: IntArray) -> IntArray:
+    """As `order_of_columns`, of tracks given box by box.
+
+    Args:
+        frame: (B,) frame of each box, ascending.
+        track: (B,) track of each box, in the order in which its frame lists the boxes.
+        kinds: (N,) type of each track.
+
+    Returns:
+        (N,) indices of the tracks in their new order.
+    """
+    num = len(kinds)
+    before = np.zeros((num, num), np.bool_)
+    _link(frame, track, kinds, before)
+    return sort_tracks(before, kinds, _first_frames(frame, track, num))
+
+
+@kernel
+def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) -> None:
+    """Mark neighbours of one kind in a frame: `before[a, b]` when b directly follows a."""
+    last = np.full(16, -1)
+    for box in range(len(frame)):
+        if box == 0 or frame[box] != frame[box - 1]:
+            for kind in range(len(last)):
+                last[kind] = -1
+        kind = kinds[track[box]]
+        if last[kind] >= 0 and last[kind] != track[box]:
+            before[last[kind], track[box]] = True
+        last[kind] = track[box]
+
+
+@kernel
+def _first_frames(frame: IntArray, track: IntArray, num: int) -> IntArray:
+    first = np.full(num, np.iinfo(np.int64).max)
+    for box in range(len(frame)):
+        first[track[box]] = min(first[track[box]], frame[box])
+    return first

@@ -1,0 +1,185 @@
+"""Files of a store: where each is, written the same way every time, read with clear errors."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.data.store import schema
+from shiftsim.errors import DataError
+from shiftsim.files import whole_file
+
+MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
+FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
+PARTIAL = ".partial"  # folder of a conversion under way
+REPAIR = "the store is damaged: convert it again"
+_FOOTER = "shiftsim"
+_COMPRESSION, _LEVEL = "zstd", 1
+
+
+def file_name(name: str) -> str:
+    """A file name for any log, city or ego name."""
+    return quote(name, safe=" @+,=").replace(".", "%2E")
+
+
+def map_file(store: Path, city: str) -> Path:
+    """File of a map."""
+    return store / "maps" / f"{file_name(city)}.parquet"
+
+
+def report_file(store: Path, city: str) -> Path:
+    """File of what is known about the conversion of a city."""
+    return store / "reports" / f"{file_name(city)}.json"
+
+
+def recording_folder(store: Path, recording: str) -> Path:
+    """Folder of a recording."""
+    return store / "recordings" / file_name(recording)
+
+
+def ego_file(folder: Path, name: str) -> Path:
+    """File of an ego's states in the folder of a recording."""
+    return folder / f"ego-{file_name(name)}.parquet"
+
+
+def read_manifest(store: Path) -> dict[str, Any]:
+    """Content of `store.json`.
+
+    Raises:
+        DataError: It is missing or broken, or of another version.
+    """
+    path = store / MANIFEST
+    if not path.is_file():
+        if (store / PARTIAL).is_dir():
+            raise DataError(
+                f"{store}: the conversion of this store was interrupted",
+                hint="start the same shiftsim convert again, it goes on",
+            )
+        raise DataError(
+            f"{store}: not a scenario store: {MANIFEST} is missing",
+            hint="give the folder that `shiftsim convert` wrote",
+        )
+    try:
+        manifest = json.loads(path.read_text("utf-8"))
+        kind, version = manifest["format"], manifest["version"]
+        files, content = manifest["files"], manifest["hash"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: damaged: {error!r}", hint=REPAIR) from error
+    if kind != schema.FORMAT or version != schema.VERSION:
+        raise DataError(
+            f"{path}: format {kind!r}, version {version!r}, not {schema.FORMAT!r} version"
+            f" {schema.VERSION}",
+            hint="convert the data again with this version of shiftsim",
+        )
+    if not isinstance(files, dict) or not isinstance(content, str):
+        raise DataError(f"{path}: damaged: no list of files", hint=REPAIR)
+    return manifest
+
+
+def write_blocks(
+    path: Path, blocks: list[pa.Table], footer: Mapping[str, object] | None = None
+) -> None:
+    """Write tables of one schema as one file with a row group each, in one step.
+
+    Equal content gives equal bytes.
+    """
+    described = blocks[0].schema
+    names = described.names
+    notes = json.dumps({} if footer is None else footer, sort_keys=True)
+    planes = [name for name in names if name in schema.PLANES]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        whole_file(path) as partial,
+        pq.ParquetWriter(
+            partial,
+            described,
+            compression=_COMPRESSION,
+            compression_level=_LEVEL,
+            use_dictionary=[
+                n for n in names if n in ("length_m", "width_m", "log", "type", "city")
+            ],
+            use_byte_stream_split=planes,
+            write_statistics=False,
+            store_schema=False,
+        ) as writer,
+    ):
+        for block in blocks:
+            writer.write_table(block, row_group_size=max(len(block), 1))
+        writer.add_key_value_metadata({_FOOTER: notes})
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file in one step."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", "utf-8")
+
+
+class Table:
+    """An open Parquet file of a store.
+
+    Attributes:
+        path: The file.
+        footer: Content of the footer.
+    """
+
+    def __init__(self, path: Path, expected: pa.Schema) -> None:
+        self.path = path
+        try:
+            self._file = pq.ParquetFile(path, memory_map=True)
+        except (OSError, pa.ArrowException) as error:
+            what = "is missing" if not path.exists() else f"is not a readable Parquet file: {error}"
+            raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
+        found = self._file.schema_arrow
+        for field in expected:
+            if found.get_field_index(field.name) < 0:
+                raise DataError(f"{path}: column {field.name!r} is missing", hint=REPAIR)
+            if not found.field(field.name).type.equals(field.type):
+                raise DataError(
+                    f"{path}: column {field.name!r} is {found.field(field.name).type}, not"
+                    f" {field.type}",
+                    hint=REPAIR,
+                )
+        self._names = expected.names
+        self.footer = self._read_footer()
+
+    def _read_footer(self) -> dict[str, object]:
+        text = (self._file.metadata.metadata or {}).get(_FOOTER.encode(), b"{}")
+        try:
+            footer: dict[str, object] = json.loads(text)
+        except ValueError as error:
+            raise DataError(f"{self.path}: unreadable footer: {error}", hint=REPAIR) from error
+        return footer
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows."""
+        return int(self._file.metadata.num_rows)
+
+    @property
+    def num_blocks(self) -> int:
+        """Number of row groups."""
+        return int(self._file.num_row_groups)
+
+    def read(self, blocks: list[int] | None = None, columns: list[str] | None = None) -> pa.Table:
+        """Rows of some row groups and columns; of all where None.
+
+        Raises:
+            DataError: The file is damaged.
+        """
+        groups = list(range(self.num_blocks)) if blocks is None else blocks
+        try:
+            return self._file.read_row_groups(groups, columns or self._names, use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,178 @@
+"""Writing a store, or adding to one."""
+
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import pyarrow as pa
+
+from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store import schema, tables
+from shiftsim.data.store.map import write_map
+from shiftsim.data.store.reading import window_of
+from shiftsim.data.store.tracks import write_ego, write_recording
+from shiftsim.errors import DataError
+from shiftsim.world.map import VectorMap
+
+
+def window_row(window: Window, city: str) -> dict[str, Any]:
+    """A window as a row of `schema.SCENARIOS`, JSON values only."""
+    goal = window.mission_goal
+    return {
+        "token": window.token,
+        "type": window.scenario_type,
+        "city": city,
+        "log": window.log_name.partition("@")[0],
+        "recording": window.log_name,
+        "ego": window.ego,
+        "first_row": window.first_row,
+        "last_row": window.last_row,
+        "row_step": window.row_step,
+        "iteration_rows": window.iteration_rows.tolist(),
+        "route": list(window.route),
+        "goal_pose": [] if goal is None else goal.tolist(),
+        "duration_s": window.mapping[0],
+        "offset_s": window.mapping[1],
+        "subsample_ratio": window.mapping[2],
+        "is_short": window.is_short,
+        "metadata": json.dumps(window.metadata, sort_keys=True),
+    }
+
+
+class StoreWriter:
+    """Writes a store, or adds to one. Use it in a `with` block; it is complete at the end.
+
+    What is added again replaces what is there. Equal content gives equal bytes.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._files: dict[str, str] = {}
+        self._cities: dict[str, str] = {}
+        if (self.path / tables.MANIFEST).exists():
+            self._files = dict(tables.read_manifest(self.path)["files"])
+            table = tables.Table(self.path / tables.SCENARIOS, schema.SCENARIOS).read()
+            self._rows = {row["token"]: row for row in table.to_pylist()}
+            self._cities = {row["recording"]: row["city"] for row in self._rows.values()}
+        elif (
+            self.path.is_dir()
+            and any(self.path.iterdir())
+            and not (self.path / tables.PARTIAL).is_dir()
+        ):
+            raise DataError(
+                f"{self.path}: the folder is not empty and not a store",
+                hint="give a new folder, or a store to add to",
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> "StoreWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+
+    @property
+    def tokens(self) -> frozenset[str]:
+        """Tokens of the scenarios that the store holds so far."""
+        return frozenset(self._rows)
+
+    def window(self, token: str) -> Window:
+        """The window of a scenario that the store holds so far."""
+        return window_of(self._rows[token])
+
+    def add_map(self, road: VectorMap) -> None:
+        """Write a map."""
+        path = tables.map_file(self.path, road.name)
+        write_map(path, road)
+        self._note(path)
+
+    def add_recording(self, recording: Recording) -> None:
+        """Write a recording."""
+        folder = tables.recording_folder(self.path, recording.log_name)
+        write_recording(folder, recording)
+        self._note(folder / tables.FRAMES)
+        self._note(folder / tables.TRACKS)
+        self._cities[recording.log_name] = recording.city
+
+    def add_ego(self, ego: EgoTrace) -> None:
+        """Write the states of an ego."""
+        folder = tables.recording_folder(self.path, ego.log_name)
+        write_ego(folder, ego)
+        self._note(tables.ego_file(folder, ego.name))
+
+    def add_window(self, window: Window) -> None:
+        """Add a scenario; its recording and ego are added before.
+
+        Raises:
+            DataError: The recording or the ego is not in the store.
+        """
+        folder = tables.recording_folder(self.path, window.log_name)
+        for path in (folder / tables.FRAMES, tables.ego_file(folder, window.ego)):
+            if self._name(path) not in self._files:
+                raise DataError(
+                    f"scenario {window.token!r}: the store does not have {self._name(path)}",
+                    hint="add the recording and the ego before the window",
+                )
+        self._rows[window.token] = window_row(window, self._cities[window.log_name])
+
+    def take_recording(self, folder: Path, log_name: str, rows: list[dict[str, Any]]) -> None:
+        """Move a recording that was written elsewhere into the store, with all its scenarios.
+
+        What the store has of that recording is replaced.
+
+        Args:
+            folder: Written by `write_recording` and `write_ego`.
+            log_name: Name of the recording.
+            rows: `window_row` of its scenarios.
+        """
+        target = tables.recording_folder(self.path, log_name)
+        below = f"{self._name(target)}/"
+        self._files = {n: d for n, d in self._files.items() if not n.startswith(below)}
+        self._rows = {t: row for t, row in self._rows.items() if row["recording"] != log_name}
+        shutil.rmtree(target, ignore_errors=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(folder, target)
+        for path in sorted(target.iterdir()):
+            self._note(path)
+        self._rows |= {row["token"]: row for row in rows}
+
+    def add_report(self, city: str, content: dict[str, Any]) -> None:
+        """Write what is to be known about the conversion of a city."""
+        path = tables.report_file(self.path, city)
+        tables.write_json(path, content)
+        self._note(path)
+
+    def close(self) -> None:
+        """Write the list of scenarios and the manifest."""
+        rows = [self._rows[token] for token in sorted(self._rows)]
+        table = pa.Table.from_pylist(rows, schema=schema.SCENARIOS)
+        tables.write_blocks(self.path / tables.SCENARIOS, [table])
+        self._note(self.path / tables.SCENARIOS)
+        files = dict(sorted(self._files.items()))
+        content = hashlib.sha256(json.dumps(files).encode()).hexdigest()
+        tables.write_json(
+            self.path / tables.MANIFEST,
+            {
+                "format": schema.FORMAT,
+                "version": schema.VERSION,
+                "hash": content,
+                "files": files,
+            },
+        )
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self.path).as_posix()
+
+    def _note(self, path: Path) -> None:
+        self._files[self._name(path)] = tables.digest(path)

@@ -1,0 +1,210 @@
+"""What driven proposals collide with, and whose fault it is.
+
+Array axes: P proposals, T time indices, R rows of time at which the others are known, N others.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, circle_around, front_touches
+from shiftsim.geometry.rings import convex_intersect
+from shiftsim.world.state import HEADING, VX, VY, VehicleParameters, X, Y
+
+STOPPED = 5e-2  # m/s, of the ego and of others in a collision
+TTC_STOPPED = 5e-3  # m/s, of the ego
+NEVER = np.inf
+
+
+class EgoBox(NamedTuple):
+    """The ego's box: length, width, and distance from the rear axle to its centre [m]."""
+
+    length: float
+    width: float
+    rear_axle_to_center: float
+
+
+class Others(NamedTuple):
+    """Boxes of all that a proposal can hit.
+
+    Attributes:
+        boxes: (R, N, 4, 2) corners [m].
+        centers: (R, N, 2) centres [m].
+        centroids: (R, N, 2) points that bearings are taken to [m].
+        speeds: (R, N) 0 for static objects [m/s].
+        radii: (N,) half diagonals [m].
+        is_agent: (N,) whether it is no static object.
+        ignored: (N,) whether contacts with it do not count.
+    """
+
+    boxes: FloatArray
+    centers: FloatArray
+    centroids: FloatArray
+    speeds: FloatArray
+    radii: FloatArray
+    is_agent: BoolArray
+    ignored: BoolArray
+
+
+def ego_box(vehicle: VehicleParameters) -> EgoBox:
+    """The box of a vehicle."""
+    return EgoBox(vehicle.length, vehicle.width, vehicle.rear_axle_to_center)
+
+
+@lean_kernel
+def place_ego(states: FloatArray, size: EgoBox, corners: FloatArray, centers: FloatArray) -> None:
+    """Write corners (P, T, 4, 2) and centres (P, T, 2) of driven states (P, T, 11) [m]."""
+    for row in range(states.shape[0]):
+        for step in range(states.shape[1]):
+            heading = states[row, step, HEADING]
+            x = states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
+            y = states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
+            centers[row, step, 0], centers[row, step, 1] = x, y
+            box_corners(x, y, heading, size.length, size.width, corners[row, step])
+
+
+@lean_kernel
+def project_box(corners: FloatArray, state: FloatArray, travel: float, out: FloatArray) -> None:
+    """Write a box (4, 2) of the ego, moved `travel` [m] along the heading of its state (11,)."""
+    cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
+    for corner in range(4):
+        out[corner, 0] = corners[corner, 0] + travel * cos
+        out[corner, 1] = corners[corner, 1] + travel * sin
+
+
+@kernel
+def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
+    """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
+    out = np.zeros(len(boxes), np.bool_)
+    x, y, radius = circle_around(footprint)
+    for index in range(len(boxes)):
+        other_x, other_y, other_radius = circle_around(boxes[index])
+        if np.hypot(x - other_x, y - other_y) <= radius + other_radius:
+            out[index] = convex_intersect(boxes[index], footprint)
+    return out
+
+
+@kernel
+def near_others(
+    states: FloatArray, corners: FloatArray, others: Others, rows: int, horizon: float
+) -> IntArray:
+    """Those that can touch an ego box, or its projection, at any time.
+
+    Args:
+        states: (P, T, 11) driven states.
+        corners: (P, T, 4, 2) corners of the ego [m].
+        others: The others.
+        rows: Of time, that count.
+        horizon: Of the projection [s].
+    """
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for row in range(corners.shape[0]):
+        for step in range(corners.shape[1]):
+            reach = horizon * np.hypot(states[row, step, VX], states[row, step, VY])
+            for corner in range(4):
+                x, y = corners[row, step, corner, 0], corners[row, step, corner, 1]
+                low_x, high_x = min(low_x, x - reach), max(high_x, x + reach)
+                low_y, high_y = min(low_y, y - reach), max(high_y, y + reach)
+    out = np.empty(len(others.radii), np.int64)
+    count = 0
+    for index in range(len(out)):
+        if others.ignored[index]:
+            continue
+        radius, is_near = others.radii[index] + 1e-6, False
+        for row in range(rows):
+            x, y = others.centers[row, index, 0], others.centers[row, index, 1]
+            if low_x - radius <= x <= high_x + radius and low_y - radius <= y <= high_y + radius:
+                is_near = True
+                break
+        if is_near:
+            out[count] = index
+            count += 1
+    return out[:count]
+
+
+@lean_kernel
+def hits(
+    others: Others, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
+) -> bool:
+    """Whether a box (4, 2) and the circle around it touch one of the others at a row of time."""
+    dx = others.centers[row, index, 0] - circle[0]
+    dy = others.centers[row, index, 1] - circle[1]
+    reach = circle[2] + others.radii[index]
+    if dx * dx + dy * dy > reach * reach:
+        return False
+    return convex_intersect(box, others.boxes[row, index])
+
+
+@lean_kernel
+def is_at_fault(
+    state: FloatArray, box: FloatArray, is_off_lane: bool, others: Others, row: int, index: int
+) -> bool:
+    """Whether the ego causes a collision.
+
+    Args:
+        state: (11,) ego state.
+        box: (4, 2) its corners [m].
+        is_off_lane: Whether it is on several lanes or off the road.
+        others: The others.
+        row: Of time.
+        index: The one that is hit.
+    """
+    if np.hypot(state[VX], state[VY]) <= STOPPED:
+        return False
+    if others.speeds[row, index] <= STOPPED:
+        return True
+    center = others.centroids[row, index]
+    if bearing(state, center[0], center[1]) > BEHIND:
+        return False
+    return is_off_lane or front_touches(box, others.boxes[row, index])
+
+
+@kernel
+def first_faults(
+    states: FloatArray,
+    corners: FloatArray,
+    off_lane: BoolArray,
+    others: Others,
+    near: IntArray,
+    rows: IntArray,
+    forgives: bool,
+    scores: FloatArray,
+    first: FloatArray,
+) -> None:
+    """At-fault collisions.
+
+    Args:
+        states: (P, T, 11) driven states.
+        corners: (P, T, 4, 2) corners of the ego [m].
+        off_lane: (P, T) whether the ego is on several lanes or off the road.
+        others: The others.
+        near: Those that count.
+        rows: (T,) row of time of each time index; -1 where it is not looked at.
+        forgives: Whether a first contact without fault makes all later ones count as such.
+        scores: (P,) receives the factors 0, 0.5 or 1.
+        first: (P,) receives the time indices of the first collisions, inf if none.
+    """
+    decided = np.empty(len(near), np.bool_)
+    for proposal in range(states.shape[0]):
+        scores[proposal], first[proposal] = 1.0, NEVER
+        for entry in range(len(near)):
+            decided[entry] = False
+        for step in range(states.shape[1]):
+            box, row = corners[proposal, step], rows[step]
+            if row < 0:
+                continue
+            circle = circle_around(box)
+            for entry in range(len(near)):
+                index = near[entry]
+                if decided[entry] or not hits(others, row, index, box, circle):
+                    continue
+                off = off_lane[proposal, step]
+                if is_at_fault(states[proposal, step], box, off, others, row, index):
+                    worth = 0.0 if others.is_agent[index] else 0.5
+                    scores[proposal] = min(scores[proposal], worth)
+                    first[proposal] = min(first[proposal], float(step))
+                    decided[entry] = True
+                elif forgives:
+                    decided[entry] = True

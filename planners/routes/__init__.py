@@ -1,0 +1,1 @@
+"""Routes: blocks corrected, lanes along them, and the searches both need."""

@@ -1,0 +1,140 @@
+"""The planners there are, by name; nothing of them is imported here."""
+
+import importlib.util
+import types
+from dataclasses import dataclass
+
+from shiftsim.files import checkpoint_folder
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A checkpoint as its authors publish it.
+
+    Attributes:
+        file: What is published.
+        project: Name of the project that publishes it.
+        name: File or folder in the folder of checkpoints, where it is found by itself.
+    """
+
+    file: str
+    project: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerEntry:
+    """One registered planner.
+
+    Attributes:
+        name: Its name everywhere.
+        kind: `rule-based`, `oracle` (looks at the recording), `replay` or `learned`.
+        target: `package.module:Class`.
+        description: One line.
+        arguments: Names of the arguments it takes.
+        checkpoint: What a learned planner loads; it also needs the extra `learned`.
+    """
+
+    name: str
+    kind: str
+    target: str
+    description: str
+    arguments: tuple[str, ...] = ()
+    checkpoint: Published | None = None
+
+
+_HERE = "shiftsim.planners"
+_NETWORK = ("checkpoint", "device")  # arguments of learned planners
+_IDM = ("min_gap", "headway", "accel_max", "decel_max")
+_ENTRIES = (
+    PlannerEntry(
+        "carl",
+        "learned",
+        f"{_HERE}.learned.carl.planner:Carl",
+        "a policy trained by reinforcement learning on a raster of the surroundings",
+        _NETWORK,
+        Published(
+            "nuPlan/checkpoints/nuplan_51892_1B/model_best.pth",
+            "autonomousvision/CaRL",
+            "nuplan_51892_1B",
+        ),
+    ),
+    PlannerEntry(
+        "constant-velocity",
+        "rule-based",
+        f"{_HERE}.basic.constant_velocity:ConstantVelocity",
+        "keeps heading and speed",
+    ),
+    PlannerEntry(
+        "diffusion-planner",
+        "learned",
+        f"{_HERE}.learned.diffusion.planner:DiffusionPlanner",
+        "samples the future of ego and neighbours with a diffusion transformer",
+        _NETWORK,
+        Published(
+            "model.pth and args.json", "ZhengYinan-AIR/Diffusion-Planner", "diffusion-planner"
+        ),
+    ),
+    PlannerEntry(
+        "idm",
+        "rule-based",
+        f"{_HERE}.idm.planner:Idm",
+        "nuPlan's IDM planner: follows the route's lanes behind the nearest object",
+        ("target_velocity", *_IDM),
+    ),
+    PlannerEntry(
+        "log-future",
+        "oracle",
+        f"{_HERE}.basic.log_future:LogFuture",
+        "drives the recorded future",
+    ),
+    PlannerEntry(
+        "pdm-closed",
+        "rule-based",
+        f"{_HERE}.pdm.planner:PdmClosed",
+        "drives 15 proposals along the route in its head and takes the best one",
+        ("speed_fractions", "lateral_offsets", "fallback_velocity", *_IDM, "map_radius"),
+    ),
+    PlannerEntry(
+        "plantf",
+        "learned",
+        f"{_HERE}.learned.plantf.planner:PlanTF",
+        "imitation with a transformer over agents and map",
+        _NETWORK,
+        Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt"),
+    ),
+    PlannerEntry(
+        "pluto",
+        "learned",
+        f"{_HERE}.learned.pluto.planner:Pluto",
+        "imitation with contrastive learning, and a choice among its plans by rules",
+        _NETWORK,
+        Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt"),
+    ),
+    PlannerEntry(
+        "scripted",
+        "replay",
+        f"{_HERE}.basic.scripted:Scripted",
+        "replays pose sequences from a Parquet or CSV file",
+        ("file", "name"),
+    ),
+    PlannerEntry(
+        "simple",
+        "rule-based",
+        f"{_HERE}.basic.simple:Simple",
+        "nuPlan's SimplePlanner: straight on, slows down to a limit",
+        ("max_velocity",),
+    ),
+)
+PLANNERS = types.MappingProxyType({entry.name: entry for entry in _ENTRIES})
+PUBLISHED = {entry.name: entry.checkpoint for entry in _ENTRIES if entry.checkpoint is not None}
+
+
+def readiness(entry: PlannerEntry) -> str:
+    """What is missing to run a planner without further ado, in one line; empty where nothing."""
+    if entry.checkpoint is None:
+        return ""
+    if importlib.util.find_spec("torch") is None:
+        return "needs PyTorch: pip install 'shiftsim[learned]'"
+    path = checkpoint_folder() / entry.checkpoint.name
+    return "" if path.exists() else f"no checkpoint: give one, or put it at {path}"

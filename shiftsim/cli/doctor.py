@@ -1,0 +1,156 @@
+"""Commands that try this installation: doctor, and verify on whole folders of reference outputs.
+
+The few reference values that come with the package are compared by the code that `verify` uses.
+"""
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from shiftsim.arrays import cache_folder
+from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, say_json
+from shiftsim.files import PACKAGE
+from shiftsim.runs.workers import default_workers
+
+REFERENCE = PACKAGE / "verify" / "reference"
+_DATA = 2
+
+
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
+    mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
+    scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
+    maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
+    require_all: Annotated[
+        bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
+    ] = False,
+    debug: Debug = False,
+) -> None:
+    """Compare with reference outputs of nuPlan's own code.
+
+    Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
+    3 not all covered (with --require-all).
+    """
+    from shiftsim.errors import one_of
+    from shiftsim.verify import MODES
+    from shiftsim.verify import verify as compare
+
+    if mode is not None:
+        one_of("mode", mode, MODES)
+    result = compare(folder, mode=mode, scenes=scenes, maps=maps)
+    for line in result.lines():
+        say(line)
+    raise typer.Exit(result.exit_code(require_all=require_all))
+
+
+def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
+    """Versions, cores and memory, and whether the kernels compute what they should."""
+    from shiftsim.cli.diagnosis import examine
+
+    with progress_bar(quiet=quiet or as_json) as advance:
+        found = examine(advance)
+    if as_json:
+        say_json(asdict(found))
+    else:
+        for line in found.lines():
+            say(line)
+    if not found.is_well:
+        raise typer.Exit(_DATA)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    Attributes:
+        versions: Of Python and the packages that matter.
+        torch: What learned planners would run on.
+        cores: Cores this process may use.
+        memory: Memory of the machine [bytes], 0 where unknown.
+        workers: Suggested number of worker processes.
+        kernel_cache: Folder of compiled kernels, empty for the default.
+        seconds: How long the checks took, compilation included [s].
+        cases: Reference values compared.
+        mismatches: Those that differ, in words.
+    """
+
+    versions: dict[str, str]
+    torch: str
+    cores: int
+    memory: int
+    workers: int
+    kernel_cache: str
+    seconds: float
+    cases: int
+    mismatches: tuple[str, ...]
+
+    @property
+    def is_well(self) -> bool:
+        """Whether results can be trusted."""
+        return self.cases > 0 and not self.mismatches
+
+    def lines(self) -> list[str]:
+        """As text."""
+        packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
+        memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
+        equal = self.cases - len(self.mismatches)
+        return [
+            f" {packages}",
+            f" torch: {self.torch}",
+            f" {self.cores} cores, {memory}, suggested workers {self.workers}",
+            f" kernel cache: {self.kernel_cache or 'next to the source'}",
+            f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
+            *(f" MISMATCH {line}" for line in self.mismatches[:20]),
+        ]
+
+
+def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
+    """Examine this installation; compiles the kernels that are not in the cache yet."""
+    from shiftsim.runs.manifest import versions
+    from shiftsim.verify import verify
+    from shiftsim.verify.warmup import warm_up
+
+    began = perf_counter()
+    reports = []
+    # the metrics take longest to compile; their processes have the time of everything before them
+    with warm_up("routes", "contacts"):
+        advance(0, 3, "torch")
+        torch = _torch()
+        advance(1, 3, "dynamics")
+        reports.append(verify(REFERENCE / "dynamics"))
+        advance(2, 3, "metrics")
+    reports.append(verify(REFERENCE / "metric_worlds"))
+    advance(3, 3, "")
+    return Diagnosis(
+        versions=versions(),
+        torch=torch,
+        cores=default_workers(memory_each=1.0),
+        memory=_memory(),
+        workers=default_workers(),
+        kernel_cache=cache_folder(),
+        seconds=perf_counter() - began,
+        cases=sum(report.num_cases for report in reports),
+        mismatches=tuple(line for report in reports for line in report.mismatches),
+    )
+
+
+def _memory() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 0
+
+
+def _torch() -> str:
+    try:
+        import torch
+    except ImportError:
+        return "not installed (learned planners: pip install 'shiftsim[learned]')"
+    if not torch.cuda.is_available():
+        return f"{torch.__version__}, no CUDA device"
+    names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return f"{torch.__version__}, CUDA {torch.version.cuda}: {', '.join(names)}"

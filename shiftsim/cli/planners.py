@@ -1,0 +1,127 @@
+"""Commands about planners and their checkpoints: planners, checkpoint."""
+
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from shiftsim.cli.common import Debug, Json, new_app, plural, say, say_json
+
+_USAGE = 1
+app = new_app("Planners: what there is, and does mine obey the contract.")
+checkpoint = new_app(
+    "Checkpoints of learned planners: what is in one; convert it.", no_args_is_help=True
+)
+
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="PATH", help="File, folder that holds one, or name in SHIFTSIM_CHECKPOINTS."
+    ),
+]
+
+
+@app.callback(invoke_without_command=True)
+def planners(context: typer.Context, as_json: Json = False, debug: Debug = False) -> None:
+    """The planners that come with shiftsim, and whether they are ready to run."""
+    if context.invoked_subcommand is None:
+        list_planners(as_json)
+
+
+@app.command("list")
+def list_planners(as_json: Json = False, debug: Debug = False) -> None:
+    """The planners that come with shiftsim, and whether they are ready to run."""
+    from shiftsim.planners.registry import PLANNERS, readiness
+
+    missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
+    if as_json:
+        say_json(
+            [
+                {**asdict(entry), "ready": not missing[name], "missing": missing[name]}
+                for name, entry in PLANNERS.items()
+            ]
+        )
+        return
+    for name, entry in PLANNERS.items():
+        say(f" {name:18} {entry.kind:11} {entry.description}")
+        if entry.checkpoint is not None:
+            published = f"{entry.checkpoint.file}, of the project {entry.checkpoint.project}"
+            say(f" {'':18} checkpoint  {published}")
+        if entry.arguments:
+            say(f" {'':18} arguments   --planner-arg {', '.join(entry.arguments)}")
+        if missing[name]:
+            say(f" {'':18} not ready   {missing[name]}")
+    ready = sum(not text for text in missing.values())
+    say(f" {ready} of {len(missing)} are ready to run")
+
+
+@app.command("check")
+def check_one_planner(
+    planner: Annotated[str, typer.Argument(help="Name or package.module:Class.")],
+    planner_arg: Annotated[
+        list[str] | None, typer.Option("--planner-arg", help="key=value; repeatable.")
+    ] = None,
+    store: Annotated[str, typer.Option(help="Store with scenarios to try it on.")] = "demo",
+    token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Does a planner obey the contract? Says what is wrong, and what to do."""
+    from shiftsim.planners.contract import check_planner
+    from shiftsim.planners.registry import load_planner
+    from shiftsim.runs.config import parse_argument
+    from shiftsim.runs.scenarios import open_named_store
+
+    arguments = {}
+    for text in planner_arg or ():
+        _, name, value = parse_argument(text, (planner,))
+        arguments[name] = value
+    load_planner(planner, arguments)
+    scenes = open_named_store(store)
+    scenario = scenes.read(token or scenes.tokens[0])
+    findings = check_planner(partial(load_planner, planner, arguments), scenario)
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if as_json:
+        say_json([asdict(finding) for finding in findings])
+    else:
+        for finding in findings:
+            say(f" {finding.severity}: {finding.check}: {finding.message}")
+            if finding.hint:
+                say(f"   hint: {finding.hint}")
+        verdict = plural(len(errors), "error") if errors else "obeys the contract"
+        say(f"{planner} on scenario {scenario.token}: {verdict}")
+    if errors:
+        raise typer.Exit(_USAGE)
+
+
+@checkpoint.command()
+def inspect(path: Source, as_json: Json = False, debug: Debug = False) -> None:
+    """Which planner a checkpoint is for, whether it loads, its hash, and what was left out."""
+    from shiftsim.planners.learned.convert import inspect_checkpoint
+
+    found = inspect_checkpoint(path)
+    if as_json:
+        say_json(found.to_dict())
+        return
+    for line in found.lines():
+        say(line)
+
+
+@checkpoint.command()
+def convert(
+    path: Source,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: ….safetensors")],
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Write the weights that the planner loads, and nothing else, to a safetensors file."""
+    from shiftsim.planners.learned.convert import convert_checkpoint
+
+    made = convert_checkpoint(path, out)
+    if as_json:
+        say_json(made.to_dict())
+        return
+    for line in made.lines():
+        say(line)

@@ -1,0 +1,233 @@
+"""Runs made of other runs, without simulating: shards joined, and rollouts scored again."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.runs.config import RunConfig, make_config, parse_shard
+from shiftsim.runs.execute import Progress, record, scenario_of
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
+from shiftsim.runs.prepare import RUNS, run_name
+from shiftsim.runs.results import MISSING, OK, Run, TaskResult, open_run, stored_results
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.scenarios import open_run_store
+from shiftsim.runs.task import Batch, Scenarios, attempt, score_rollout
+from shiftsim.runs.workers import default_workers, map_unordered
+
+
+def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
+    """Write the run folder that the shards `1/n` to `n/n` are parts of.
+
+    Args:
+        runs: The shards.
+        out: The new folder; by default the name of the shards without their number.
+        allow_partial: Accept that shards are missing; their tasks then are `missing`.
+
+    Returns:
+        The run; its scores and metrics are the same bytes as without shards.
+
+    Raises:
+        ConfigError: Something is no shard, of another run, given twice or missing.
+    """
+    first = runs[0].manifest
+    shards = _check_shards(runs, allow_partial=allow_partial)
+    name = first["run"].removesuffix(f".{first['shard'].replace('/', '-of-')}")
+    target = Path(out) if out else runs[0].path.parent / name
+    check_target(target, first["determining"])
+    manifest = {key: value for key, value in first.items() if key != "tokens"} | {
+        "run": target.name,
+        "shard": "",
+        "config": first["config"] | {"shard": ""},
+        "started": min(run.manifest["started"] for run in runs),
+        "ended": max(run.manifest["ended"] for run in runs),
+        "merged": now(),
+        "merged_from": [run.path.name for run in runs],
+    }
+    writer = RunWriter(target, manifest)
+    try:
+        for run in runs:
+            for result, place in stored_results(run.path):
+                if result.task in writer.ended:
+                    raise ConfigError(
+                        f"task {tuple(result.task)!r} of {str(run.path)!r} is in another shard too",
+                        hint="name every shard once",
+                    )
+                writer.add(result, stored=place)
+        errors = {task: error for run in runs for task, error in _without_result(run)}
+        return writer.finish(
+            manifest | {"state": "finished"},
+            _expected(first),
+            lambda task: errors.get(task, f"shard missing; there are {', '.join(shards)}"),
+        )
+    finally:
+        writer.close()
+
+
+def _check_shards(runs: Sequence[Run], *, allow_partial: bool) -> list[str]:
+    first = runs[0]
+    numbers: dict[int, Run] = {}
+    for run in runs:
+        shard = run.manifest["shard"]
+        if not shard:
+            raise ConfigError(
+                f"{str(run.path)!r} is not a shard", hint="merge joins runs made with --shard i/n"
+            )
+        differing = difference(run.manifest, first.manifest["determining"], shard)
+        if differing or parse_shard(shard)[1] != parse_shard(first.manifest["shard"])[1]:
+            raise ConfigError(
+                f"{str(run.path)!r} and {str(first.path)!r} are not of the same run: "
+                f"{differing or 'their shards are ' + shard + ' and ' + first.manifest['shard']}",
+                hint="name the shards of one run",
+            )
+        number, count = parse_shard(shard)
+        if number in numbers:
+            raise ConfigError(
+                f"{str(run.path)!r} and {str(numbers[number].path)!r} are both shard {shard}",
+                hint="name every shard once",
+            )
+        numbers[number] = run
+    missing = [f"{number}/{count}" for number in range(1, count + 1) if number not in numbers]
+    if missing and not allow_partial:
+        raise ConfigError(
+            f"shards are missing: {', '.join(missing)}",
+            hint="name all of them, or --allow-partial for a result that is labelled so",
+        )
+    return [run.manifest["shard"] for run in runs]
+
+
+def _expected(manifest: dict[str, Any]) -> list[Task]:
+    """All tasks of the whole run."""
+    determining = manifest["determining"]
+    return [
+        Task(planner, noise, seed, token)
+        for planner in determining["planners"]
+        for noise, fields in determining["noise"].items()
+        for seed in ([0] if fields["kind"] == "none" else determining["seeds"])
+        for token in manifest["tokens"]
+    ]
+
+
+def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
+    """The missing tasks of a run, and why they have no result."""
+    columns = (run.tasks[name].to_pylist() for name in (*Task._fields, "status", "error"))
+    for *key, status, error in zip(*columns, strict=True):
+        if status == MISSING:
+            yield Task(*key), error
+
+
+class Rescorer:
+    """Scores one stored rollout after the other."""
+
+    def __init__(self, run: Path, store: str, config: RunConfig) -> None:
+        """Score rollouts of a run.
+
+        Args:
+            run: Its folder.
+            store: Folder of the store it was made with.
+            config: Its settings, with the other thresholds and metrics.
+        """
+        self.config = config
+        self._run, self._scenarios = open_run(run), Scenarios(store)
+
+    def __call__(self, batch: Batch) -> list[TaskResult]:
+        """The results of tasks."""
+        return [attempt(task, partial(self._score, task)) for task in batch.tasks]
+
+    def _score(self, task: Task) -> TaskResult:
+        scenario = self._scenarios.read(task.token)
+        log = self._run.rollout(task, scenario)
+        scores, metrics = score_rollout(scenario, log, self.config)
+        return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
+
+
+def rescore(
+    run: Run,
+    *,
+    thresholds: str,
+    metrics: tuple[str, ...] = (),
+    store: str | None = None,
+    out: str | None = None,
+    workers: int = 0,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    argv: Sequence[str] = (),
+) -> Run:
+    """Write a run folder as if the run had been made with other thresholds.
+
+    Args:
+        run: A run with stored rollouts.
+        thresholds: Threshold profile.
+        metrics: Own metrics, by `module:attribute`.
+        store: The store, where it has moved.
+        out: The new folder; by default `runs/<id>`.
+        workers: Worker processes; 0 chooses from the cores.
+        on_progress: Called after every rollout.
+        argv: The command line, for the manifest.
+
+    Raises:
+        DataError: Rollouts are missing, or the store is another one.
+    """
+    for metric in metrics:
+        load_metric(metric)
+    found = open_run_store(run, store)
+    determining = run.manifest["determining"] | {
+        "thresholds": asdict(thresholds_of(thresholds)),
+        "metrics": sorted(metrics),
+        "metric_version": METRIC_VERSION,
+        "code": _code(run.manifest["determining"].get("code", "")),
+    }
+    values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
+    config = make_config(values, where=str(run.path / "manifest.json"))
+    target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
+    check_target(target, determining)
+    statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))
+    done = [task for task, status in statuses.items() if status == OK]
+    without = [task for task in done if run.rollout_places[task] is None]
+    if without:
+        raise DataError(
+            f"run {run.path.name!r} holds no rollouts for {len(without)} of {len(done)} tasks",
+            hint="run again with --save-rollouts all",
+        )
+    manifest = make_manifest(
+        target,
+        config=config,
+        split=run.manifest["split"],
+        store=run.manifest["store"] if store is None else found.source,
+        determining=determining,
+        argv=argv,
+    )
+    writer = RunWriter(target, manifest)
+    try:
+        for result, _ in stored_results(run.path):
+            if result.status != OK:  # it stays so
+                writer.add(replace(result, seconds={}))
+        outcomes = map_unordered(
+            partial(Rescorer, run.path.resolve(), found.source, config),
+            # as rollouts lie in their files
+            [Batch((task,)) for task in sorted(done, key=lambda task: task.token)],
+            workers=min(workers or default_workers(), len(done)),
+            alone=1,
+            group=scenario_of,
+        )
+        with closing(outcomes):
+            add = partial(_add, writer, run)
+            record(outcomes, add, Progress(0, len(done), 0), on_progress)
+        manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
+        return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
+    finally:
+        writer.close()
+
+
+def _add(writer: RunWriter, run: Run, result: TaskResult) -> None:
+    writer.add(result, stored=run.rollout_places[result.task])
+
+
+def _code(simulated: str) -> str:
+    """Digest of the code that simulated, and of the code that scores where it is another."""
+    here = code_digest()
+    return here if here == simulated else f"{simulated}, scored by {here}"

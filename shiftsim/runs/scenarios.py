@@ -1,0 +1,281 @@
+"""The scenarios of a run: the store they are in, and splits, which are named lists of their tokens.
+
+A run knows its store by hash. A bundled run holds a store of its own with the scenarios it used and
+their maps, so that the folder alone is enough to score, view and plot it anywhere.
+"""
+
+import hashlib
+import json
+import shutil
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from shiftsim.data.store.reading import ScenarioStore, open_store
+from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.writing import StoreWriter, window_row
+from shiftsim.errors import ConfigError, DataError, nearest, one_of
+from shiftsim.files import read_toml, store_path
+from shiftsim.runs.config import DEFAULT_STORE
+from shiftsim.runs.results import Run
+
+BUNDLE = "store"  # folder below that of the run
+
+
+def open_named_store(name: str) -> ScenarioStore:
+    """A store by name, path or URL; the demo store is made when it is not there yet.
+
+    Raises:
+        DataError: It is not there, or damaged.
+    """
+    if "://" in name:
+        return open_store(name)
+    path = store_path(name)
+    if name == DEFAULT_STORE and not path.exists():
+        from shiftsim.data.demo.store import demo_store
+
+        path = demo_store(path)
+    if not path.exists():
+        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
+        raise DataError(
+            f"no store {name!r} at {str(path)!r}",
+            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
+        )
+    return open_store(path)
+
+
+def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
+    """The store that a run was made with, or its bundle, which then has the hash of that store.
+
+    Args:
+        run: The run.
+        store: Name or path, where the store has moved.
+
+    Raises:
+        DataError: It is not there, or is another one.
+    """
+    bundle = run.path / BUNDLE
+    if store is None and bundle.is_dir():
+        found = open_store(bundle)
+        wanted = run.manifest.get("bundle", {}).get("hash")
+    else:
+        found = _open(run, store)
+        wanted = run.manifest["determining"]["store"]
+    if found.hash != wanted:
+        raise DataError(
+            f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
+            hint="name the right one with --store, or run again",
+        )
+    found.hash = run.manifest["determining"]["store"]
+    return found
+
+
+def _open(run: Run, store: str | None) -> ScenarioStore:
+    place = store or run.manifest["store"]
+    if "://" in place:
+        return open_store(place)
+    path = store_path(place)
+    if not path.exists():
+        raise DataError(
+            f"the store of run {run.path.name!r} is not at {str(path)!r}",
+            hint="say where it is with --store",
+        )
+    return open_store(path)
+
+
+def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
+    """Copy scenarios with their recordings and maps into a run folder.
+
+    Args:
+        store: The store.
+        folder: The run folder.
+        tokens: The scenarios.
+
+    Returns:
+        What the manifest says about it.
+    """
+    target = folder / BUNDLE
+    if not target.exists():
+        partial = folder / f".{BUNDLE}.tmp"
+        shutil.rmtree(partial, ignore_errors=True)
+        _copy(store, partial, set(tokens))
+        partial.rename(target)
+    return {"hash": open_store(target).hash}
+
+
+def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
+    columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
+    used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
+    with StoreWriter(target) as writer:
+        for city in sorted({city for _, _, city in used}):
+            writer.add_map(store.map(city))
+        for recording in sorted({recording for _, recording, _ in used}):
+            rows = [
+                window_row(store.window(token), city)
+                for token, name, city in used
+                if name == recording
+            ]
+            copied = target / ".recording"
+            shutil.copytree(store.recording_folder(recording), copied)
+            writer.take_recording(copied, recording, rows)
+    if (store.path / REVIEW).is_file():
+        (target / REVIEW).parent.mkdir()
+        shutil.copyfile(store.path / REVIEW, target / REVIEW)
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """A named list of scenario tokens.
+
+    Attributes:
+        name: As in tables and folder names.
+        tokens: The tokens, each once, in the order listed.
+    """
+
+    name: str
+    tokens: tuple[str, ...]
+
+    @property
+    def hash(self) -> str:
+        """Digest of the set of tokens; their order does not matter."""
+        return token_hash(self.tokens)
+
+
+def token_hash(tokens: Iterable[str]) -> str:
+    """Digest of a set of tokens."""
+    return hashlib.blake2b("\n".join(sorted(tokens)).encode(), digest_size=16).hexdigest()
+
+
+def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
+    """The split of a name.
+
+    Args:
+        name: A file (`.toml`, or `.txt` with one token per line), a name below `splits/` of the
+            store, or the store's own name (or nothing) for all its scenarios.
+        store: Folder of the store.
+        tokens: All scenarios of the store.
+
+    Raises:
+        ConfigError: There is no such split, or it contradicts itself.
+    """
+    if name in ("", store.name):
+        return Split(store.name, tokens)
+    path = Path(name)
+    if path.suffix in (".toml", ".txt"):
+        return read_split(path)
+    path = store / "splits" / f"{name}.toml"
+    if path.is_file():
+        return read_split(path)
+    known = sorted([store.name, *(found.stem for found in (store / "splits").glob("*.toml"))])
+    near = nearest(name, known)
+    hint = f"did you mean {near!r}? " if near else ""
+    raise ConfigError(
+        f"split {name!r} unknown",
+        hint=f"{hint}available: {', '.join(known)}, or a .toml or .txt file",
+    )
+
+
+def read_split(path: Path) -> Split:
+    """A split from a file: TOML with `tokens`, or text with one token per line.
+
+    Raises:
+        ConfigError: The file cannot be read, names no tokens or a token twice, or its `count` or
+            `hash` says otherwise.
+    """
+    table: dict[str, object] = {}
+    if path.suffix == ".toml":
+        table = read_toml(path)
+        listed = table.get("tokens")
+    else:
+        try:
+            listed = path.read_text().split()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"cannot read split {str(path)!r}: {error}", hint="check the path"
+            ) from error
+    if not isinstance(listed, list) or not listed or not all(isinstance(t, str) for t in listed):
+        raise ConfigError(f"split {str(path)!r} lists no tokens", hint='write tokens = ["…", "…"]')
+    split = Split(str(table.get("name", path.stem)), tuple(listed))
+    if len(set(listed)) < len(listed):
+        twice = next(token for token in listed if listed.count(token) > 1)
+        raise ConfigError(f"split {str(path)!r} lists {twice!r} twice", hint="remove one of them")
+    actual = {"count": len(listed), "hash": split.hash}
+    for name, value in actual.items():
+        if table.get(name, value) != value:
+            raise ConfigError(
+                f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
+                hint="the file was edited or cut off; fetch or write it again",
+            )
+    return split
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted.
+
+    Args:
+        rows: `token`, `type` and `city` of every scenario.
+        usable: Tokens to choose from.
+        wanted: Values by column; none for any.
+        per_type: At most so many of every type, the first ones by token.
+        limit: At most so many in all, the first ones by token.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        lines = [
+            f"name = {json.dumps(split.name)}",
+            f"count = {len(tokens)}",
+            f'hash = "{split.hash}"',
+            "tokens = [",
+            *(f'    "{token}",' for token in tokens),
+            "]",
+        ]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
+    return split

@@ -1,0 +1,93 @@
+"""Route correction: where it looks for the start, and that repeating it changes nothing."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import straight_road
+
+from shiftsim.data.demo.store import bench_scene
+from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.planners.routes.correction import (
+    RouteCorrector,
+    correct_route,
+    find_start,
+    known_blocks,
+)
+from shiftsim.world.layers import square_around
+from shiftsim.world.map import build_map
+
+
+def names(road, blocks):
+    return [road.blocks.ids[block] for block in blocks]
+
+
+def start_of(road, route, pose, area):
+    start = find_start(road, known_blocks(road, route, "token", "test"), np.array(pose), area)
+    return road.blocks.ids[start.block], names(road, start.others)
+
+
+def test_the_wider_the_search_the_more_blocks_may_be_the_start():
+    road = straight_road()
+    pose = (201.0, 0.0, 0.0)
+    assert start_of(road, ["1"], pose, square_around(201.0, 0.0, 0.5)) == ("2", ["2"])
+    # the right lane of every block lies below the pose, the left one is too far
+    assert start_of(road, ["1"], pose, square_around(201.0, 0.0, 2.5)) == ("1", ["1"])
+    footprint = boxes_to_corners(np.array([202.5, 0.0, 0.0]), np.array([5.2, 2.3]))
+    assert start_of(road, ["2"], pose, footprint) == ("2", ["2"])
+
+
+def test_off_the_road_the_nearest_block_of_either_kind_is_taken():
+    road = straight_road()
+    pose = (215.0, 30.0, 0.0)
+    start, candidates = start_of(road, ["1"], pose, square_around(215.0, 30.0, 1.0))
+    assert candidates == ["3", "2"]
+    assert start == "2"
+
+
+def test_a_route_that_misses_its_start_and_a_link_is_completed():
+    road = straight_road()
+    corrector = RouteCorrector(road, known_blocks(road, ["3"], "token", "test"), 1.0)
+    assert names(road, corrector.at(np.array([100.0, 0.0, 0.0]))) == ["1", "2", "3"]
+    gap = RouteCorrector(road, known_blocks(road, ["1", "3"], "token", "test"), 1.0)
+    assert names(road, gap.at(np.array([100.0, 0.0, 0.0]))) == ["1", "2", "3"]
+
+
+def test_repeated_ids_of_a_route_count_once():
+    road = straight_road()
+    assert known_blocks(road, ["1", "2", "1", "3"], "token", "test") == [0, 2, 1]
+
+
+@pytest.mark.parametrize(("route", "text"), [([], "is empty"), (["1", "x"], "no roadblock 'x'")])
+def test_a_bad_route_is_an_error_that_names_planner_and_scenario(route, text):
+    with pytest.raises(PlannerError, match=text) as caught:
+        known_blocks(straight_road(), route, "a1b2", "plantf")
+    assert "plantf" in str(caught.value)
+    assert "a1b2" in str(caught.value)
+
+
+def test_a_map_without_roads_is_an_error():
+    road = build_map("nowhere", edges=[], blocks=[])
+    with pytest.raises(PlannerError, match="map 'nowhere' has no roadblocks"):
+        find_start(road, [], np.zeros(3), square_around(0.0, 0.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def city():
+    return bench_scene(0, 0)
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_what_is_kept_is_what_a_new_correction_gives(city, data):
+    road, ego = city.map, city.expert
+    dropped = data.draw(st.integers(0, 3))
+    blocks = known_blocks(road, city.route, city.token, "test")[dropped:]
+    corrector = RouteCorrector(road, blocks, 2.5)
+    for _ in range(4):
+        pose = ego[data.draw(st.integers(0, len(ego) - 1)), :3].copy()
+        pose += [data.draw(st.floats(-9, 9)), data.draw(st.floats(-9, 9)), 0.0]
+        pose[2] += data.draw(st.sampled_from([0.0, 1.5, 3.0]))
+        start = find_start(road, blocks, pose, square_around(pose[0], pose[1], 2.5))
+        assert corrector.at(pose) == tuple(correct_route(road, blocks, start))

@@ -1,0 +1,34 @@
+"""Import paths of earlier versions work for one version more, and say where things are now."""
+
+import importlib
+
+import pytest
+
+from shiftsim._moved import MODULES, NAMES
+
+
+@pytest.mark.parametrize(("old", "new"), MODULES.items())
+def test_a_module_that_moved_is_found(old, new):
+    with pytest.warns(DeprecationWarning, match=f"{old} is now {new}"):
+        earlier = importlib.reload(importlib.import_module(old))
+    current = importlib.import_module(new)
+    public = {name for name in vars(current) if not name.startswith("_")}
+    assert public
+    assert all(vars(earlier)[name] is vars(current)[name] for name in public)
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "new"),
+    [(package, name, new) for package, names in NAMES.items() for name, new in names.items()],
+)
+def test_a_name_that_moved_is_found(package, name, new):
+    with pytest.warns(DeprecationWarning, match=f"{name} is now {new}"):
+        found = getattr(importlib.import_module(package), name)
+    assert found is getattr(importlib.import_module(new), name)
+
+
+def test_other_names_are_unknown():
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("shiftsim.simulations")
+    with pytest.raises(AttributeError, match="no attribute 'load'"):
+        importlib.import_module("shiftsim.planners").load  # noqa: B018
