@@ -1,5 +1,6 @@
 """Reactive traffic in small worlds: 100 steps of nuPlan's IDM agents (`idm_world_*.json`)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.files import Source, read_fields
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, read_map, read_objects
+from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, make_scenario, read_map, read_objects
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights
@@ -68,22 +69,10 @@ def _make_scenario(world: Source) -> Scenario:
     counts = {len(world["lights"]), frames.shape[1], *(len(thing["frames"]) for thing in things)}
     if counts != {len(time_us)}:
         raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
-    return Scenario(
-        token=str(world.values["world"]),
-        scenario_type="unknown",
-        log_name="idm_world",
-        city=road.name,
-        map=road,
-        time_us=time_us,
-        ego=ego_states(dict(zip(EGO_COLUMNS[: VY + 1], frames, strict=True))),
-        tracks=read_objects(sorted(things, key=lambda o: AgentKind[o["type"]]), len(time_us)),
-        traffic_lights=_make_lights(world["lights"], road),
-        iteration_rows=np.arange(len(time_us)),
-        row_step=1,
-        route=(),
-        mission_goal=None,
-        mapping=(10.0, 0.0, 1.0),
-    )
+    ego = ego_states(dict(zip(EGO_COLUMNS[: VY + 1], frames, strict=True)))
+    tracks = read_objects(sorted(things, key=lambda o: AgentKind[o["type"]]), len(time_us))
+    out = make_scenario(str(world.values["world"]), road, time_us, ego, tracks)
+    return replace(out, traffic_lights=_make_lights(world["lights"], road))
 
 
 def _make_lights(lights: list[dict[str, str]], road: VectorMap) -> TrafficLights:

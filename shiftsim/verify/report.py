@@ -97,9 +97,8 @@ class Report:
             bad = np.atleast_1d(ours != theirs)
         if not bad.any():
             return True
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        got = np.asarray(np.atleast_1d(ours)[first]).tolist()
-        want = np.asarray(np.atleast_1d(theirs)[first]).tolist()
+        first = tuple(np.argwhere(bad)[0].tolist())
+        got, want = (np.asarray(np.atleast_1d(side)[first]).tolist() for side in (ours, theirs))
         at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
         count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
         return self._differ(tally, quantity, where, f"{got!r}, not {want!r}{at}{count}")
@@ -139,13 +138,11 @@ class Report:
 
     def lines(self, max_mismatches: int = 50) -> list[str]:
         """The report as text; the last line is the summary."""
-        out = []
-        for name, tally in self.quantities.items():
-            equal = tally.cases - tally.mismatches
-            out.append(
-                f"{name}: {equal}/{tally.cases} equal, max |Δ| {tally.max_error:.3g} "
-                f"(tolerance {tally.tolerance:.3g})"
-            )
+        out = [
+            f"{name}: {tally.cases - tally.mismatches}/{tally.cases} equal, "
+            f"max |Δ| {tally.max_error:.3g} (tolerance {tally.tolerance:.3g})"
+            for name, tally in self.quantities.items()
+        ]
         out += [f"not compared: {what}" for what in self.informative]
         out += [f"not covered: {what} ({count})" for what, count in self.not_covered.items()]
         out += [f"MISMATCH {line}" for line in self.mismatches[:max_mismatches]]

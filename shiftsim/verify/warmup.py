@@ -11,38 +11,29 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from subprocess import DEVNULL
 
 import numpy as np
 
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks, TrafficLights, VehicleParameters
+from shiftsim.world.state import PACIFICA
 
 WORLD = Path(__file__).parent / "reference" / "metric_worlds" / "metric_world_21.json"
-_ROUTE = ("R1", "RC1", "R2")
 
 
 @contextmanager
 def warm_up(*shares: str) -> Iterator[None]:
-    """Compile in the background for as long as the block lasts, and wait for the rest after it.
+    """Compile shares (all, if none is named) beside the block, and wait for the rest after it.
 
     A share that fails is left to whoever runs into its cause.
-
-    Args:
-        shares: Names out of `SHARES`; all of them when none is named.
     """
     command = "import sys; from shiftsim.verify.warmup import SHARES; SHARES[sys.argv[1]]()"
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", command, share],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for share in shares or SHARES
-    ]
+    start = partial(subprocess.Popen, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
+    processes = [start([sys.executable, "-c", command, share]) for share in shares or SHARES]
     try:
         yield
         for process in processes:
@@ -60,7 +51,7 @@ def _routes() -> None:
     from shiftsim.metrics.route import corner_routes, driven_route
 
     log, road = _rollout()
-    ego = collision.flat_ego(log.ego, VehicleParameters())
+    ego = collision.flat_ego(log.ego, PACIFICA)
     route, corners = driven_route(road, ego.centers), corner_routes(road, ego.corners)
     lane_changes(road, corners)
     drivable_area.measure(road, ego.corners, route, corners)
@@ -74,7 +65,7 @@ def _contacts() -> None:
     from shiftsim.metrics.time_to_collision import time_to_collision
 
     log, road = _rollout()
-    ego = collision.flat_ego(log.ego, VehicleParameters())
+    ego = collision.flat_ego(log.ego, PACIFICA)
     tracks, is_common = collision.flat_tracks(log.tracks), np.ones(len(log.ego), np.bool_)
     contacts = collision.first_contacts(ego, tracks)
     time_to_collision(ego, tracks, contacts, (), is_common, road, log.tracks)
@@ -100,38 +91,20 @@ SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
 def _rollout() -> tuple[SimulationLog, VectorMap]:
     """A drive past a car and a pedestrian, and its map."""
     from shiftsim.verify.metric_worlds import read_world
+    from shiftsim.verify.worlds import make_tracks
 
     log, road = read_world(json.loads(WORLD.read_text("utf-8")))
-    count = len(log.time_us)
-    poses = np.repeat(log.ego[:, None, :3], 2, axis=1)
-    poses[:, :, 0] += [12.0, 30.0]
-    tracks = Tracks(
-        np.ones((count, 2), np.bool_),
-        poses,
-        np.ones((count, 2, 2)),
-        np.full((count, 2, 2), 2.0),
-        np.array([AgentKind.VEHICLE, AgentKind.PEDESTRIAN], np.int64),
-        ("a", "b"),
-    )
+    values = np.ones((len(log.time_us), 2, 7))
+    values[..., :3] = log.ego[:, None, :3] + [[12.0, 0.0, 0.0], [30.0, 0.0, 0.0]]
+    values[..., 5:] = 2.0
+    tracks = make_tracks(values.shape[:2], ..., values, ("vehicle", "pedestrian"), ("a", "b"))
     return replace(log, tracks=tracks), road
 
 
 def scene() -> Scenario:
     """A scenario of a dozen iterations: a small map with a route, a car, a pedestrian."""
+    from shiftsim.verify.worlds import make_scenario
+
     log, road = _rollout()
-    return Scenario(
-        token=log.token,
-        scenario_type="unknown",
-        log_name="warm-up",
-        city=road.name,
-        map=road,
-        time_us=log.time_us,
-        ego=log.ego,
-        tracks=log.tracks,
-        traffic_lights=TrafficLights.empty(len(log.time_us)),
-        iteration_rows=np.arange(12, dtype=np.int64),
-        row_step=1,
-        route=_ROUTE,
-        mission_goal=None,
-        mapping=(1.0, 0.0, 1.0),
-    )
+    out = make_scenario(log.token, road, log.time_us, log.ego, log.tracks)
+    return replace(out, iteration_rows=np.arange(12, dtype=np.int64), route=("R1", "RC1", "R2"))

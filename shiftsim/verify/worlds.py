@@ -11,7 +11,15 @@ from shiftsim.errors import DataError
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import Source
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
-from shiftsim.world.state import NUM_STATE, AgentKind, Tracks, TrafficLights
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import (
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    AgentKind,
+    Tracks,
+    TrafficLights,
+    center_poses,
+)
 
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
@@ -19,6 +27,7 @@ EGO_COLUMNS = (
     *("tire_steering_angle", "tire_steering_rate", "angular_velocity", "angular_acceleration"),
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
+BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
@@ -30,9 +39,30 @@ def ego_states(columns: Mapping[str, Any]) -> FloatArray:
     return out
 
 
+def ego_columns(states: FloatArray) -> dict[str, FloatArray]:
+    """Columns of the official tables by name, from (R, 11) ego states: rear axle and centre."""
+    columns = np.concatenate([states, center_poses(states[:, :3])], axis=1)
+    return dict(zip((*EGO_COLUMNS, *CENTER_COLUMNS), columns.T, strict=True))
+
+
+def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str, Any]:
+    """Columns of `objects.parquet` but for heights: tracks at rows, both (R,)."""
+    kinds = tracks.kinds[index]
+    # the official table shows static objects, which have no velocity, as standing
+    moves = tracks.velocities[rows, index]
+    moves = np.where(kinds[:, None] > LAST_AGENT_KIND, np.nan_to_num(moves), moves)
+    values = [tracks.poses[rows, index], moves, tracks.sizes[rows, index]]
+    return {
+        "iteration": rows,
+        "track_token": [tracks.tokens[i] for i in index.tolist()],
+        "type": [AgentKind(kind).name for kind in kinds.tolist()],
+        **dict(zip(BOX_COLUMNS, np.concatenate(values, axis=1).T, strict=True)),
+    }
+
+
 def make_tracks(
     shape: tuple[int, int],
-    where: tuple[IntArray, IntArray] | tuple[slice],
+    where: Any,
     values: FloatArray,
     kinds: Sequence[str],
     tokens: Sequence[str],
@@ -41,7 +71,7 @@ def make_tracks(
 
     Args:
         shape: Rows and tracks.
-        where: Row and track of each value; a whole slice where the values are dense.
+        where: Row and track of each value; `...` where the values are dense.
         values: (..., 7) x, y, heading, vx, vy, length, width; NaN where a track is absent.
         kinds: Names of the types of the tracks.
         tokens: Their tokens.
@@ -69,7 +99,7 @@ def read_objects(objects: Sequence[Source], count: int) -> Tracks:
             if frame is not None:
                 values[row, column] = [*frame, thing["length"], thing["width"]]
     kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
-    return make_tracks(values.shape[:2], (slice(None),), values, kinds, tokens)
+    return make_tracks(values.shape[:2], ..., values, kinds, tokens)
 
 
 def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
@@ -127,6 +157,28 @@ def _is_connector(kind: str, plain: str, connector: str) -> bool:
     if kind not in (plain, connector):
         raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
     return kind == connector
+
+
+def make_scenario(
+    token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
+) -> Scenario:
+    """A scenario whose iterations are all rows, without lights, route and goal."""
+    return Scenario(
+        token=token,
+        scenario_type="unknown",
+        log_name="world",
+        city=road.name,
+        map=road,
+        time_us=time_us,
+        ego=ego,
+        tracks=tracks,
+        traffic_lights=TrafficLights.empty(len(time_us)),
+        iteration_rows=np.arange(len(time_us)),
+        row_step=1,
+        route=(),
+        mission_goal=None,
+        mapping=(10.0, 0.0, 1.0),
+    )
 
 
 def recorded_log(

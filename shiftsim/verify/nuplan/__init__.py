@@ -10,13 +10,7 @@ from shiftsim.verify.scenes import Scenes
 
 
 def verify_nuplan(folder: Path, report: Report, mode: str | None = None) -> None:
-    """Compare every table of the folder.
-
-    Args:
-        folder: Folder with `scenes.json`, `logs`, `maps` and `expected`.
-        report: Filled with the comparisons.
-        mode: Only runs of this challenge (`NR`, `R`, `PT`); the importer is compared always.
-    """
+    """Compare every table of the folder; of one mode only its runs, but the importer always."""
     scenes = Scenes(folder)
     with report.attempt("importer", folder.name):
         verify_nuplan_import(folder, report)

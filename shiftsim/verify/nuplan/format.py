@@ -39,12 +39,7 @@ _SETS = {"tagged", "objects", "lights", "lanes_at_point", "out", "inc", "stop", 
 
 
 def verify_nuplan_format(folder: Path, report: Report) -> None:
-    """Compare every field of `devkit_readback.json`.
-
-    Args:
-        folder: Folder with `logs`, `maps` and `devkit_readback.json`.
-        report: Filled with the comparisons.
-    """
+    """Compare every field of `devkit_readback.json` with what is in `logs` and `maps`."""
     path = folder / "devkit_readback.json"
     expected = read_fields(path, report, "readback")
     logs = sorted((folder / "logs").glob("*.db"))

@@ -12,17 +12,16 @@ from shiftsim.verify.files import Groups, Source, read_json
 from shiftsim.verify.nuplan.maps import METRES, RADIANS, verify_maps
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS
+from shiftsim.verify.worlds import ego_columns, object_columns
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, LightStatus, center_poses
+from shiftsim.world.state import LightStatus
 
 POSE = np.array([METRES, METRES, RADIANS])
 _EGO = {
     **dict.fromkeys(("x", "y", "center_x", "center_y"), METRES),
     **dict.fromkeys(("heading", "center_heading"), RADIANS),
 }
-_BOX = ("x", "y", "heading", "vx", "vy", "length", "width", "height")
 # What log_ego holds: name -> samples asked for, horizon in rows, direction, from which iteration.
 _EXCERPTS = {
     "past_2s": (20, 40, -1, 0),
@@ -34,12 +33,7 @@ _ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples 
 
 
 def verify_nuplan_import(folder: Path, report: Report) -> None:
-    """Compare maps, logged ego states, objects, lights and scene facts with the official ones.
-
-    Args:
-        folder: Folder with `scenes.json`, `logs`, `maps` and `expected`.
-        report: Filled with the comparisons.
-    """
+    """Compare maps, logged ego states, objects, lights and scene facts with the official ones."""
     scenes, expected = Scenes(folder), folder / "expected"
     verify_maps(expected, scenes.maps, report)
     ego = Groups(expected / "log_ego.parquet", report, ("scene", "kind"))
@@ -162,44 +156,17 @@ def _compare_ego(key: tuple[str, str], scene: Scenario, ego: Groups) -> None:
     if key[1] in _EXCERPTS:
         num, horizon, direction, iteration = _EXCERPTS[key[1]]
         rows = excerpt_rows(scene, int(rows[iteration]), num, horizon, direction)
-    states = scene.ego[rows]
-    ours = {
-        "index": np.arange(len(rows)),
-        "time_us": scene.time_us[rows],
-        **dict(zip(EGO_COLUMNS, states.T, strict=True)),
-        **dict(zip(CENTER_COLUMNS, center_poses(states[:, :3]).T, strict=True)),
-    }
-    ego.match(key, ours, _EGO)
+    samples = {"index": np.arange(len(rows)), "time_us": scene.time_us[rows]}
+    ego.match(key, {**samples, **ego_columns(scene.ego[rows])}, _EGO)
 
 
 def _compare_objects(key: tuple[str, ...], scene: Scenario, log: Log, objects: Groups) -> None:
     """Objects of every sample, in nuPlan's order, with their heights (which only the log has)."""
     sampled = np.searchsorted(log.time_us, scene.iteration_times[:-1])
     boxes = read_boxes(log, int(sampled[0]), int(sampled[-1]) + 1)
-    chosen = np.flatnonzero(np.isin(boxes.row, sampled))
-    kinds, values = boxes.kind[chosen], boxes.values[chosen].copy()
-    static = kinds > AgentKind.BICYCLE
-    values[static, 3:5] = 0.0  # static objects have no velocity, which the table shows as 0
-    ours = {
-        "iteration": np.searchsorted(sampled, boxes.row[chosen]),
-        "track_token": [boxes.token[index] for index in chosen.tolist()],
-        "type": [AgentKind(kind).name for kind in kinds.tolist()],
-        **dict(zip(_BOX, values.T, strict=True)),
-    }
-    objects.match(key, ours, _EGO)
-    # the dense tracks of the scenario hold the same boxes in the same order
     tracks = scene.tracks.rows(scene.iteration_rows[:-1])
-    frame, track = np.nonzero(tracks.valid)
-    parts = (tracks.poses, tracks.velocities, tracks.sizes)
-    dense = np.column_stack([part[frame, track] for part in parts])
-    values[static, 3:5] = np.nan
-    names = [tracks.tokens[index] for index in track.tolist()]
-    for name, mine, listed in (
-        ("iteration", frame, ours["iteration"]),
-        ("track_token", names, ours["track_token"]),
-        ("values", dense, values[:, :7]),
-    ):
-        objects.table.report.compare(f"dense tracks {name}", key[0], mine, listed)
+    heights = {"height": boxes.values[np.isin(boxes.row, sampled), 7]}
+    objects.match(key, object_columns(tracks, *np.nonzero(tracks.valid)) | heights, _EGO)
 
 
 def _compare_lights(name: str, scene: Scenario, table: Groups) -> None:

@@ -23,9 +23,9 @@ _QUERY = {
     "lane_curvature": 1e-9,  # 1/m; follows from coordinates, not stored in the map
 }
 _NEAR = 20.0  # m, half width of the square of the `near20` columns
-_HEADING_REACH = 0.5  # m, nuPlan's probe for the heading at an arc length
-_CURVATURE_REACH = 2.0  # m, nuPlan's spacing of the three points of a curvature
-_FLAT = 1e-6  # m^4, nuPlan: 16 times the squared triangle area below which a curvature is 0
+_HEADING_REACH = 0.5  # m, distance of the probe for a heading
+_CURVATURE_REACH = 2.0  # m, spacing of the three points of a curvature
+_FLAT = 1e-6  # m^4, 16 times the squared area of their triangle below which it is 0
 _LINES = {
     "baseline": "baselines",
     "left_boundary": "left_boundaries",
@@ -236,6 +236,7 @@ def _heading_at(lines: Polylines, line: int, arc: float) -> float:
 
 
 def _curvature_at(lines: Polylines, line: int, arc: float) -> float:
+    # nuPlan rule 605: of a circle through three points, the middle one kept off the ends
     reach, length = _CURVATURE_REACH, lines.length(line)
     middle = length / 2.0 if length < 2.0 * reach else min(max(arc, reach), length - reach)
     reach = min(reach, length / 2.0)

@@ -12,14 +12,15 @@ from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.worlds import (
-    CENTER_COLUMNS,
+    BOX_COLUMNS,
     EGO_COLUMNS,
+    ego_columns,
     ego_states,
     make_tracks,
     recorded_log,
 )
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import AgentKind, Tracks, center_poses
+from shiftsim.world.state import AgentKind, Tracks
 
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 PROFILE_KEY = (*RUN_KEY, "thresholds")
@@ -59,14 +60,9 @@ def verify_nuplan_metrics(
     *,
     logged: Path | None = None,
 ) -> None:
-    """Score the recorded rollout of every run of `ego.parquet`.
+    """Score the recorded rollout of every run of `ego.parquet` (of one mode).
 
-    Args:
-        expected: Folder with the tables of the runs.
-        report: Filled with the comparisons.
-        scenes: The scenes.
-        mode: Only runs of this challenge (`NR`, `R`, `PT`).
-        logged: Folder with the tables of the logs, if that is another one.
+    `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
     runs = Groups(expected / "ego.parquet", report)
     tables = {n: Groups(expected / f"{n}.parquet", report, key) for n, key in _TABLES.items()}
@@ -101,9 +97,9 @@ def _measure(
     tracks = Tracks.empty(len(ego)) if objects is None else tracks_of(objects, len(ego))
     stamps = rows["time_us"].astype(np.int64), expert["time_us"].astype(np.int64)
     log = recorded_log(run[0], stamps[0], ego, tracks, stamps[1], logged)
-    centers = dict(zip(CENTER_COLUMNS, center_poses(ego[:, :3]).T, strict=True))
-    count = len(logged) - 1
-    ours = {"iteration": np.arange(count), "time_us": stamps[1][:count], **centers}
+    columns, count = ego_columns(ego), len(logged) - 1
+    ours = {"iteration": np.arange(count), "time_us": stamps[1][:count]}
+    ours |= {name: columns[name] for name in _RECORDED}
     rows.match(where, ours, _RECORDED, quantity="recorded")
     return measure(log, road)
 
@@ -125,8 +121,7 @@ def tracks_of(rows: Source, count: int) -> Tracks:
         raise DataError("an object occurs twice at one iteration")
     if iteration.min() < 0 or iteration.max() >= count:
         raise DataError(f"objects at iteration {iteration.max()}, ego at {count} iterations")
-    names = ("x", "y", "heading", "vx", "vy", "length", "width")
-    values = np.column_stack([rows[name].astype(np.float64) for name in names])
+    values = np.column_stack([rows[name].astype(np.float64) for name in BOX_COLUMNS])
     listed = [kinds[token] for token in tokens]
     return make_tracks((count, len(tokens)), (iteration, track), values, listed, tokens)
 

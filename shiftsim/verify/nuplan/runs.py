@@ -20,9 +20,9 @@ from shiftsim.verify.files import TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import known_scores
 from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import CENTER_COLUMNS, EGO_COLUMNS, ego_states
+from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, Trajectory, center_poses
+from shiftsim.world.state import AgentKind, Tracks, Trajectory
 
 EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
 # m, rad, m/s; the README of the folder allows 1e-3 m
@@ -45,14 +45,9 @@ def verify_simulation(
     *,
     logged: Path | None = None,
 ) -> None:
-    """Simulate every run of `ego.parquet` and compare states, reactive objects and scores.
+    """Simulate every run of `ego.parquet` (of one mode) and compare states, objects and scores.
 
-    Args:
-        folder: Folder with the tables of the runs; scripts are in `scripted.parquet` beside it.
-        report: Filled with the comparisons.
-        scenes: The scenarios by scene name.
-        mode: Only runs of this challenge.
-        logged: Folder with the table of logged objects, if that is another one.
+    `scripted.parquet` is beside the folder; `logged` has the table of logged objects.
     """
     runs = Groups(folder / "ego.parquet", report)
     objects = Groups(folder / "objects.parquet", report)
@@ -65,39 +60,29 @@ def verify_simulation(
             continue
         with report.attempt("simulation", where):
             controller, traffic = CHALLENGES[challenge]
-            name, args = reference_planner(planner, folder.parent)
-            driver = load_planner(name, args)
+            spec, args = planner.replace("_", "-"), {}
+            if planner.startswith(_SCRIPTED):
+                args = {"file": str(folder.parent / "scripted.parquet")}
+                spec, args["name"] = "scripted", planner.removeprefix(_SCRIPTED)
+            driver = load_planner(spec, args)
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
-            _compare_ego(where, log, runs[key])
+            samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
+            ours = {**samples, **ego_columns(log.ego)}
+            runs[key].match(where, ours, EGO_TOLERANCES, quantity="ego")
             if challenge == "R":
                 heights = _heights(replayed.get(scene, "NR", "*"))
                 _compare_objects(key, log, objects, heights)
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                ours = {name: [s] for name, s in known_scores(judge(measured, profile)).items()}
-                theirs, at = scores[*key, thresholds], f"{where} {thresholds}"
-                theirs.match(at, ours, TOLERANCE, quantity="simulated score")
+                found = known_scores(judge(measured, profile))
+                scores[*key, thresholds].match(
+                    f"{where} {thresholds}",
+                    {name: [score] for name, score in found.items()},
+                    TOLERANCE,
+                    quantity="simulated score",
+                )
     if mode in (None, "R"):
         objects.table.finish()
-
-
-def reference_planner(name: str, folder: Path) -> tuple[str, dict[str, str]]:
-    """Our planner and its arguments for a planner name of the reference."""
-    if name.startswith(_SCRIPTED):
-        file = str(folder / "scripted.parquet")
-        return "scripted", {"file": file, "name": name.removeprefix(_SCRIPTED)}
-    return name.replace("_", "-"), {}
-
-
-def _compare_ego(where: str, log: SimulationLog, rows: Source) -> None:
-    centers = center_poses(log.ego[:, :3])
-    ours = {
-        "iteration": np.arange(len(log.time_us)),
-        "time_us": log.time_us,
-        **dict(zip(EGO_COLUMNS, log.ego.T, strict=True)),
-        **dict(zip(CENTER_COLUMNS, centers.T, strict=True)),
-    }
-    rows.match(where, ours, EGO_TOLERANCES, quantity="ego")
 
 
 def _heights(rows: Source | None) -> dict[tuple[int, str], float]:
@@ -118,35 +103,18 @@ def _compare_objects(
     orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
     track = np.concatenate(orders)
-    kinds, tokens = tracks.kinds[track], [tracks.tokens[i] for i in track.tolist()]
-    velocities = np.where(
-        kinds[:, None] > LAST_AGENT_KIND, 0.0, tracks.velocities[iteration, track]
-    )
+    ours = object_columns(tracks, iteration, track)
     # of vehicles as in the first frame, of others as replayed
-    first = np.where(kinds == AgentKind.VEHICLE, 0, iteration).tolist()
-    ours = {
-        "iteration": iteration,
-        "track_token": tokens,
-        "type": [AgentKind(kind).name for kind in kinds],
-        **dict(zip(("x", "y", "heading"), tracks.poses[iteration, track].T, strict=True)),
-        **dict(zip(("length", "width"), tracks.sizes[iteration, track].T, strict=True)),
-        **dict(zip(("vx", "vy"), velocities.T, strict=True)),
-        "height": [heights.get(pair, np.nan) for pair in zip(first, tokens, strict=True)],
-    }
+    first = np.where(tracks.kinds[track] == AgentKind.VEHICLE, 0, iteration).tolist()
+    pairs = zip(first, ours["track_token"], strict=True)
+    ours["height"] = [heights.get(pair, np.nan) for pair in pairs]
     objects.match(key, ours, OBJECT_TOLERANCES, quantity="reactive")
 
 
 def verify_planners(
     folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
 ) -> None:
-    """Plan again at every iteration of `trajectories.parquet` and compare the states.
-
-    Args:
-        folder: Folder with the tables of the runs.
-        report: Filled with the comparisons.
-        scenes: The scenarios by scene name.
-        mode: Only runs of this challenge.
-    """
+    """Plan again at every iteration of `trajectories.parquet` (of one mode) and compare states."""
     plans = Groups(folder / "trajectories.parquet", report)
     egos = Groups(folder / "ego.parquet", report)
     objects = Groups(folder / "objects.parquet", report)

@@ -14,14 +14,7 @@ from shiftsim.verify.scenes import Scenes
 def verify_pdm(
     folder: Path, report: Report, *, mode: str | None = None, scenes: Path | None = None
 ) -> None:
-    """Compare every file of the folder.
-
-    Args:
-        folder: Folder with `kernels`, `routes.json`, `idm_calls.json` and `loop`, or some of them.
-        report: Filled with the comparisons.
-        mode: Only closed loops of this challenge (`NR` or `R`).
-        scenes: Folder with the logs and maps, by default `nuplan` beside `folder`.
-    """
+    """Compare every file of the folder; arguments as for `shiftsim.verify.verify`."""
     known = Scenes(scenes or folder.resolve().parent / "nuplan")
 
     def with_scenes(path: Path) -> None:

@@ -17,13 +17,7 @@ from shiftsim.world.state import VX, VY, AgentKind, LightStatus
 
 
 def verify_idm_calls(path: Path, report: Report, scenes: Mapping[str, Scenario]) -> None:
-    """Repeat every recorded call from the scene's log and compare inputs and outputs.
-
-    Args:
-        path: The file.
-        report: Filled with the comparisons.
-        scenes: The scenarios by scene name; calls of other scenes are named as not covered.
-    """
+    """Repeat every recorded call from the scene's log; those of unknown scenes are not covered."""
     planners: dict[tuple[str, int], Idm] = {}
     for content in read_json(path):
         call = Source("idm_calls.json", "field", content, report)

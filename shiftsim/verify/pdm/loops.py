@@ -24,8 +24,7 @@ from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 
-PLAN_POSITION, PLAN_HEADING = 2e-5, 1e-6  # m, rad: stored as 32 bit floats
-PLAN_TOLERANCES = np.array([PLAN_POSITION, PLAN_POSITION, PLAN_HEADING])
+PLAN_TOLERANCES = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: stored as 32 bit floats
 _TABLES = (
     "metrics",
     "statistics",
@@ -48,14 +47,7 @@ _DRIVEN = {  # column of proposals.parquet → index in a state row
 
 
 def verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None = None) -> None:
-    """Compare every run of the folder.
-
-    Args:
-        folder: The `loop` folder.
-        report: Receives the comparisons.
-        scenes: The scenes.
-        mode: Only runs of this challenge.
-    """
+    """Compare every run (of one mode) of the `loop` folder."""
     verify_calls(folder, report, scenes, mode)
     logged = scenes.folder / "expected"
     verify_nuplan_metrics(folder, report, scenes, mode, logged=logged)
@@ -65,7 +57,7 @@ def verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None 
 def verify_calls(
     folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
 ) -> None:
-    """Make every planning call again from the recorded ego state; arguments as above."""
+    """Make every planning call again from the recorded ego state."""
     egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
     steps = Groups(folder / "steps.parquet", report, _CALL)
     proposals = Groups(folder / "proposals.parquet", report, _CALL)

@@ -25,13 +25,7 @@ from shiftsim.world.state import NUM_STATE, PACIFICA, center_poses
 
 
 def verify_routes(path: Path, report: Report, scenes: Mapping[str, Scenario]) -> None:
-    """Correct every route again and compare.
-
-    Args:
-        path: The file.
-        report: Receives the comparisons.
-        scenes: The scenarios by scene name; cases of other scenes are named as not covered.
-    """
+    """Correct every route again and compare; those of unknown scenes are not covered."""
     for number, content in enumerate(read_json(path)):
         case = Source("routes.json", "field", content, report)
         case.note("label", "route_name", "pose_name")

@@ -24,9 +24,9 @@ from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.contacts import Others, touches_boxes
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
-from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, read_fields
+from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, read_fields, read_json
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import make_tracks
+from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
 from shiftsim.world.layers import make_polygons
 from shiftsim.world.state import HEADING, PACIFICA, VX, VY, X, Y, center_poses
 
@@ -45,7 +45,6 @@ SCORE_COLUMNS = {  # column of the reference: field of `Scores`, tolerance
     "collision_idx": ("collision_index", EXACT),
     "ttc_idx": ("ttc_index", EXACT),
 }
-_OBJECT = ("x", "y", "heading", "vx", "vy", "length", "width")
 
 
 class Planned(NamedTuple):
@@ -64,10 +63,10 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     Args:
         report: Receives the comparisons.
         facts: Takes what `step_core_summary.json` lists of the steps, by name of the step.
-        path: The `.npz`; its inputs are in the `.json` beside it.
+        path: The `.json` with its inputs; its outputs are in the `.npz` beside it.
     """
-    inputs = read_fields(path.with_suffix(".json"), report, "step_NNN.json")
-    file, where = read_arrays(path, report, "PDM"), path.stem
+    inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
+    file = read_arrays(path.with_suffix(".npz"), report, "PDM")
     planned, collided = _plan(inputs)
     boxes = planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
     times = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
@@ -106,10 +105,9 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
 def _plan(inputs: Source) -> tuple[Planned, list[str]]:
     ego = np.array(inputs["ego_state"], np.float64)
     things, parts = inputs.each("objects"), inputs.each("drivable")
-    values = np.array([[thing[name] for name in _OBJECT] for thing in things], np.float64)
+    values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
     kinds, names = ([thing[name] for thing in things] for name in ("type", "token"))
-    whole = (slice(None),)
-    tracks = make_tracks((1, len(things)), whole, values.reshape(1, -1, 7), kinds, names)
+    tracks = make_tracks((1, len(things)), ..., values.reshape(1, -1, 7), kinds, names)
     center = center_poses(ego[None, :3])[0]
     chosen = select_tracks(tracks, center[0], center[1], set(), DEFAULT)
     ids, reds = [part["id"] for part in parts], inputs["red_light_lane_ids"]
@@ -230,9 +228,9 @@ def _unstable(driven: FloatArray, others: Others) -> dict[int, float]:
     return out
 
 
-def verify_summary(report: Report, facts: dict[str, dict[str, Any]], entries: Any) -> None:
+def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
     """Compare the entries of `step_core_summary.json` with what the steps came to."""
-    for entry in entries:
+    for entry in read_json(path):
         name = entry.get("case", "?")
         theirs = Source("step_core_summary.json", "field", entry, report)
         theirs.note("label", "case")
