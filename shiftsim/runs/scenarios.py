@@ -110,7 +110,6 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
 
     columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
     used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
-    from shiftsim.data.store.writing import StoreWriter, window_row
 
     with StoreWriter(target) as writer:
         for city in sorted({city for _, _, city in used}):
