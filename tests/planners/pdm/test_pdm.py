@@ -11,13 +11,11 @@ from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straigh
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.corridors import HIT
-from shiftsim.geometry.paths import make_path, project
+from shiftsim.geometry.paths import make_path
 from shiftsim.planners.pdm.corridor import corridor_shape, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
 from shiftsim.planners.pdm.planner import PdmClosed
-from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
-from shiftsim.planners.proposals.tracker import fit_speed
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
@@ -169,24 +167,6 @@ def test_the_speed_limit_of_zero_gives_a_plan_without_numbers_that_are_not_finit
     assert np.isfinite(plan.states).all()
 
 
-def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
-    poses = np.cumsum(rng.uniform(-0.1, 1.0, (41, 3)) * [1.0, 1.0, 0.1], axis=0)
-    dt, penalty = 0.1, 1e-4
-    # unknowns v_0, a_0 … a_38; rows of R are a_0 … a_36 and the last difference
-    unknowns = np.hstack([np.ones((40, 1)), dt * np.tri(40, 39, -1)])
-    rows = [dt * np.cos(poses[:-1, 2])[:, None] * unknowns]
-    rows += [dt * np.sin(poses[:-1, 2])[:, None] * unknowns]
-    matrix = np.vstack(rows)
-    right = np.concatenate([np.diff(poses[:, 0]), np.diff(poses[:, 1])])
-    regular = np.zeros((38, 40))
-    regular[np.arange(37), np.arange(1, 38)] = 1.0
-    regular[37, 38], regular[37, 39] = -1.0, 1.0
-    solved = np.linalg.solve(matrix.T @ matrix + penalty * regular.T @ regular, matrix.T @ right)
-    out = np.empty(40)
-    fit_speed(poses, dt, penalty, out)
-    np.testing.assert_allclose(out, unknowns @ solved, rtol=0, atol=1e-9)
-
-
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
@@ -207,48 +187,6 @@ def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
             polygon.intersects(shapely.Polygon(ring_of(forecast, i, row))) for i in range(40)
         ]
         np.testing.assert_array_equal(corridor.sides[row] == HIT, touches)
-
-
-@settings(max_examples=30)
-@given(st.integers(0, 2**32 - 1))
-def test_projection_is_the_nearest_point_of_the_line(seed):
-    rng = np.random.default_rng(seed)
-    xy = np.cumsum(rng.normal(0.0, 1.0, (50, 2)), axis=0)
-    path = make_path(np.column_stack([xy, np.zeros(50)]))
-    line = shapely.LineString(xy)
-    for point in rng.uniform(-12, 12, (20, 2)):
-        progress, distance, _ = project(path, *point, int(rng.integers(0, 7)))
-        assert distance == pytest.approx(line.distance(shapely.Point(point)), abs=1e-9)
-        at = line.interpolate(progress)
-        assert at.distance(shapely.Point(point)) == pytest.approx(distance, abs=1e-9)
-
-
-def test_areas_and_their_order_are_those_of_the_map():
-    road = straight_road()
-    areas = make_areas(road, [1, 3])
-    selected = select_areas(road, 195.0, 0.0, 10.0)
-    ids = [road.edges.ids[i] for i in selected]
-    assert ids == ["10", "11", "20", "21"]
-    found = np.empty(8, np.int64)
-    for x, y, expected in (
-        (195.0, 0.0, ["11"]),
-        (200.0, 0.0, ["11", "21"]),
-        (195.0, 1.75, ["10", "11"]),
-        (195.0, 5.3, []),
-    ):
-        under = found[: covering(areas, selected, x, y, found)]
-        assert [road.edges.ids[i] for i in under] == expected
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 2**32 - 1))
-def test_ranks_are_the_order_in_which_a_spatial_index_yields_boxes(seed):
-    rng = np.random.default_rng(seed)
-    low = rng.uniform(0, 100, (60, 2))
-    bounds = np.hstack([low, low + rng.uniform(1, 30, (60, 2))])
-    tree = shapely.STRtree(shapely.box(*bounds.T), node_capacity=10)
-    yielded = tree.query(shapely.box(30, 30, 60, 60), predicate="intersects")
-    assert (np.diff(index_ranks(bounds)[yielded]) > 0).all()
 
 
 def test_the_nearest_of_each_kind_are_seen_static_objects_first():

@@ -1,0 +1,56 @@
+"""Areas and the tracker of proposals, against slow obvious versions."""
+
+import numpy as np
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import straight_road
+
+from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
+from shiftsim.planners.proposals.tracker import fit_speed
+
+
+def test_areas_and_their_order_are_those_of_the_map():
+    road = straight_road()
+    areas = make_areas(road, [1, 3])
+    selected = select_areas(road, 195.0, 0.0, 10.0)
+    ids = [road.edges.ids[i] for i in selected]
+    assert ids == ["10", "11", "20", "21"]
+    found = np.empty(8, np.int64)
+    for x, y, expected in (
+        (195.0, 0.0, ["11"]),
+        (200.0, 0.0, ["11", "21"]),
+        (195.0, 1.75, ["10", "11"]),
+        (195.0, 5.3, []),
+    ):
+        under = found[: covering(areas, selected, x, y, found)]
+        assert [road.edges.ids[i] for i in under] == expected
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_ranks_are_the_order_in_which_a_spatial_index_yields_boxes(seed):
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(0, 100, (60, 2))
+    bounds = np.hstack([low, low + rng.uniform(1, 30, (60, 2))])
+    tree = shapely.STRtree(shapely.box(*bounds.T), node_capacity=10)
+    yielded = tree.query(shapely.box(30, 30, 60, 60), predicate="intersects")
+    assert (np.diff(index_ranks(bounds)[yielded]) > 0).all()
+
+
+def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
+    poses = np.cumsum(rng.uniform(-0.1, 1.0, (41, 3)) * [1.0, 1.0, 0.1], axis=0)
+    dt, penalty = 0.1, 1e-4
+    # unknowns v_0, a_0 … a_38; rows of R are a_0 … a_36 and the last difference
+    unknowns = np.hstack([np.ones((40, 1)), dt * np.tri(40, 39, -1)])
+    rows = [dt * np.cos(poses[:-1, 2])[:, None] * unknowns]
+    rows += [dt * np.sin(poses[:-1, 2])[:, None] * unknowns]
+    matrix = np.vstack(rows)
+    right = np.concatenate([np.diff(poses[:, 0]), np.diff(poses[:, 1])])
+    regular = np.zeros((38, 40))
+    regular[np.arange(37), np.arange(1, 38)] = 1.0
+    regular[37, 38], regular[37, 39] = -1.0, 1.0
+    solved = np.linalg.solve(matrix.T @ matrix + penalty * regular.T @ regular, matrix.T @ right)
+    out = np.empty(40)
+    fit_speed(poses, dt, penalty, out)
+    np.testing.assert_allclose(out, unknowns @ solved, rtol=0, atol=1e-9)
