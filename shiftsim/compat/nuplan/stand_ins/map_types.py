@@ -38,36 +38,20 @@ class SemanticMapLayer(IntEnum):
         return cls[layer]
 
 
-class LaneConnectorType(IntEnum):
-    """Where a lane connector turns."""
-
-    STRAIGHT = 0
-    LEFT = 1
-    RIGHT = 2
-    UTURN = 3
-    UNKNOWN = 4
-
-
-class StopLineType(IntEnum):
-    """Why one stops at a stop line."""
-
-    PED_CROSSING = 0
-    STOP_SIGN = 1
-    TRAFFIC_LIGHT = 2
-    TURN_STOP = 3
-    YIELD = 4
-    UNKNOWN = 5
-
-
-class IntersectionType(IntEnum):
-    """Kind of an intersection."""
-
-    DEFAULT = 0
-    TRAFFIC_LIGHT = 1
-    STOP_SIGN = 2
-    LANE_BRANCH = 3
-    LANE_MERGE = 4
-    PASS_THROUGH = 5
+# numbered from 0, as in nuPlan's map
+LaneConnectorType = IntEnum(
+    "LaneConnectorType", ["STRAIGHT", "LEFT", "RIGHT", "UTURN", "UNKNOWN"], start=0
+)
+StopLineType = IntEnum(
+    "StopLineType",
+    ["PED_CROSSING", "STOP_SIGN", "TRAFFIC_LIGHT", "TURN_STOP", "YIELD", "UNKNOWN"],
+    start=0,
+)
+IntersectionType = IntEnum(
+    "IntersectionType",
+    ["DEFAULT", "TRAFFIC_LIGHT", "STOP_SIGN", "LANE_BRANCH", "LANE_MERGE", "PASS_THROUGH"],
+    start=0,
+)
 
 
 class TrafficLightStatusType(IntEnum):
