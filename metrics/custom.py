@@ -1,4 +1,4 @@
-"""Own metrics: callables `(log, road) -> float | MetricRow`, reported beside the official ones."""
+"""Custom metrics: `(log, road) -> float | MetricRow`, reported beside the official ones."""
 
 import importlib
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ def add_metrics(
     road: VectorMap,
     metrics: Sequence[str | CustomMetric],
 ) -> MetricResult:
-    """The same result with the rows of own metrics in `extra`; the score stays as it is.
+    """The same result with the rows of custom metrics in `extra`; the score stays as it is.
 
     Raises:
         ConfigError: A metric cannot be loaded, or two rows have the same name.
@@ -50,7 +50,7 @@ def add_metrics(
     taken = {*result.scores, *SHORT_NAMES}
     for row in rows:
         if row.metric in taken:
-            raise ConfigError(f"metric name {row.metric!r} is taken", "rename the own metric")
+            raise ConfigError(f"metric name {row.metric!r} is taken", "rename the custom metric")
         taken.add(row.metric)
     return replace(result, extra=tuple(rows))
 

@@ -1,6 +1,6 @@
 """SimulationLog: the arrays of one finished rollout, nothing else.
 
-Metrics, results and pictures are made from it. It holds K = T - 1 samples for a scenario of T
+Metrics, results and pages are made from it. It holds K = T - 1 samples for a scenario of T
 iterations: the state reached after the last planner call is never stored.
 """
 

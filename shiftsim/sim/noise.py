@@ -25,7 +25,7 @@ OU_THETA = 2.0  # 1/s, of the state-drift benchmark
 
 
 class NoiseFunction(Protocol):
-    """An own noise model: any callable with this signature, named `module:attribute`."""
+    """A custom noise model: any callable with this signature, named `module:attribute`."""
 
     def __call__(
         self, accel: np.random.Generator, steering: np.random.Generator, num_steps: int, dt: float
@@ -92,11 +92,11 @@ def parse_noise(name: str) -> NoiseModel:
     """The noise model of a name.
 
     Args:
-        name: One of `NOISE_NAMES`, or `module:attribute` of an own model: a `NoiseFunction` or a
+        name: One of `NOISE_NAMES`, or `module:attribute` of a custom model: a `NoiseFunction` or a
             `NoiseModel`.
 
     Raises:
-        ConfigError: The name is unknown, or the own model cannot be imported.
+        ConfigError: The name is unknown, or the custom model cannot be imported.
     """
     if ":" in name:
         return _load_noise(name)
@@ -125,7 +125,7 @@ def sample_noise(
         sigma is 0.
 
     Raises:
-        ConfigError: The name is unknown, or an own model returned something else than (T, 2)
+        ConfigError: The name is unknown, or a custom model returned something else than (T, 2)
             finite numbers.
     """
     if isinstance(model, str):

@@ -35,7 +35,7 @@ def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatA
         line: (K, 2) vertices, at least 2 [m].
         distance: Half width of the buffer [m].
         keep: (K,) scratch.
-        out: (V, 2) room for the curve [m].
+        out: (V, 2) receives the curve [m].
 
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.

@@ -27,8 +27,8 @@ from shiftsim.sim.traffic.idm.scene import (
 from shiftsim.sim.traffic.idm.step import (
     BEGIN,
     DONE,
+    LEFT_PATH,
     LONGER_PATHS,
-    STRAYED,
     advance,
     write_agents,
 )
@@ -105,7 +105,7 @@ class IdmTraffic:
         end, what, first = -1, 0, BEGIN
         while end != DONE:
             end, what = advance(scene, ego, row_of(tracks, row), self._spans[iteration], first)
-            if end == STRAYED:
+            if end == LEFT_PATH:
                 raise TrafficError(
                     f"reactive agent {tracks.tokens[scene.agents[what]]} is outside of its own "
                     f"path at iteration {iteration + 1}",

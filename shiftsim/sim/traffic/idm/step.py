@@ -12,7 +12,7 @@ from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY
 
-DONE, LONGER_PATHS, LONGER_CURVES, STRAYED = 0, 1, 2, 3  # how a step ends
+DONE, LONGER_PATHS, LONGER_CURVES, LEFT_PATH = 0, 1, 2, 3  # how a step ends
 BEGIN = -1  # instead of the agent that an interrupted step goes on with
 _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
@@ -30,7 +30,7 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
 
     Returns:
         DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
-        agent whose footprint needs more, to go on with; STRAYED and the agent that is outside of
+        agent whose footprint needs more, to go on with; LEFT_PATH and the agent that is outside of
         its own corridor.
     """
     fleet, agents = scene.fleet, scene.agents
@@ -53,7 +53,7 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
             # nuPlan rule 123: agents move one after the other, and see where those before them went
             lead, gap = find_lead(scene, agent)
             if lead == OFF_PATH:
-                return STRAYED, agent
+                return LEFT_PATH, agent
             _drive(scene, agent, lead, gap, ego, span)
         if move_agent(scene, agent) < 0:
             return LONGER_CURVES, agent
