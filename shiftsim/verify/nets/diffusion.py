@@ -223,15 +223,14 @@ def _compare(loop: Loop) -> None:
         **{f"feature/{name}": getattr(features, name) for name in names},
     }
     if "encoding" in loop.stored:
-        ours["encoding"] = _encoding(loop.variant, features)
+        ours["encoding"] = _encoding(loop.planner.network, features)
     loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
 
 
-def _encoding(variant: str, features: Features) -> Any:
+def _encoding(network: Any, features: Features) -> Any:
     """Tokens of the scene (107, 192)."""
     import torch
 
-    network = make_network(NAME, variant)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
         return network.encode(network.normalise(inputs))[0]
