@@ -42,7 +42,6 @@ _DERIVED = "derived columns of annotations.parquet: acceleration and angular vel
 
 
 Keys: TypeAlias = list[LaneKey]  # OpenDRIVE lanes at a point
-Rows: TypeAlias = tuple[dict[str, Any], dict[str, float]]  # columns of a table, tolerances
 
 
 class LocalMap:
@@ -122,17 +121,18 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     recording, local = read_recording(site, site.recordings[0]), LocalMap(find_map(site))
     keys = [list(local.keys_at(x, y).values()) for x, y in recording.bottom[:, :2].tolist()]
 
-    def table(compare: Callable[[int, Site, Annotations, list[Keys]], Rows], path: Path) -> None:
+    def table(
+        compare: Callable[[Source, int, Site, Annotations, list[Keys]], None], path: Path
+    ) -> None:
         groups = Groups(path, report, ("track_id",))
         for number, track in enumerate(recording.track_ids.tolist()):
-            ours, atol = compare(number, site, recording, keys)
-            groups.match((str(track),), ours, atol)
+            compare(groups[(str(track),)], number, site, recording, keys)
         groups.finish()
 
     parts: dict[str, Callable[[Path], object]] = {
         "data": lambda path: report.note(_DERIVED),
-        "expected_rows.parquet": partial(table, _rows_of),
-        "expected_20hz.parquet": partial(table, _samples_of),
+        "expected_rows.parquet": partial(table, _verify_rows),
+        "expected_20hz.parquet": partial(table, _verify_samples),
         "expected.json": lambda path: _verify_summary(
             read_fields(path, report), site, recording, keys
         ),
@@ -140,8 +140,10 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     verify_files(folder, report, parts)
 
 
-def _rows_of(number: int, site: Site, recording: Annotations, keys: list[Keys]) -> Rows:
-    """What the table of rows holds of a track, and the tolerances."""
+def _verify_rows(
+    table: Source, number: int, site: Site, recording: Annotations, keys: list[Keys]
+) -> None:
+    """Compare the rows of a track as recorded."""
     rows = np.flatnonzero(recording.track == number)
     utm = recording.bottom[rows, :2] + site.offset[:2]
     to_degrees = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True)
@@ -155,11 +157,13 @@ def _rows_of(number: int, site: Site, recording: Annotations, keys: list[Keys]) 
         **_named("utm_x utm_y", utm),
         **_named("lon lat", np.column_stack(to_degrees.transform(*utm.T))),
     }
-    return columns, {"utm_x": _UTM, "utm_y": _UTM, "": _EXACT}
+    table.match(f"track {number}", columns, {"utm_x": _UTM, "utm_y": _UTM, "": _EXACT})
 
 
-def _samples_of(number: int, site: Site, recording: Annotations, keys: list[Keys]) -> Rows:
-    """What the table of 20 Hz samples holds of a track, and the tolerances."""
+def _verify_samples(
+    table: Source, number: int, site: Site, recording: Annotations, keys: list[Keys]
+) -> None:
+    """Compare a track resampled at 20 Hz."""
     runs = find_runs(recording, ConversionConfig().max_hole_s)
     (run,) = np.flatnonzero(runs.track == number)  # of one piece
     rows = slice(runs.first[run], runs.last[run] + 1)
@@ -173,11 +177,12 @@ def _samples_of(number: int, site: Site, recording: Annotations, keys: list[Keys
     columns = {
         "step": steps.astype(np.int64),
         "t": times,
-        "yaw": samples.poses[:, 2],
         **_named("x y", np.transpose(bottom)),
         **_named("vx vy", samples.velocities),
     }
-    return columns, {"": _EXACT}
+    where, yaw = f"track {number}", samples.poses[:, 2]
+    table.match(where, columns, _EXACT)
+    table.report.compare("20 Hz yaw", where, yaw, table["yaw"], atol=_EXACT, angle=True)
 
 
 def _named(names: str, columns: np.ndarray) -> dict[str, np.ndarray]:

@@ -37,14 +37,7 @@ def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> 
 
 
 def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
-    """Compare every file of a sub-folder.
-
-    Args:
-        part: Name of the sub-folder, as in `PARTS`.
-        folder: Where its files are.
-        report: Filled with the comparisons.
-        scenes: The scenes that closed loops and routes refer to.
-    """
+    """Compare every file of a sub-folder, whose name as in `PARTS` is `part`."""
     if part not in PARTS:
         report.skip(f"{part}: nothing compares this folder")
     elif find_spec("torch") is None and part != "route_correction":

@@ -12,11 +12,7 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    make_network,
-    match_meta,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, NUM_STATE, AgentKind, Command

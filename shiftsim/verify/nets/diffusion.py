@@ -32,12 +32,7 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    make_network,
-    match_meta,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
@@ -228,15 +223,14 @@ def _compare(loop: Loop) -> None:
         **{f"feature/{name}": getattr(features, name) for name in names},
     }
     if "encoding" in loop.stored:
-        ours["encoding"] = _encoding(loop.variant, features)
+        ours["encoding"] = _encoding(loop.planner.network, features)
     loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
 
 
-def _encoding(variant: str, features: Features) -> Any:
+def _encoding(network: Any, features: Features) -> Any:
     """Tokens of the scene (107, 192)."""
     import torch
 
-    network = make_network(NAME, variant)
     with torch.inference_mode():
         inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
         return network.encode(network.normalise(inputs))[0]

@@ -148,14 +148,10 @@ def verify_loop(
     compare: Callable[[Loop], None],
     recorded: Sequence[str],
 ) -> None:
-    """Make every step of a closed loop again and compare.
+    """Make every step of a closed loop again, and `compare` it.
 
-    Args:
-        file: The file.
-        scenes: The scenes.
-        make: Makes the planner from the name of its weights.
-        compare: Compares one step.
-        recorded: Names of the arrays with a row for every plan.
+    `make` makes the planner from the name of its weights; every plan has a row in the `recorded`
+    arrays.
     """
     loop = Loop(file, _planner(make, f"deterministic:{file['meta/variant']}").fork(), scenes)
     loop.compare_scene(scenes)

@@ -17,12 +17,7 @@ from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLAN_COLUMNS, PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    OUTPUT,
-    make_network,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network, verify_manifest
 from shiftsim.verify.scenes import Scenes
 
 Arrays: TypeAlias = dict[str, np.ndarray]
@@ -80,12 +75,7 @@ def compare_features(
 ) -> None:
     """Compare what is stored of one iteration that is made before the network.
 
-    Args:
-        loop: The iteration.
-        agents: The ego and the agents.
-        road: Lanes, connectors and crosswalks.
-        route: Blocks of the corrected route.
-        others: Further features by name.
+    `route` are blocks of the corrected route, `others` further features by name.
     """
     scenario, ego = loop.scenario, loop.seen.history.ego[-1]
     ids = [*scenario.map.edges.ids, *scenario.map.crosswalks.ids]
@@ -159,9 +149,7 @@ def run_network(planner: str, network: Any, inputs: Any) -> dict[str, Any]:
 def derived_outputs(raw: Mapping[str, Any], present: Any) -> dict[str, Any]:
     """What the official network makes of its raw outputs for one scene.
 
-    Args:
-        raw: Arrays by their names in the files, without the axis of the batch.
-        present: (A, 3) poses of the agents now.
+    `present` are the (A, 3) poses of the agents now.
     """
     poses, best = headings_of(raw["trajectory"]), int(raw["probability"].argmax())
     derived = {"output_trajectory": poses.reshape(-1, *poses.shape[-2:])[best]}
@@ -243,12 +231,8 @@ def verify_vector_manifest(file: Source, scenes: Scenes, planner: str, **builder
 def compare_inputs(file: Source, planner: str, radius: float) -> None:
     """Check the arrays of a synthetic input against each other.
 
-    The network reads one of two arrays that say the same, or neither.
-
-    Args:
-        file: The file.
-        planner: Name of the planner.
-        radius: Beyond which points are not valid [m].
+    The network reads one of two arrays that say the same, or neither. Points beyond `radius` [m]
+    are not valid.
     """
     inputs = file.below("in/")
     given = {name: np.asarray(inputs[name], np.float64) for name in inputs}
@@ -326,7 +310,7 @@ def _compare(loop: Loop) -> None:
         "agent.category": np.zeros(len(features.agents.valid), np.int64),
     }
     compare_features(loop, features.agents, features.road, features.route, others)
-    raw = run_network(NAME, make_network(NAME, variant), make_batch([features], "cpu"))
+    raw = run_network(NAME, loop.planner.network, make_batch([features], "cpu"))
     ours = {name: value[0] for name, value in raw.items()}
     ours |= derived_outputs(ours, None)
     compare_outputs(loop.stored.below("net/"), loop.where, NAME, variant, ours)

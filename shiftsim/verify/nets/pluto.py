@@ -20,7 +20,7 @@ from shiftsim.verify.nets.loops import (
     Loop,
     verify_loop,
 )
-from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT
 from shiftsim.verify.nets.plantf import (
     INPUTS,
     compare_features,
@@ -122,8 +122,8 @@ def _by_place(positions: Any) -> Any:
 def _compare_network(loop: Loop) -> None:
     from shiftsim.planners.learned.pluto.network import Inputs
 
-    network, inputs = make_network(NAME, loop.variant), loop.features
-    raw = run_network(NAME, network, Inputs(*stack([inputs], "cpu")))
+    inputs = loop.features
+    raw = run_network(NAME, loop.planner.network, Inputs(*stack([inputs], "cpu")))
     ours = {name: value[0] for name, value in raw.items()}
     present = np.concatenate([inputs.position[1:, -1], inputs.heading[1:, -1:]], axis=1)
     ours |= derived_outputs(ours, present)
@@ -154,11 +154,7 @@ def _compare_choice(loop: Loop, choice: Choice) -> None:
 
 def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     """Compare what the scores of the stored proposals are, against the stored predictions."""
-    stored, scenario, ego = (
-        loop.stored.below("post/"),
-        loop.scenario,
-        loop.seen.history.ego[-1],
-    )
+    stored, scenario, ego = (loop.stored.below("post/"), loop.scenario, loop.seen.history.ego[-1])
     tokens = [scenario.tracks.tokens[track] for track in sight.agents.tracks.tolist()]
     line = nearest_line(sight.lines, ego)
     ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}

@@ -71,7 +71,7 @@ def test_everything_is_equal(scenes):
     assert report.not_covered == {}
     assert report.quantities["carl picture boundaries"].cases == 60
     assert report.quantities["carl lane_connectors"].cases == 9
-    assert report.quantities["carl next_state"].cases == 320
+    assert report.quantities["action_decode next_state"].cases == 320
 
 
 def test_every_route_is_corrected_alike(scenes):
