@@ -20,29 +20,17 @@ _HERE = Path(__file__).parent
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What a complete result of a track covers.
+    """What a complete result of a track covers."""
 
-    Attributes:
-        name: On the command line.
-        title: Of its table.
-        planners: Those that the paper compares.
-        traffic: Traffic modes, one run each.
-        noise: Noise models.
-        seeds: Seeds of the noise.
-        reference: The published list that is driven besides one's own scenarios.
-        own_thresholds: Threshold profile of one's own scenarios.
-        own_note: What scores on one's own scenarios are, and are not.
-    """
-
-    name: str
-    title: str
-    planners: tuple[str, ...]
-    traffic: tuple[str, ...]
-    noise: tuple[str, ...]
-    seeds: tuple[int, ...]
-    reference: KnownSet
-    own_thresholds: str
-    own_note: str
+    name: str  # on the command line
+    title: str  # of its table
+    planners: tuple[str, ...]  # those that the paper compares
+    traffic: tuple[str, ...]  # traffic modes, one run each
+    noise: tuple[str, ...]  # noise models
+    seeds: tuple[int, ...]  # seeds of the noise
+    reference: KnownSet  # the published list that is driven besides one's own scenarios
+    own_thresholds: str  # threshold profile of one's own scenarios
+    own_note: str  # what scores on one's own scenarios are, and are not
 
     @property
     def rollouts_per_scenario(self) -> int:

@@ -31,19 +31,12 @@ Extra = Callable[[Sequence[Group]], list[Table]]
 
 @dataclass(frozen=True)
 class Plan:
-    """A benchmark that has been checked and can start.
+    """A benchmark that has been checked and can start."""
 
-    Attributes:
-        track: The track.
-        folder: Where everything goes.
-        runs: The runs, by the name of their folder.
-        own: One's own list of scenarios as a whole.
-    """
-
-    track: Track
-    folder: Path
-    runs: Mapping[str, Prepared]
-    own: KnownSet
+    track: Track  # the track
+    folder: Path  # where everything goes
+    runs: Mapping[str, Prepared]  # the runs, by the name of their folder
+    own: KnownSet  # one's own list of scenarios as a whole
 
     @property
     def num_tasks(self) -> int:

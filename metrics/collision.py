@@ -62,17 +62,11 @@ class FlatTracks(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """First contact with each of N tracks.
+    """First contact with each of N tracks."""
 
-    Attributes:
-        first: (N,) sample, K where there is none.
-        types: (N,) position in `COLLISION_TYPES`; meaningless where there is none.
-        delta_v: (N,) [m/s]; meaningless where there is none.
-    """
-
-    first: IntArray
-    types: IntArray
-    delta_v: FloatArray
+    first: IntArray  # (N,) sample, K where there is none
+    types: IntArray  # (N,) position in `COLLISION_TYPES`; meaningless where there is none
+    delta_v: FloatArray  # (N,) [m/s]; meaningless where there is none
 
 
 def flat_ego(states: FloatArray, vehicle: VehicleParameters) -> Ego:

@@ -26,25 +26,15 @@ _SMOOTH_INTERIOR = np.array([-3.0, 3.0, 7.0, 9.0, 9.0, 7.0, 3.0, -3.0]) / 32.0
 
 
 class ComfortSignals(NamedTuple):
-    """Processed signals of one rollout, all (K,).
+    """Processed signals of one rollout, all (K,)."""
 
-    Attributes:
-        lon_accel: Smoothed longitudinal acceleration at the centre [m/s^2].
-        lat_accel: Smoothed lateral acceleration at the centre [m/s^2].
-        mag_accel: Smoothed magnitude of the acceleration at the rear axle [m/s^2].
-        lon_jerk: Derivative of `lon_accel` [m/s^3].
-        mag_jerk: Derivative of `mag_accel` [m/s^3].
-        yaw_rate: First derivative of the heading [rad/s].
-        yaw_accel: Second derivative of the heading [rad/s^2].
-    """
-
-    lon_accel: FloatArray
-    lat_accel: FloatArray
-    mag_accel: FloatArray
-    lon_jerk: FloatArray
-    mag_jerk: FloatArray
-    yaw_rate: FloatArray
-    yaw_accel: FloatArray
+    lon_accel: FloatArray  # smoothed longitudinal acceleration at the centre [m/s^2]
+    lat_accel: FloatArray  # smoothed lateral acceleration at the centre [m/s^2]
+    mag_accel: FloatArray  # smoothed magnitude of the acceleration at the rear axle [m/s^2]
+    lon_jerk: FloatArray  # derivative of `lon_accel` [m/s^3]
+    mag_jerk: FloatArray  # derivative of `mag_accel` [m/s^3]
+    yaw_rate: FloatArray  # first derivative of the heading [rad/s]
+    yaw_accel: FloatArray  # second derivative of the heading [rad/s^2]
 
 
 # What is bounded, in nuPlan's order: devkit metric name -> signal. `bounds_of` has the same order.

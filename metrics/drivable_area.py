@@ -17,15 +17,10 @@ CORNERS_NAME = "corners_in_drivable_area"
 
 
 class DrivableArea(NamedTuple):
-    """Corners that leave the drivable area.
+    """Corners that leave the drivable area."""
 
-    Attributes:
-        outside: (K, 4) whether a corner is in no lane, connector or drivable area.
-        distances: (K, 4) how far outside it is, 0 inside [m].
-    """
-
-    outside: BoolArray
-    distances: FloatArray
+    outside: BoolArray  # (K, 4) whether a corner is in no lane, connector or drivable area
+    distances: FloatArray  # (K, 4) how far outside it is, 0 inside [m]
 
 
 def measure(

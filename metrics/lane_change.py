@@ -16,20 +16,14 @@ NAME = "ego_lane_change"
 
 @dataclass(frozen=True, slots=True)
 class LaneChanges:
-    """Lane changes of one rollout.
+    """Lane changes of one rollout."""
 
-    Attributes:
-        states: (K,) number of edges that hold all corners, connected ones included; 0 when the
-            ego is entirely outside lanes, -1 when its corners have none in common.
-        start: (L,) opening sample of each change.
-        end: (L,) closing sample.
-        failed: (L,) whether the ego came back, left the road, or did not finish.
-    """
-
+    # (K,) number of edges that hold all corners, connected ones included; 0 when the ego is
+    # entirely outside lanes, -1 when its corners have none in common
     states: IntArray
-    start: IntArray
-    end: IntArray
-    failed: BoolArray
+    start: IntArray  # (L,) opening sample of each change
+    end: IntArray  # (L,) closing sample
+    failed: BoolArray  # (L,) whether the ego came back, left the road, or did not finish
 
     @property
     def is_common(self) -> BoolArray:

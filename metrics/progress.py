@@ -26,16 +26,11 @@ class Progress:
     """Progress along the expert's route.
 
     nuPlan rule 71: the expert has one sample more than the ego.
-
-    Attributes:
-        ego: (K,) progress of each sample over the one before [m].
-        expert: (T,) the same of the expert [m].
-        has_route: Whether the expert drove on any lane; without, both are all zero.
     """
 
-    ego: FloatArray
-    expert: FloatArray
-    has_route: bool
+    ego: FloatArray  # (K,) progress of each sample over the one before [m]
+    expert: FloatArray  # (T,) the same of the expert [m]
+    has_route: bool  # whether the expert drove on any lane; without, both are all zero
 
 
 def measure(map: VectorMap, centers: FloatArray, expert_centers: FloatArray) -> Progress:

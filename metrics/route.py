@@ -21,15 +21,10 @@ _OVERLAP = -1  # several lanes hold the point
 
 
 class EdgeLists(NamedTuple):
-    """Edges that hold a point, for an array of points.
+    """Edges that hold a point, for an array of points."""
 
-    Attributes:
-        edges: (…, C) edge indices; only the first `counts` of each row mean anything.
-        counts: (…) how many.
-    """
-
-    edges: IntArray
-    counts: IntArray
+    edges: IntArray  # (…, C) edge indices; only the first `counts` of each row mean anything
+    counts: IntArray  # (…) how many
 
     def at(self, *index: int) -> list[int]:
         """Edges of one point."""
@@ -42,19 +37,12 @@ class EdgeLists(NamedTuple):
 
 
 class Lanes(NamedTuple):
-    """What kernels read of the lanes and connectors of a map. E edges.
+    """What kernels read of the lanes and connectors of a map. E edges."""
 
-    Attributes:
-        polygons: Their areas.
-        num_lanes: How many of them are lanes; the others are connectors.
-        incoming: Edges that lead into an edge.
-        outgoing: Edges an edge leads to.
-    """
-
-    polygons: Polygons
-    num_lanes: int
-    incoming: Lists
-    outgoing: Lists
+    polygons: Polygons  # their areas
+    num_lanes: int  # how many of them are lanes; the others are connectors
+    incoming: Lists  # edges that lead into an edge
+    outgoing: Lists  # edges an edge leads to
 
 
 def lanes_of(map: VectorMap) -> Lanes:

@@ -55,33 +55,19 @@ SHORT_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """One rollout, measured. K samples.
+    """One rollout, measured. K samples."""
 
-    Attributes:
-        time_us: (K,) time stamps [us].
-        route: Edges of the ego centre.
-        corners: (K, 4, C) edges of the corners.
-        lanes: Whether the corners share lanes, and the lane changes.
-        comfort: The seven signals.
-        progress: Progress of ego and expert along the expert's route.
-        drivable: Corners outside and their distances.
-        collisions: First contacts, in order of time.
-        ttc: Time to collision and partner at each sample.
-        overspeed: (K,) speed above the limit, 0 where there is none [m/s].
-        lane_progress: (K,) progress along the lane since the sample before [m].
-    """
-
-    time_us: IntArray
-    route: EdgeLists
-    corners: EdgeLists
-    lanes: lane_change.LaneChanges
-    comfort: ComfortSignals
-    progress: progress.Progress
-    drivable: drivable_area.DrivableArea
-    collisions: tuple[Collision, ...]
-    ttc: time_to_collision.TimeToCollision
-    overspeed: FloatArray
-    lane_progress: FloatArray
+    time_us: IntArray  # (K,) time stamps [us]
+    route: EdgeLists  # edges of the ego centre
+    corners: EdgeLists  # (K, 4, C) edges of the corners
+    lanes: lane_change.LaneChanges  # whether the corners share lanes, and the lane changes
+    comfort: ComfortSignals  # the seven signals
+    progress: progress.Progress  # progress of ego and expert along the expert's route
+    drivable: drivable_area.DrivableArea  # corners outside and their distances
+    collisions: tuple[Collision, ...]  # first contacts, in order of time
+    ttc: time_to_collision.TimeToCollision  # time to collision and partner at each sample
+    overspeed: FloatArray  # (K,) speed above the limit, 0 where there is none [m/s]
+    lane_progress: FloatArray  # (K,) progress along the lane since the sample before [m]
 
     @property
     def is_common(self) -> BoolArray:

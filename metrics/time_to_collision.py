@@ -38,17 +38,11 @@ _STOPPED_SPEED = 5e-3  # m/s
 
 
 class TimeToCollision(NamedTuple):
-    """Time to collision of one rollout.
+    """Time to collision of one rollout."""
 
-    Attributes:
-        values: (K,) [s], inf where nothing is hit, 0 at an at-fault collision.
-        partners: (K,) track that is hit, or -1.
-        tokens: Tokens of the tracks.
-    """
-
-    values: FloatArray
-    partners: IntArray
-    tokens: tuple[str, ...]
+    values: FloatArray  # (K,) [s], inf where nothing is hit, 0 at an at-fault collision
+    partners: IntArray  # (K,) track that is hit, or -1
+    tokens: tuple[str, ...]  # tokens of the tracks
 
 
 def time_to_collision(

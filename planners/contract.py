@@ -48,19 +48,12 @@ _HINTS = {  # by the name of the rule: what to do
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing to know about a planner.
+    """One thing to know about a planner."""
 
-    Attributes:
-        severity: `error`, `warning` or `note`.
-        check: Name of the rule.
-        message: What is the case, with the offending value.
-        hint: What to do about it; empty for a note.
-    """
-
-    severity: str
-    check: str
-    message: str
-    hint: str = ""
+    severity: str  # `error`, `warning` or `note`
+    check: str  # name of the rule
+    message: str  # what is the case, with the offending value
+    hint: str = ""  # what to do about it; empty for a note
 
 
 def check_planner(planner: Any, scenario: Scenario) -> list[Finding]:

@@ -146,21 +146,13 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
 
 @dataclass(frozen=True, slots=True)
 class RunPlanner:
-    """A planner of a run: how to make it, and what identifies it.
+    """A planner of a run: how to make it, and what identifies it."""
 
-    Attributes:
-        name: As in tables.
-        source: A name, `package.module:Class`, a class, or an instance.
-        arguments: Passed to the constructor of a name or class.
-        fingerprint: All that tells it from another planner, as JSON values.
-        in_batches: Whether it answers for several scenarios at once.
-    """
-
-    name: str
-    source: Any
-    arguments: Mapping[str, Any]
-    fingerprint: Mapping[str, Any]
-    in_batches: bool = False
+    name: str  # as in tables
+    source: Any  # A name, `package.module:Class`, a class, or an instance
+    arguments: Mapping[str, Any]  # passed to the constructor of a name or class
+    fingerprint: Mapping[str, Any]  # all that tells it from another planner, as JSON values
+    in_batches: bool = False  # whether it answers for several scenarios at once
 
     def make(self) -> Planner:
         """An instance of its own for one worker."""

@@ -9,37 +9,23 @@ from shiftsim.files import checkpoint_folder
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A checkpoint as its authors publish it.
+    """A checkpoint as its authors publish it."""
 
-    Attributes:
-        file: What is published.
-        project: Name of the project that publishes it.
-        name: File or folder in the folder of checkpoints, where it is found by itself.
-    """
-
-    file: str
-    project: str
-    name: str
+    file: str  # what is published
+    project: str  # name of the project that publishes it
+    name: str  # file or folder in the folder of checkpoints, where it is found by itself
 
 
 @dataclass(frozen=True, slots=True)
 class PlannerEntry:
-    """One registered planner.
+    """One registered planner."""
 
-    Attributes:
-        name: Its name everywhere.
-        kind: `rule-based`, `oracle` (looks at the recording), `replay` or `learned`.
-        target: `package.module:Class`.
-        description: One line.
-        arguments: Names of the arguments it takes.
-        checkpoint: What a learned planner loads; it also needs the extra `learned`.
-    """
-
-    name: str
-    kind: str
-    target: str
-    description: str
-    arguments: tuple[str, ...] = ()
+    name: str  # its name everywhere
+    kind: str  # `rule-based`, `oracle` (looks at the recording), `replay` or `learned`
+    target: str  # `package.module:Class`
+    description: str  # one line
+    arguments: tuple[str, ...] = ()  # names of the arguments it takes
+    # what a learned planner loads; it also needs the extra `learned`
     checkpoint: Published | None = None
 
 

@@ -69,24 +69,16 @@ def _one_by_one(make: Make, tasks: Sequence[str]) -> Iterator[_Done]:
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What became of one site.
+    """What became of one site."""
 
-    Attributes:
-        site: Name of the site, which is the name of its map.
-        lanes: Lanes and lane connectors of the map.
-        drivable_share: Share of moving vehicles on drivable area.
-        recordings: Summary of every recording that was converted.
-        skipped: Why, by name of a recording that cannot be converted.
-        kept: How many recordings were converted before, by an interrupted or an earlier call.
-        map_warnings: Count by kind of what was repaired in the map.
-    """
-
-    site: str
-    lanes: int
-    drivable_share: float
-    recordings: tuple[RecordingSummary, ...]
+    site: str  # name of the site, which is the name of its map
+    lanes: int  # lanes and lane connectors of the map
+    drivable_share: float  # share of moving vehicles on drivable area
+    recordings: tuple[RecordingSummary, ...]  # summary of every recording that was converted
+    # why, by name of a recording that cannot be converted
     skipped: dict[str, str] = field(default_factory=dict)
-    kept: int = 0
+    kept: int = 0  # how many recordings were converted before, by an interrupted or an earlier call
+    # count by kind of what was repaired in the map
     map_warnings: dict[str, int] = field(default_factory=dict)
 
     @property

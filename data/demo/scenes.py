@@ -12,19 +12,12 @@ from shiftsim.files import read_toml
 
 @dataclass(frozen=True)
 class Scene:
-    """One recording.
+    """One recording."""
 
-    Attributes:
-        start: UTC time of the first frame.
-        duration: [s].
-        drivers: One line each, as `scenes.toml` says.
-        walkers: Likewise.
-    """
-
-    start: str
-    duration: float
-    drivers: str
-    walkers: str
+    start: str  # UTC time of the first frame
+    duration: float  # [s]
+    drivers: str  # one line each, as `scenes.toml` says
+    walkers: str  # likewise
 
     @property
     def name(self) -> str:

@@ -22,18 +22,14 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass
 class ConversionReport:
-    """What a conversion did.
+    """What a conversion did."""
 
-    Attributes:
-        converted: Tokens of the scenarios written.
-        unchanged: Tokens that were in the store already, cut in the same way.
-        failed: Reason by token, or by log where the whole log failed.
-        flaws: Counts of what the source got wrong and nuPlan tolerates, by `where: what`.
-    """
-
-    converted: list[str] = field(default_factory=list)
+    converted: list[str] = field(default_factory=list)  # tokens of the scenarios written
+    # tokens that were in the store already, cut in the same way
     unchanged: list[str] = field(default_factory=list)
+    # reason by token, or by log where the whole log failed
     failed: dict[str, str] = field(default_factory=dict)
+    # counts of what the source got wrong and nuPlan tolerates, by `where: what`
     flaws: Counter[str] = field(default_factory=Counter)
 
 

@@ -35,24 +35,17 @@ _RASTER = {"shape": [1, 1], "transform_matrix": _IDENTITY}
 
 @dataclass
 class ExportReport:
-    """What an export wrote.
+    """What an export wrote."""
 
-    Attributes:
-        logs: Folder of the logs.
-        maps: Folder of the maps.
-        token_file: File that lists the tokens.
-        tokens: Token in nuPlan's files by scenario; the same unless it had another form.
-        cities: Names of the maps written.
-        mappings: Number of scenarios by type and mapping (duration, offset, ratio).
-        missing_maps: Maps that nuPlan's own code opens and that are not in the folder.
-    """
-
-    logs: Path
-    maps: Path
-    token_file: Path
+    logs: Path  # folder of the logs
+    maps: Path  # folder of the maps
+    token_file: Path  # file that lists the tokens
+    # token in nuPlan's files by scenario; the same unless it had another form
     tokens: dict[str, str] = field(default_factory=dict)
-    cities: list[str] = field(default_factory=list)
+    cities: list[str] = field(default_factory=list)  # names of the maps written
+    # number of scenarios by type and mapping (duration, offset, ratio)
     mappings: Counter[tuple[str, Mapping]] = field(default_factory=Counter)
+    # maps that nuPlan's own code opens and that are not in the folder
     missing_maps: list[str] = field(default_factory=list)
 
     @property

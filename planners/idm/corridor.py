@@ -25,21 +25,13 @@ UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet
 
 
 class Objects(NamedTuple):
-    """Polygons around the ego. M objects.
+    """Polygons around the ego. M objects."""
 
-    Attributes:
-        xy: (V, 2) vertices of all rings, not closed [m].
-        ptr: (M + 1,) first vertex of each ring.
-        circles: (M, 3) x, y, radius of a circle around each ring [m].
-        headings: (M,) heading, 0 for a red light [rad].
-        speeds: (M,) speed, 0 for static objects and red lights [m/s].
-    """
-
-    xy: FloatArray
-    ptr: IntArray
-    circles: FloatArray
-    headings: FloatArray
-    speeds: FloatArray
+    xy: FloatArray  # (V, 2) vertices of all rings, not closed [m]
+    ptr: IntArray  # (M + 1,) first vertex of each ring
+    circles: FloatArray  # (M, 3) x, y, radius of a circle around each ring [m]
+    headings: FloatArray  # (M,) heading, 0 for a red light [rad]
+    speeds: FloatArray  # (M,) speed, 0 for static objects and red lights [m/s]
 
 
 @kernel

@@ -28,25 +28,15 @@ _EGO_TOKEN = "ego_token"
 
 
 class Policy(NamedTuple):
-    """What drives along the path.
+    """What drives along the path."""
 
-    Attributes:
-        length: Of the ego [m].
-        width: Of the ego [m].
-        target_velocity: Speed on a free road [m/s].
-        min_gap: Gap kept at standstill [m].
-        headway: Time gap kept [s].
-        accel_max: Largest acceleration [m/s^2].
-        decel_max: Largest deceleration, positive [m/s^2].
-    """
-
-    length: float
-    width: float
-    target_velocity: float
-    min_gap: float
-    headway: float
-    accel_max: float
-    decel_max: float
+    length: float  # of the ego [m]
+    width: float  # of the ego [m]
+    target_velocity: float  # speed on a free road [m/s]
+    min_gap: float  # gap kept at standstill [m]
+    headway: float  # time gap kept [s]
+    accel_max: float  # largest acceleration [m/s^2]
+    decel_max: float  # largest deceleration, positive [m/s^2]
 
 
 class Idm:

@@ -20,15 +20,10 @@ Output = TypeVar("Output")
 
 
 class LearnedPlanner(ABC, Generic[Features, Output]):
-    """Base of the adapters.
+    """Base of the adapters."""
 
-    Attributes:
-        name: Of the planner, in the table of planners.
-        degraded: Why the last plan is a fallback; empty when it is not.
-    """
-
-    name: str
-    degraded: str = ""
+    name: str  # of the planner, in the table of planners
+    degraded: str = ""  # why the last plan is a fallback; empty when it is not
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the network.

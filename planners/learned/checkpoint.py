@@ -38,35 +38,21 @@ _WITH_ARGS = ("diffusion-planner",)  # planners whose weights mean nothing witho
 
 
 class Weights(NamedTuple):
-    """What is loaded into a network.
+    """What is loaded into a network."""
 
-    Attributes:
-        state: Tensors by official name, complete, of the network's own types.
-        args: Settings of the network that came with them, or None.
-    """
-
-    state: dict[str, Any]
-    args: dict[str, Any] | None
+    state: dict[str, Any]  # tensors by official name, complete, of the network's own types
+    args: dict[str, Any] | None  # settings of the network that came with them, or None
 
 
 class Checkpoint(NamedTuple):
-    """A checkpoint file as read, for whatever planner it is.
+    """A checkpoint file as read, for whatever planner it is."""
 
-    Attributes:
-        path: The file.
-        container: What kind of file it is, and where in it the weights are.
-        state: Tensors by name without prefixes.
-        args: Settings of the network beside them, or None.
-        skipped: What was left out: other entries, and objects of foreign classes.
-        made_from: SHA-256 of the file that this one was converted from, or empty.
-    """
-
-    path: Path
-    container: str
-    state: dict[str, Any]
-    args: dict[str, Any] | None
-    skipped: tuple[str, ...]
-    made_from: str = ""
+    path: Path  # the file
+    container: str  # what kind of file it is, and where in it the weights are
+    state: dict[str, Any]  # tensors by name without prefixes
+    args: dict[str, Any] | None  # settings of the network beside them, or None
+    skipped: tuple[str, ...]  # what was left out: other entries, and objects of foreign classes
+    made_from: str = ""  # SHA-256 of the file that this one was converted from, or empty
 
 
 def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:

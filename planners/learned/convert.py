@@ -19,31 +19,18 @@ from shiftsim.planners.learned.match import most_like, shapes_of
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """What is in a checkpoint file.
+    """What is in a checkpoint file."""
 
-    Attributes:
-        path: The file.
-        container: Kind of file, and the entry that holds the weights.
-        planner: The planner that it looks like; empty for none.
-        problem: Why that planner cannot load it; empty where it can.
-        tensors: Number of tensors.
-        parameters: Number of values in them.
-        sha256: Of the file.
-        args: Settings beside the weights, or None.
-        skipped: What was left out.
-        made_from: SHA-256 of the file that this one was converted from, or empty.
-    """
-
-    path: str
-    container: str
-    planner: str
-    problem: str
-    tensors: int
-    parameters: int
-    sha256: str
-    args: dict[str, Any] | None
-    skipped: tuple[str, ...]
-    made_from: str
+    path: str  # the file
+    container: str  # kind of file, and the entry that holds the weights
+    planner: str  # the planner that it looks like; empty for none
+    problem: str  # why that planner cannot load it; empty where it can
+    tensors: int  # number of tensors
+    parameters: int  # number of values in them
+    sha256: str  # of the file
+    args: dict[str, Any] | None  # settings beside the weights, or None
+    skipped: tuple[str, ...]  # what was left out
+    made_from: str  # SHA-256 of the file that this one was converted from, or empty
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON values."""

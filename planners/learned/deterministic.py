@@ -89,19 +89,12 @@ def _value(rule: str, name: str, shape: tuple[int, ...]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class DriveHead:
-    """How the last layer of a trajectory head becomes a smooth ramp forward. C channels.
+    """How the last layer of a trajectory head becomes a smooth ramp forward. C channels."""
 
-    Attributes:
-        gain: Factors on the weights.
-        exponent: Powers of the time fraction.
-        const: Constant parts of the bias.
-        slope: Parts of the bias that grow with time.
-    """
-
-    gain: tuple[float, ...]
-    exponent: tuple[float, ...]
-    const: tuple[float, ...]
-    slope: tuple[float, ...]
+    gain: tuple[float, ...]  # factors on the weights
+    exponent: tuple[float, ...]  # powers of the time fraction
+    const: tuple[float, ...]  # constant parts of the bias
+    slope: tuple[float, ...]  # parts of the bias that grow with time
 
 
 def override_head(state: State, layer: str, head: DriveHead) -> None:

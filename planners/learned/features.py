@@ -54,25 +54,15 @@ def short_history(count: int) -> str:
 
 
 class AgentFeatures(NamedTuple):
-    """The ego and the agents nearest to it in the ego frame, float32. A rows, the ego first.
+    """The ego and the agents nearest to it in the ego frame, float32. A rows, the ego first."""
 
-    Attributes:
-        tracks: (A - 1,) track of every row but the first.
-        position: (A, 21, 2) rear axle of the ego, centres of the others [m].
-        heading: (A, 21) not wrapped [rad].
-        velocity: (A, 21, 2) [m/s].
-        shape: (A, 21, 2) width, length [m].
-        valid: (A, 21) whether the sample is there; all else is 0 where not.
-        category: (A,) 0 ego, 1 vehicle, 2 pedestrian, 3 bicycle.
-    """
-
-    tracks: IntArray
-    position: np.ndarray
-    heading: np.ndarray
-    velocity: np.ndarray
-    shape: np.ndarray
-    valid: BoolArray
-    category: IntArray
+    tracks: IntArray  # (A - 1,) track of every row but the first
+    position: np.ndarray  # (A, 21, 2) rear axle of the ego, centres of the others [m]
+    heading: np.ndarray  # (A, 21) not wrapped [rad]
+    velocity: np.ndarray  # (A, 21, 2) [m/s]
+    shape: np.ndarray  # (A, 21, 2) width, length [m]
+    valid: BoolArray  # (A, 21) whether the sample is there; all else is 0 where not
+    category: IntArray  # (A,) 0 ego, 1 vehicle, 2 pedestrian, 3 bicycle
 
 
 def agent_features(history: History, center: FloatArray, max_agents: int) -> AgentFeatures:

@@ -22,51 +22,29 @@ _ZERO_BIN = 1e-6  # divisor of a bin without length
 
 
 class RoadObjects(NamedTuple):
-    """Lanes, then connectors, then crosswalks of a map, each in the order of its layer. M objects.
+    """Lanes, then connectors, then crosswalks of a map, each in the order of its layer; M in all."""
 
-    Attributes:
-        lines: (M, 3, 21, 2) centre, left and right polyline in the map frame [m].
-        angles: (M, 3, 20) orientation of the steps [rad].
-        kind: (M,) LANE, CONNECTOR or CROSSWALK.
-        block: (M,) block of the object, or NONE.
-        limit: (M,) speed limit [m/s], NaN where there is none.
-    """
-
-    lines: FloatArray
-    angles: FloatArray
-    kind: IntArray
-    block: IntArray
-    limit: FloatArray
+    lines: FloatArray  # (M, 3, 21, 2) centre, left and right polyline in the map frame [m]
+    angles: FloatArray  # (M, 3, 20) orientation of the steps [rad]
+    kind: IntArray  # (M,) LANE, CONNECTOR or CROSSWALK
+    block: IntArray  # (M,) block of the object, or NONE
+    limit: FloatArray  # (M,) speed limit [m/s], NaN where there is none
 
 
 class RoadFeatures(NamedTuple):
-    """Objects around the ego in its frame, float32 and ready for a network. M objects.
+    """Objects around the ego in its frame, float32 and ready for a network. M objects."""
 
-    Attributes:
-        objects: (M,) row of each in `RoadObjects`; below the number of edges it is the edge.
-        points: (M, 3, 20, 2) points of centre, left and right [m].
-        vectors: (M, 3, 20, 2) to the next point [m].
-        orientations: (M, 3, 20) of the vectors, not wrapped [rad].
-        centers: (M, 3) pose of the middle of the centre line.
-        valid: (M, 20) whether a point of the centre line is near enough.
-        kind: (M,) LANE, CONNECTOR or CROSSWALK.
-        on_route: (M,)
-        light: (M,) LightStatus, UNKNOWN where there is no light.
-        has_limit: (M,)
-        limit: (M,) speed limit [m/s], 0 where there is none.
-    """
-
-    objects: IntArray
-    points: np.ndarray
-    vectors: np.ndarray
-    orientations: np.ndarray
-    centers: np.ndarray
-    valid: BoolArray
-    kind: IntArray
-    on_route: BoolArray
-    light: IntArray
-    has_limit: BoolArray
-    limit: np.ndarray
+    objects: IntArray  # (M,) row of each in `RoadObjects`; below the number of edges it is the edge
+    points: np.ndarray  # (M, 3, 20, 2) points of centre, left and right [m]
+    vectors: np.ndarray  # (M, 3, 20, 2) to the next point [m]
+    orientations: np.ndarray  # (M, 3, 20) of the vectors, not wrapped [rad]
+    centers: np.ndarray  # (M, 3) pose of the middle of the centre line
+    valid: BoolArray  # (M, 20) whether a point of the centre line is near enough
+    kind: IntArray  # (M,) LANE, CONNECTOR or CROSSWALK
+    on_route: BoolArray  # (M,)
+    light: IntArray  # (M,) LightStatus, UNKNOWN where there is no light
+    has_limit: BoolArray  # (M,)
+    limit: np.ndarray  # (M,) speed limit [m/s], 0 where there is none
 
 
 def _make_road_objects(road: VectorMap) -> RoadObjects:

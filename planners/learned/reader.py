@@ -53,19 +53,13 @@ _BROKEN = (
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """A file as read.
+    """A file as read."""
 
-    Attributes:
-        container: What kind of file it is.
-        entries: Its top level: tensors, and what else is plain.
-        metadata: Texts beside the tensors of a safetensors file.
-        skipped: Names of the classes whose objects were left out.
-    """
-
-    container: str
-    entries: dict[str, Any]
+    container: str  # what kind of file it is
+    entries: dict[str, Any]  # its top level: tensors, and what else is plain
+    # texts beside the tensors of a safetensors file
     metadata: dict[str, str] = field(default_factory=dict)
-    skipped: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()  # names of the classes whose objects were left out
 
 
 def read_contents(path: Path) -> Contents:

@@ -23,21 +23,13 @@ from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
 
 
 class Corridor(NamedTuple):
-    """A stretch of a path and what stands in it. M tracks and lights.
+    """A stretch of a path and what stands in it. M tracks and lights."""
 
-    Attributes:
-        low: Progress at its start [m].
-        high: Progress at its end [m].
-        half_width: Radius of the buffer [m].
-        sides: (41, M) CLEAR, HIT or OPEN on every forecast map.
-        progress: (41, M) projection of the centroid on the path, where not CLEAR [m].
-    """
-
-    low: float
-    high: float
-    half_width: float
-    sides: IntArray
-    progress: FloatArray
+    low: float  # progress at its start [m]
+    high: float  # progress at its end [m]
+    half_width: float  # radius of the buffer [m]
+    sides: IntArray  # (41, M) CLEAR, HIT or OPEN on every forecast map
+    progress: FloatArray  # (41, M) projection of the centroid on the path, where not CLEAR [m]
 
 
 def make_corridor(low: float, high: float, half_width: float, count: int) -> Corridor:

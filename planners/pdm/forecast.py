@@ -21,23 +21,15 @@ NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a 
 
 
 class Forecast(NamedTuple):
-    """Tracks around the ego on every forecast map, and red lights. B boxes, M = B + lights.
+    """Tracks around the ego on every forecast map, and red lights. B boxes, M = B + lights."""
 
-    Attributes:
-        others: The boxes on 41 maps; what the ego has touched before is ignored.
-        moves: (B,) whether a box changes from map to map.
-        headings: (B,) of the box [rad].
-        ignored: (M,) whether the ego has touched it before; the first B are those of `others`.
-        light_xy: (V, 2) vertices of the red connectors, not closed [m].
-        light_ptr: (lights + 1,) first vertex of each.
-    """
-
-    others: Others
-    moves: BoolArray
-    headings: FloatArray
+    others: Others  # the boxes on 41 maps; what the ego has touched before is ignored
+    moves: BoolArray  # (B,) whether a box changes from map to map
+    headings: FloatArray  # (B,) of the box [rad]
+    # (M,) whether the ego has touched it before; the first B are those of `others`
     ignored: BoolArray
-    light_xy: FloatArray
-    light_ptr: IntArray
+    light_xy: FloatArray  # (V, 2) vertices of the red connectors, not closed [m]
+    light_ptr: IntArray  # (lights + 1,) first vertex of each
 
 
 def select_tracks(

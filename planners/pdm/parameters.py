@@ -29,43 +29,27 @@ class FollowingModel(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PdmParameters:
-    """What a user may change.
+    """What a user may change."""
 
-    Attributes:
-        speed_fractions: Target speeds as shares of the lane's limit, slowest first.
-        fallback_velocity: Stands in for a missing limit [m/s].
-        lateral_offsets: Of the paths beside the centerline, left is positive [m].
-        following: The longitudinal policy.
-        map_radius: Objects nearer than this are seen; half side of the map square [m].
-        max_static: Most static objects that are seen.
-        max_vehicles: Most vehicles that are seen.
-        max_pedestrians: Most pedestrians that are seen.
-        max_bicycles: Most bicycles that are seen.
-        progress_weight: Of the score.
-        ttc_weight: Of the score.
-        comfort_weight: Of the score.
-        comfort: Bounds of the comfort test.
-        direction_limits: Oncoming travel up to which the factor is 1, and 0.5 [m].
-        brake_time: An at-fault collision within this brakes [s], if
-        brake_speed: the ego is not faster than this [m/s].
-    """
-
+    # target speeds as shares of the lane's limit, slowest first
     speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)
-    fallback_velocity: float = 15.0
+    fallback_velocity: float = 15.0  # stands in for a missing limit [m/s]
+    # of the paths beside the centerline, left is positive [m]
     lateral_offsets: tuple[float, ...] = (-1.0, 1.0)
-    following: FollowingModel = field(default_factory=FollowingModel)
-    map_radius: float = 50.0
-    max_static: int = 50
-    max_vehicles: int = 50
-    max_pedestrians: int = 25
-    max_bicycles: int = 10
-    progress_weight: float = 5.0
-    ttc_weight: float = 5.0
-    comfort_weight: float = 2.0
-    comfort: ComfortBounds = field(default_factory=ComfortBounds)
+    following: FollowingModel = field(default_factory=FollowingModel)  # the longitudinal policy
+    map_radius: float = 50.0  # objects nearer than this are seen; half side of the map square [m]
+    max_static: int = 50  # most static objects that are seen
+    max_vehicles: int = 50  # most vehicles that are seen
+    max_pedestrians: int = 25  # most pedestrians that are seen
+    max_bicycles: int = 10  # most bicycles that are seen
+    progress_weight: float = 5.0  # of the score
+    ttc_weight: float = 5.0  # of the score
+    comfort_weight: float = 2.0  # of the score
+    comfort: ComfortBounds = field(default_factory=ComfortBounds)  # bounds of the comfort test
+    # oncoming travel up to which the factor is 1, and 0.5 [m]
     direction_limits: tuple[float, float] = (2.0, 6.0)
-    brake_time: float = 2.0
-    brake_speed: float = 5.0
+    brake_time: float = 2.0  # an at-fault collision within this brakes [s], if
+    brake_speed: float = 5.0  # the ego is not faster than this [m/s]
 
     def __post_init__(self) -> None:
         if not self.speed_fractions or not np.isfinite(self.speed_fractions).all():

@@ -44,19 +44,12 @@ from shiftsim.world.state import NUM_STATE, Trajectory
 
 
 class Seen(NamedTuple):
-    """What one step was planned from.
+    """What one step was planned from."""
 
-    Attributes:
-        forecast: What is around.
-        tokens: Of the tracks, then of the red lights.
-        place: The map of the step.
-        lane: The current lane.
-    """
-
-    forecast: Forecast
-    tokens: list[str]
-    place: Place
-    lane: int
+    forecast: Forecast  # what is around
+    tokens: list[str]  # of the tracks, then of the red lights
+    place: Place  # the map of the step
+    lane: int  # the current lane
 
 
 class PdmClosed:

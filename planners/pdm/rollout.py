@@ -27,53 +27,31 @@ _NOBODY, _TIED = -1, -2  # instead of what is nearest
 
 
 class Scene(NamedTuple):
-    """What proposals are rolled out in.
+    """What proposals are rolled out in."""
 
-    Attributes:
-        paths: The centerline and those beside it.
-        forecast: What is around.
-        size: Of the ego.
-        model: The longitudinal policy.
-    """
-
-    paths: Sequence[Path]
-    forecast: Forecast
-    size: EgoBox
-    model: FollowingModel
+    paths: Sequence[Path]  # the centerline and those beside it
+    forecast: Forecast  # what is around
+    size: EgoBox  # of the ego
+    model: FollowingModel  # the longitudinal policy
 
 
 class Rows(NamedTuple):
-    """Policies of one path; zeros where not rolled out yet.
+    """Policies of one path; zeros where not rolled out yet."""
 
-    Attributes:
-        targets: (F,) target speeds [m/s].
-        poses: (F, 81, 3) x [m], y [m], heading [rad].
-        motion: (F, 81, 2) progress [m], speed [m/s].
-        leads: (F, 81, 3) progress [m], speed [m/s], rear length [m].
-    """
-
-    targets: FloatArray
-    poses: FloatArray
-    motion: FloatArray
-    leads: FloatArray
+    targets: FloatArray  # (F,) target speeds [m/s]
+    poses: FloatArray  # (F, 81, 3) x [m], y [m], heading [rad]
+    motion: FloatArray  # (F, 81, 2) progress [m], speed [m/s]
+    leads: FloatArray  # (F, 81, 3) progress [m], speed [m/s], rear length [m]
 
 
 class Proposals(NamedTuple):
-    """Rear-axle poses, motion along the path, and leads, as in `Rows`, of all paths.
+    """Rear-axle poses, motion along the path, and leads, as in `Rows`, of all paths."""
 
-    Attributes:
-        targets: (F,) target speeds [m/s].
-        poses: (L, F, 81, 3)
-        motion: (L, F, 81, 2)
-        leads: (L, F, 81, 3)
-        corridors: One per path.
-    """
-
-    targets: FloatArray
-    poses: FloatArray
-    motion: FloatArray
-    leads: FloatArray
-    corridors: tuple[Corridor, ...]
+    targets: FloatArray  # (F,) target speeds [m/s]
+    poses: FloatArray  # (L, F, 81, 3)
+    motion: FloatArray  # (L, F, 81, 2)
+    leads: FloatArray  # (L, F, 81, 3)
+    corridors: tuple[Corridor, ...]  # one per path
 
     def rows(self, path: int, chosen: slice = slice(None)) -> Rows:
         """Some of the policies of a path."""

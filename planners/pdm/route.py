@@ -21,19 +21,12 @@ MAX_COVERING = 64  # areas over one point
 
 
 class Route(NamedTuple):
-    """What PDM-Closed decides once per scenario.
+    """What PDM-Closed decides once per scenario."""
 
-    Attributes:
-        start: Where it begins.
-        corrected: Blocks of the corrected route.
-        lanes: Lanes and connectors of these blocks, in order.
-        areas: The drivable areas of the map, those of the route marked.
-    """
-
-    start: Start
-    corrected: list[int]
-    lanes: IntArray
-    areas: Areas
+    start: Start  # where it begins
+    corrected: list[int]  # blocks of the corrected route
+    lanes: IntArray  # lanes and connectors of these blocks, in order
+    areas: Areas  # the drivable areas of the map, those of the route marked
 
 
 def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:

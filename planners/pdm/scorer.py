@@ -32,49 +32,28 @@ MIN_PROGRESS = 0.1  # m, of the best proposal; below it progress is not compared
 
 
 class Scores(NamedTuple):
-    """Scores of P proposals.
+    """Scores of P proposals."""
 
-    Attributes:
-        total: (P,) the score.
-        no_collision: (P,) factor: 0, 0.5 or 1.
-        drivable: (P,) factor: 0 or 1.
-        direction: (P,) factor: 0, 0.5 or 1.
-        progress: (P,) in [0, 1].
-        ttc: (P,) 0 or 1.
-        comfort: (P,) 0 or 1.
-        raw_progress: (P,) along the centerline, before factors [m].
-        collision_index: (P,) first time index of an at-fault collision, inf if none.
-        ttc_index: (P,) first time index of a violation, inf if none.
-        flags: (P, T, 3) whether the ego is on several lanes, off the road, off the route.
-    """
-
-    total: FloatArray
-    no_collision: FloatArray
-    drivable: FloatArray
-    direction: FloatArray
-    progress: FloatArray
-    ttc: FloatArray
-    comfort: FloatArray
-    raw_progress: FloatArray
-    collision_index: FloatArray
-    ttc_index: FloatArray
-    flags: BoolArray
+    total: FloatArray  # (P,) the score
+    no_collision: FloatArray  # (P,) factor: 0, 0.5 or 1
+    drivable: FloatArray  # (P,) factor: 0 or 1
+    direction: FloatArray  # (P,) factor: 0, 0.5 or 1
+    progress: FloatArray  # (P,) in [0, 1]
+    ttc: FloatArray  # (P,) 0 or 1
+    comfort: FloatArray  # (P,) 0 or 1
+    raw_progress: FloatArray  # (P,) along the centerline, before factors [m]
+    collision_index: FloatArray  # (P,) first time index of an at-fault collision, inf if none
+    ttc_index: FloatArray  # (P,) first time index of a violation, inf if none
+    flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
 
 
 class Place(NamedTuple):
-    """The map as the scorer sees it.
+    """The map as the scorer sees it."""
 
-    Attributes:
-        areas: Lanes, connectors and car parks.
-        selected: Those of this step.
-        intersections: Areas where what is beside the ego counts as well.
-        centerline: Progress is measured along it.
-    """
-
-    areas: Areas
-    selected: IntArray
-    intersections: Polygons
-    centerline: Path
+    areas: Areas  # lanes, connectors and car parks
+    selected: IntArray  # those of this step
+    intersections: Polygons  # areas where what is beside the ego counts as well
+    centerline: Path  # progress is measured along it
 
 
 def score(

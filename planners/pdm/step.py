@@ -14,23 +14,14 @@ from shiftsim.world.state import VX, VY, VehicleParameters
 
 
 class Step(NamedTuple):
-    """What one step came to. P = 15 proposals, 5 speeds on each of 3 paths.
+    """What one step came to. P = 15 proposals, 5 speeds on each of 3 paths."""
 
-    Attributes:
-        poses: (81, 3) the plan, rear axle x [m], y [m], heading [rad].
-        best: Number of the best proposal.
-        braked: Whether the emergency brake replaces it.
-        proposals: As rolled out.
-        driven: As driven by the tracker.
-        scores: Of the driven proposals.
-    """
-
-    poses: FloatArray
-    best: int
-    braked: bool
-    proposals: Proposals
-    driven: Driven
-    scores: Scores
+    poses: FloatArray  # (81, 3) the plan, rear axle x [m], y [m], heading [rad]
+    best: int  # number of the best proposal
+    braked: bool  # whether the emergency brake replaces it
+    proposals: Proposals  # as rolled out
+    driven: Driven  # as driven by the tracker
+    scores: Scores  # of the driven proposals
 
 
 def plan_step(

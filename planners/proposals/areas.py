@@ -20,41 +20,25 @@ NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
 class Slabs(NamedTuple):
-    """Rings sliced into horizontal slabs. R rings, S slabs.
+    """Rings sliced into horizontal slabs. R rings, S slabs."""
 
-    Attributes:
-        xy: (V, 2) vertices of all rings [m].
-        rings: (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs.
-        grid: (R, 2) y of the lowest slab [m], slabs per metre.
-        edge_ptr: (S + 1,) first entry of each slab in `edge_ends`.
-        edge_ends: Vertices at which the edges of a slab end.
-        poly_ptr: (M + 1,) first ring of each area.
-        bounds: (M, 4) of the areas: min x, min y, max x, max y [m].
-    """
-
-    xy: FloatArray
+    xy: FloatArray  # (V, 2) vertices of all rings [m]
+    # (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs
     rings: IntArray
-    grid: FloatArray
-    edge_ptr: IntArray
-    edge_ends: IntArray
-    poly_ptr: IntArray
-    bounds: FloatArray
+    grid: FloatArray  # (R, 2) y of the lowest slab [m], slabs per metre
+    edge_ptr: IntArray  # (S + 1,) first entry of each slab in `edge_ends`
+    edge_ends: IntArray  # vertices at which the edges of a slab end
+    poly_ptr: IntArray  # (M + 1,) first ring of each area
+    bounds: FloatArray  # (M, 4) of the areas: min x, min y, max x, max y [m]
 
 
 class Areas(NamedTuple):
-    """Areas of all lanes and connectors of a map, then of its car parks.
+    """Areas of all lanes and connectors of a map, then of its car parks."""
 
-    Attributes:
-        polygons: The areas.
-        slabs: Their rings.
-        on_route: (M,) whether the route holds a lane of that id.
-        lane: (M,) the lane of that id; for a car park usually -1.
-    """
-
-    polygons: Polygons
-    slabs: Slabs
-    on_route: BoolArray
-    lane: IntArray
+    polygons: Polygons  # the areas
+    slabs: Slabs  # their rings
+    on_route: BoolArray  # (M,) whether the route holds a lane of that id
+    lane: IntArray  # (M,) the lane of that id; for a car park usually -1
 
 
 def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:

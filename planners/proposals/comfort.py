@@ -56,15 +56,10 @@ def make_filters() -> Filters:
 
 
 class Comfort(NamedTuple):
-    """How P driven proposals feel.
+    """How P driven proposals feel."""
 
-    Attributes:
-        signals: (P, 6, 41) filtered signals named by `SIGNALS`.
-        is_within: (P, 6) whether each stays strictly within its bounds.
-    """
-
-    signals: FloatArray
-    is_within: BoolArray
+    signals: FloatArray  # (P, 6, 41) filtered signals named by `SIGNALS`
+    is_within: BoolArray  # (P, 6) whether each stays strictly within its bounds
 
 
 def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:

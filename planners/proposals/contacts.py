@@ -19,25 +19,15 @@ NEVER = np.inf
 
 
 class Others(NamedTuple):
-    """Boxes of all that a proposal can hit.
+    """Boxes of all that a proposal can hit."""
 
-    Attributes:
-        boxes: (R, N, 4, 2) corners [m].
-        centers: (R, N, 2) centres [m].
-        centroids: (R, N, 2) points that bearings are taken to [m].
-        speeds: (R, N) 0 for static objects [m/s].
-        radii: (N,) half diagonals [m].
-        is_agent: (N,) whether it is no static object.
-        ignored: (N,) whether contacts with it do not count.
-    """
-
-    boxes: FloatArray
-    centers: FloatArray
-    centroids: FloatArray
-    speeds: FloatArray
-    radii: FloatArray
-    is_agent: BoolArray
-    ignored: BoolArray
+    boxes: FloatArray  # (R, N, 4, 2) corners [m]
+    centers: FloatArray  # (R, N, 2) centres [m]
+    centroids: FloatArray  # (R, N, 2) points that bearings are taken to [m]
+    speeds: FloatArray  # (R, N) 0 for static objects [m/s]
+    radii: FloatArray  # (N,) half diagonals [m]
+    is_agent: BoolArray  # (N,) whether it is no static object
+    ignored: BoolArray  # (N,) whether contacts with it do not count
 
 
 @lean_kernel

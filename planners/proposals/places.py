@@ -26,23 +26,14 @@ class EgoBox(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Driven proposals and where they are.
+    """Driven proposals and where they are."""
 
-    Attributes:
-        states: (P, T, 11) driven states.
-        corners: (P, T, 4, 2) corners of the ego [m].
-        centers: (P, T, 2) its centres [m].
-        flags: (P, T, 3) whether it is on several lanes, off the road, off the route.
-        off_lane: (P, T) whether it is on several lanes or off the road.
-        speed_limits: (P, T) largest limit where it is, 0 off the road [m/s].
-    """
-
-    states: FloatArray
-    corners: FloatArray
-    centers: FloatArray
-    flags: BoolArray
-    off_lane: BoolArray
-    speed_limits: FloatArray
+    states: FloatArray  # (P, T, 11) driven states
+    corners: FloatArray  # (P, T, 4, 2) corners of the ego [m]
+    centers: FloatArray  # (P, T, 2) its centres [m]
+    flags: BoolArray  # (P, T, 3) whether it is on several lanes, off the road, off the route
+    off_lane: BoolArray  # (P, T) whether it is on several lanes or off the road
+    speed_limits: FloatArray  # (P, T) largest limit where it is, 0 off the road [m/s]
 
 
 def ego_box(vehicle: VehicleParameters) -> EgoBox:

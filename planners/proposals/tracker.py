@@ -78,17 +78,11 @@ def fit_speed(poses: FloatArray, dt: float, penalty: float, out: FloatArray) -> 
 
 
 class Profiles(NamedTuple):
-    """What poses are tracked by.
+    """What poses are tracked by."""
 
-    Attributes:
-        speeds: (T - 1,) reference speeds [m/s].
-        curvatures: (T - 1,) reference curvatures [1/m].
-        ahead: (horizon,) scratch.
-    """
-
-    speeds: FloatArray
-    curvatures: FloatArray
-    ahead: FloatArray
+    speeds: FloatArray  # (T - 1,) reference speeds [m/s]
+    curvatures: FloatArray  # (T - 1,) reference curvatures [1/m]
+    ahead: FloatArray  # (horizon,) scratch
 
 
 @kernel
@@ -115,17 +109,11 @@ def look_ahead(
 
 
 class Driven(NamedTuple):
-    """Proposals as driven.
+    """Proposals as driven."""
 
-    Attributes:
-        speeds: (P, T - 1) reference speeds [m/s].
-        curvatures: (P, T - 1) reference curvatures [1/m].
-        states: (P, 41, 11) states.
-    """
-
-    speeds: FloatArray
-    curvatures: FloatArray
-    states: FloatArray
+    speeds: FloatArray  # (P, T - 1) reference speeds [m/s]
+    curvatures: FloatArray  # (P, T - 1) reference curvatures [1/m]
+    states: FloatArray  # (P, 41, 11) states
 
 
 def drive_proposals(

@@ -26,15 +26,10 @@ MAX_OVERLAP = 1.0  # m^2, of two roadblock connectors of a route without loops
 
 
 class Start(NamedTuple):
-    """Where a route begins.
+    """Where a route begins."""
 
-    Attributes:
-        block: The block the ego starts on.
-        others: Blocks it may as well start on, once per lane that qualifies.
-    """
-
-    block: int
-    others: list[int]
+    block: int  # the block the ego starts on
+    others: list[int]  # blocks it may as well start on, once per lane that qualifies
 
 
 def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str) -> list[int]:

@@ -14,17 +14,12 @@ SAME_POINT = 1e-8  # m, vertices closer than this are one
 
 
 class LanePath(NamedTuple):
-    """The path along some lanes.
+    """The path along some lanes."""
 
-    Attributes:
-        line: (V, 2) all vertices of the lanes' baselines, on which the ego is projected [m].
-        line_arc: (V,) arc length at each of them [m].
-        driven: What poses are read from: without repeated vertices.
-    """
-
+    # (V, 2) all vertices of the lanes' baselines, on which the ego is projected [m]
     line: FloatArray
-    line_arc: FloatArray
-    driven: Path
+    line_arc: FloatArray  # (V,) arc length at each of them [m]
+    driven: Path  # what poses are read from: without repeated vertices
 
     @property
     def end(self) -> float:

@@ -10,15 +10,11 @@ Neighbours = Callable[[int], Iterable[int]]
 
 
 class Search(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-        path: From the start to the goal; without one, to the place that comes nearest to it.
-        found: Whether a goal was reached.
-    """
-
+    # from the start to the goal; without one, to the place that comes nearest to it
     path: list[int]
-    found: bool
+    found: bool  # whether a goal was reached
 
 
 def search_levels(

@@ -60,29 +60,17 @@ def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) ->
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        versions: Of Python and the packages that matter.
-        torch: What learned planners would run on.
-        cores: Cores this process may use.
-        memory: Memory of the machine [bytes], 0 where unknown.
-        workers: Suggested number of worker processes.
-        kernel_cache: Folder of compiled kernels, empty for the default.
-        seconds: How long the checks took, compilation included [s].
-        cases: Reference values compared.
-        mismatches: Those that differ, in words.
-    """
-
-    versions: dict[str, str]
-    torch: str
-    cores: int
-    memory: int
-    workers: int
-    kernel_cache: str
-    seconds: float
-    cases: int
-    mismatches: tuple[str, ...]
+    versions: dict[str, str]  # of Python and the packages that matter
+    torch: str  # what learned planners would run on
+    cores: int  # cores this process may use
+    memory: int  # memory of the machine [bytes], 0 where unknown
+    workers: int  # suggested number of worker processes
+    kernel_cache: str  # folder of compiled kernels, empty for the default
+    seconds: float  # how long the checks took, compilation included [s]
+    cases: int  # reference values compared
+    mismatches: tuple[str, ...]  # those that differ, in words
 
     @property
     def is_well(self) -> bool:

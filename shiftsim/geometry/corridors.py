@@ -23,21 +23,13 @@ _QUARTER_SEGMENTS = 16  # of the round joins
 
 
 class Stretch(NamedTuple):
-    """A stretch of a polyline and the half width of its corridor.
+    """A stretch of a polyline and the half width of its corridor."""
 
-    Attributes:
-        xy: (K, 2) vertices of the whole polyline [m].
-        runs: Bounds of its runs, as in `Path`.
-        begin: First vertex of the stretch.
-        end: One past its last vertex.
-        half_width: Radius of the buffer around it [m].
-    """
-
-    xy: FloatArray
-    runs: FloatArray
-    begin: int
-    end: int
-    half_width: float
+    xy: FloatArray  # (K, 2) vertices of the whole polyline [m]
+    runs: FloatArray  # bounds of its runs, as in `Path`
+    begin: int  # first vertex of the stretch
+    end: int  # one past its last vertex
+    half_width: float  # radius of the buffer around it [m]
 
 
 @lean_kernel

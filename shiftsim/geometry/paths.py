@@ -17,19 +17,12 @@ _SLACK = 1e-6  # m, more than rounding can change a distance by
 
 
 class Path(NamedTuple):
-    """A polyline with headings. K vertices, duplicates allowed.
+    """A polyline with headings. K vertices, duplicates allowed."""
 
-    Attributes:
-        xy: (K, 2) vertices [m].
-        heading: (K,) unwrapped heading at each of them [rad].
-        progress: (K,) arc length at each of them [m].
-        runs: (R, 4) bounds of segments 8 r … 8 r + 7: min x, min y, max x, max y [m].
-    """
-
-    xy: FloatArray
-    heading: FloatArray
-    progress: FloatArray
-    runs: FloatArray
+    xy: FloatArray  # (K, 2) vertices [m]
+    heading: FloatArray  # (K,) unwrapped heading at each of them [rad]
+    progress: FloatArray  # (K,) arc length at each of them [m]
+    runs: FloatArray  # (R, 4) bounds of segments 8 r … 8 r + 7: min x, min y, max x, max y [m]
 
 
 def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:

@@ -35,19 +35,12 @@ BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal s
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What a report shows.
+    """What a report shows."""
 
-    Attributes:
-        tables: Kinds of tables, of `TABLES`.
-        by: Splits the rows of the score table further.
-        beside: Show the published figures as well.
-        allow_partial: Show labelled means of incomplete groups.
-    """
-
-    tables: tuple[str, ...] = TABLES
-    by: str | None = None
-    beside: bool = False
-    allow_partial: bool = False
+    tables: tuple[str, ...] = TABLES  # kinds of tables, of `TABLES`
+    by: str | None = None  # splits the rows of the score table further
+    beside: bool = False  # show the published figures as well
+    allow_partial: bool = False  # show labelled means of incomplete groups
 
     def __post_init__(self) -> None:
         for name in self.tables:

@@ -28,17 +28,11 @@ _BARS = "bars: 95 % bootstrap interval over recordings"
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture.
+    """One picture."""
 
-    Attributes:
-        name: Of its file, without ending.
-        title: What it shows.
-        drawn: The matplotlib figure.
-    """
-
-    name: str
-    title: str
-    drawn: Any
+    name: str  # of its file, without ending
+    title: str  # what it shows
+    drawn: Any  # the matplotlib figure
 
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""

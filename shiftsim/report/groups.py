@@ -26,54 +26,31 @@ TRAFFIC = {"nonreactive": "NR", "reactive": "R"}
 
 @dataclass(frozen=True, slots=True)
 class KnownSet:
-    """A published list of scenarios, as far as it is known.
+    """A published list of scenarios, as far as it is known."""
 
-    Attributes:
-        name: As split.
-        label: As in tables.
-        thresholds: Threshold profile of the benchmark.
-        count: Number of its scenarios.
-        sha256: Of its tokens, sorted and joined by newlines.
-        tokens: The tokens, where they may be shipped.
-    """
-
-    name: str
-    label: str
-    thresholds: str
-    count: int
-    sha256: str
-    tokens: tuple[str, ...] = ()
+    name: str  # as split
+    label: str  # as in tables
+    thresholds: str  # threshold profile of the benchmark
+    count: int  # number of its scenarios
+    sha256: str  # of its tokens, sorted and joined by newlines
+    tokens: tuple[str, ...] = ()  # the tokens, where they may be shipped
 
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """The scenarios of a run.
+    """The scenarios of a run."""
 
-    Attributes:
-        name: Of the split.
-        label: What stands in tables; says so where it is a part only, as `demo-mini (4/16)`.
-        known: Name of the published list that this is, or is a part of; empty for an own list.
-        whole: Scenarios of the whole list; those of the run where no more is known.
-        thresholds: Threshold profile.
-        metric_version: Version of the metric definitions.
-        controller: How plans moved the ego.
-        tokens: (N,) the scenarios, sorted.
-        cities: (N,) city of each, empty where no rollout finished.
-        recordings: (N,) recording of each.
-        types: (N,) type of each.
-    """
-
-    name: str
-    label: str
-    known: str
-    whole: int
-    thresholds: str
-    metric_version: str
-    controller: str
-    tokens: tuple[str, ...]
-    cities: tuple[str, ...]
-    recordings: tuple[str, ...]
-    types: tuple[str, ...]
+    name: str  # of the split
+    label: str  # what stands in tables; says so where it is a part only, as `demo-mini (4/16)`
+    known: str  # name of the published list that this is, or is a part of; empty for an own list
+    whole: int  # scenarios of the whole list; those of the run where no more is known
+    thresholds: str  # threshold profile
+    metric_version: str  # version of the metric definitions
+    controller: str  # how plans moved the ego
+    tokens: tuple[str, ...]  # (N,) the scenarios, sorted
+    cities: tuple[str, ...]  # (N,) city of each, empty where no rollout finished
+    recordings: tuple[str, ...]  # (N,) recording of each
+    types: tuple[str, ...]  # (N,) type of each
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -107,24 +84,15 @@ class DataSet:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """All rollouts of one planner under one noise in one run.
+    """All rollouts of one planner under one noise in one run."""
 
-    Attributes:
-        run: The run.
-        data: Its scenarios.
-        traffic: `NR`, `R`, or another mode's name.
-        planner: Name, made unique among the runs of a report.
-        noise: Name.
-        seeds: The seeds.
-        values: (S, N, C) seeds, scenarios, `COLUMNS`, in [0, 1]; NaN where nothing finished.
-    """
-
-    run: Run
-    data: DataSet
-    traffic: str
-    planner: str
-    noise: str
-    seeds: tuple[int, ...]
+    run: Run  # the run
+    data: DataSet  # its scenarios
+    traffic: str  # `NR`, `R`, or another mode's name
+    planner: str  # name, made unique among the runs of a report
+    noise: str  # name
+    seeds: tuple[int, ...]  # the seeds
+    # (S, N, C) seeds, scenarios, `COLUMNS`, in [0, 1]; NaN where nothing finished
     values: FloatArray
 
     @property

@@ -6,29 +6,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Numbers copied from the paper; scores are times 100.
+    """Numbers copied from the paper; scores are times 100."""
 
-    Attributes:
-        source: Where they are from.
-        cities: Names of each site by its abbreviation, in the paper's order.
-        scenarios: Scenarios of each site, by abbreviation.
-        columns: Columns of `semantic_shift`: sets, sites, metrics.
-        semantic_shift: Values by traffic and planner.
-        noises: Columns of `robustness`.
-        robustness: By traffic, set and planner: mean and deviation of each noise.
-        sets: Columns of `comparison`.
-        comparison: Properties of the data sets, by name of the property.
-    """
-
-    source: str
+    source: str  # where they are from
+    # names of each site by its abbreviation, in the paper's order
     cities: Mapping[str, Sequence[str]]
-    scenarios: Mapping[str, int]
-    columns: Sequence[str]
-    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]
-    noises: Sequence[str]
+    scenarios: Mapping[str, int]  # scenarios of each site, by abbreviation
+    columns: Sequence[str]  # columns of `semantic_shift`: sets, sites, metrics
+    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]  # values by traffic and planner
+    noises: Sequence[str]  # columns of `robustness`
+    # by traffic, set and planner: mean and deviation of each noise
     robustness: Mapping[str, Mapping[str, Mapping[str, Sequence[Sequence[float]]]]]
-    sets: Sequence[str]
-    comparison: Mapping[str, Sequence[str]]
+    sets: Sequence[str]  # columns of `comparison`
+    comparison: Mapping[str, Sequence[str]]  # properties of the data sets, by name of the property
 
     def abbreviation(self, city: str) -> str:
         """The paper's abbreviation of a city; empty for other cities."""

@@ -36,24 +36,16 @@ _REASONS = {
 
 @dataclass(frozen=True, slots=True)
 class ScoreRow:
-    """One line of a score table.
+    """One line of a score table."""
 
-    Attributes:
-        labels: Planner, noise, and what else tells the lines apart.
-        num_done: Finished tasks.
-        num_expected: Tasks of a complete run.
-        num_scenarios: Scenarios of a complete run.
-        num_seeds: Seeds.
-        means: Mean of each column of `COLUMNS` in [0, 1]; empty when nothing finished.
-        deviations: Standard deviation over the seeds' means; empty for a single seed.
-    """
-
-    labels: tuple[str, ...]
-    num_done: int
-    num_expected: int
-    num_scenarios: int
-    num_seeds: int
+    labels: tuple[str, ...]  # planner, noise, and what else tells the lines apart
+    num_done: int  # finished tasks
+    num_expected: int  # tasks of a complete run
+    num_scenarios: int  # scenarios of a complete run
+    num_seeds: int  # seeds
+    # mean of each column of `COLUMNS` in [0, 1]; empty when nothing finished
     means: dict[str, float]
+    # standard deviation over the seeds' means; empty for a single seed
     deviations: dict[str, float]
 
     @property

@@ -73,25 +73,15 @@ def _blocks(draws: int) -> list[int]:
 
 
 class Comparison(NamedTuple):
-    """Two planners on the same scenarios.
+    """Two planners on the same scenarios."""
 
-    Attributes:
-        difference: Mean of first minus second.
-        interval: Of that mean; None with fewer than two clusters.
-        p_value: Two-sided, that the sign of every recording's difference is a toss of a coin.
-        smallest_p: The smallest value the test can give with so few recordings.
-        wins: Scenarios on which the first is better.
-        ties: Scenarios on which both are equal.
-        losses: Scenarios on which the first is worse.
-    """
-
-    difference: float
-    interval: Interval | None
-    p_value: float
-    smallest_p: float
-    wins: int
-    ties: int
-    losses: int
+    difference: float  # mean of first minus second
+    interval: Interval | None  # of that mean; None with fewer than two clusters
+    p_value: float  # two-sided, that the sign of every recording's difference is a toss of a coin
+    smallest_p: float  # the smallest value the test can give with so few recordings
+    wins: int  # scenarios on which the first is better
+    ties: int  # scenarios on which both are equal
+    losses: int  # scenarios on which the first is worse
 
 
 def compare(

@@ -9,15 +9,10 @@ _GAP = 2  # blanks between columns of text
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number and how many digits of it are shown.
+    """A number and how many digits of it are shown."""
 
-    Attributes:
-        value: The number.
-        digits: Behind the point.
-    """
-
-    value: float
-    digits: int = 2
+    value: float  # the number
+    digits: int = 2  # behind the point
 
     def __str__(self) -> str:
         return f"{self.value:.{self.digits}f}"
@@ -36,19 +31,13 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A score times 100, or the reason why there is none.
+    """A score times 100, or the reason why there is none."""
 
-    Attributes:
-        mean: Mean over scenarios, then over seeds; None when withheld.
-        std: Standard deviation over the seeds' means; None for one seed or when withheld.
-        done: Finished rollouts.
-        expected: Rollouts of a complete group.
-    """
-
-    mean: float | None
+    mean: float | None  # mean over scenarios, then over seeds; None when withheld
+    # standard deviation over the seeds' means; None for one seed or when withheld
     std: float | None
-    done: int
-    expected: int
+    done: int  # finished rollouts
+    expected: int  # rollouts of a complete group
 
     @property
     def label(self) -> str:
@@ -70,25 +59,15 @@ Cell: TypeAlias = str | Number | Estimate | Interval | None
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        name: Of its files and LaTeX label.
-        title: What it shows.
-        header: Names of the columns.
-        rows: Cells; None where there is nothing to say.
-        num_labels: Leading columns that hold text.
-        notes: What a reader must know to use the numbers.
-        full: The same for machines, where it is another table.
-    """
-
-    name: str
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    num_labels: int
-    notes: tuple[str, ...] = ()
-    full: "Table | None" = None
+    name: str  # of its files and LaTeX label
+    title: str  # what it shows
+    header: tuple[str, ...]  # names of the columns
+    rows: tuple[tuple[Cell, ...], ...]  # cells; None where there is nothing to say
+    num_labels: int  # leading columns that hold text
+    notes: tuple[str, ...] = ()  # what a reader must know to use the numbers
+    full: "Table | None" = None  # the same for machines, where it is another table
 
     def __post_init__(self) -> None:
         for row in self.rows:

@@ -49,21 +49,13 @@ def parse_workers(text: str) -> int:
 
 
 class Option(NamedTuple):
-    """A setting on the command line, and what its values may be.
+    """A setting on the command line, and what its values may be."""
 
-    Attributes:
-        help: What the option is for.
-        flags: Its names, where they are not the name of the setting.
-        choices: The values there are; empty for any.
-        least: Smallest value; None for any.
-        parse: Makes the value from the text of the command line.
-    """
-
-    help: str
-    flags: tuple[str, ...] = ()
-    choices: tuple[str, ...] = ()
-    least: int | None = None
-    parse: Callable[[str], Any] | None = None
+    help: str  # what the option is for
+    flags: tuple[str, ...] = ()  # its names, where they are not the name of the setting
+    choices: tuple[str, ...] = ()  # the values there are; empty for any
+    least: int | None = None  # smallest value; None for any
+    parse: Callable[[str], Any] | None = None  # makes the value from the text of the command line
 
 
 def _setting(default: Any, help: str, *flags: str, **more: Any) -> Any:

@@ -34,21 +34,13 @@ _AXES = ("x [m]", "y [m]", "heading [rad]")
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """The first step at which two rollouts differ.
+    """The first step at which two rollouts differ."""
 
-    Attributes:
-        iteration: The step.
-        seconds: Its time since the start [s].
-        quantity: What differs first, with its unit.
-        first: Its value in the first run.
-        second: Its value in the second run.
-    """
-
-    iteration: int
-    seconds: float
-    quantity: str
-    first: float
-    second: float
+    iteration: int  # the step
+    seconds: float  # its time since the start [s]
+    quantity: str  # what differs first, with its unit
+    first: float  # its value in the first run
+    second: float  # its value in the second run
 
     def __str__(self) -> str:
         name, _, unit = self.quantity.partition(" [")
@@ -61,50 +53,31 @@ class Departure:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A rollout whose score is another one.
+    """A rollout whose score is another one."""
 
-    Attributes:
-        task: Key in the first run.
-        planner: Planner of the second run.
-        first: Score in the first run.
-        second: Score in the second run.
-        metrics: Scores of the metrics that differ, in both runs.
-        departure: Where the rollouts part; None where they do not, or are not stored.
-        note: Why there is no departure.
-    """
-
-    task: Task
-    planner: str
-    first: float
-    second: float
+    task: Task  # key in the first run
+    planner: str  # planner of the second run
+    first: float  # score in the first run
+    second: float  # score in the second run
+    # scores of the metrics that differ, in both runs
     metrics: dict[str, tuple[float | None, float | None]]
+    # where the rollouts part; None where they do not, or are not stored
     departure: Departure | None
-    note: str
+    note: str  # why there is no departure
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Two runs compared.
+    """Two runs compared."""
 
-    Attributes:
-        settings: Names of the settings that results depend on and that differ.
-        same: Rollouts with the same score.
-        better: Rollouts that are better in the second run.
-        worse: Rollouts that are worse in it.
-        only_first: Rollouts that finished in the first run alone.
-        only_second: Rollouts that finished in the second run alone.
-        means: Mean score of the common rollouts in both runs.
-        changes: The rollouts that changed most.
-    """
-
-    settings: tuple[str, ...]
-    same: int
-    better: int
-    worse: int
-    only_first: int
-    only_second: int
-    means: tuple[float, float]
-    changes: tuple[Change, ...]
+    settings: tuple[str, ...]  # names of the settings that results depend on and that differ
+    same: int  # rollouts with the same score
+    better: int  # rollouts that are better in the second run
+    worse: int  # rollouts that are worse in it
+    only_first: int  # rollouts that finished in the first run alone
+    only_second: int  # rollouts that finished in the second run alone
+    means: tuple[float, float]  # mean score of the common rollouts in both runs
+    changes: tuple[Change, ...]  # the rollouts that changed most
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON values."""

@@ -28,18 +28,12 @@ Outcomes: TypeAlias = Generator[Outcome[Batch, list[TaskResult]], None, None]
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run is.
+    """How far a run is."""
 
-    Attributes:
-        done: Tasks that have ended, failed ones and those of an earlier attempt included.
-        total: Tasks of the run.
-        failed: Tasks that failed, in this attempt.
-        seconds: Time spent so far by purpose, over all workers [s].
-    """
-
-    done: int
-    total: int
-    failed: int
+    done: int  # tasks that have ended, failed ones and those of an earlier attempt included
+    total: int  # tasks of the run
+    failed: int  # tasks that failed, in this attempt
+    # time spent so far by purpose, over all workers [s]
     seconds: dict[str, float] = field(default_factory=dict)
 
     def after(self, result: TaskResult) -> "Progress":

@@ -55,17 +55,11 @@ _SCHEMA = pa.schema(
 
 @dataclass(frozen=True, slots=True)
 class FilterConfig:
-    """What a scenario must satisfy.
+    """What a scenario must satisfy."""
 
-    Attributes:
-        thresholds: Threshold profile of collisions and drivable area.
-        min_path_m: Shortest path from iteration 0 to the end [m].
-        min_progress_share: Smallest share of that path that is progress along the route.
-    """
-
-    thresholds: str = "deepplan"
-    min_path_m: float = 5.0
-    min_progress_share: float = 0.5
+    thresholds: str = "deepplan"  # threshold profile of collisions and drivable area
+    min_path_m: float = 5.0  # shortest path from iteration 0 to the end [m]
+    min_progress_share: float = 0.5  # smallest share of that path that is progress along the route
 
     def __post_init__(self) -> None:
         thresholds_of(self.thresholds)
@@ -79,19 +73,13 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class Verdicts:
-    """The verdicts of a store.
+    """The verdicts of a store."""
 
-    Attributes:
-        path: The file.
-        rows: One row per scenario, sorted by token; the columns of the file.
-        hash: Digest of the file.
-        config: What the scenarios had to satisfy.
-    """
-
-    path: Path
+    path: Path  # the file
+    # one row per scenario, sorted by token; the columns of the file
     rows: tuple[Mapping[str, Any], ...]
-    hash: str
-    config: Mapping[str, Any]
+    hash: str  # digest of the file
+    config: Mapping[str, Any]  # what the scenarios had to satisfy
 
     @property
     def accepted(self) -> tuple[str, ...]:

@@ -59,19 +59,12 @@ _CHUNK = 256  # results turned into tables at once
 
 
 class Ended(NamedTuple):
-    """A task that has ended.
+    """A task that has ended."""
 
-    Attributes:
-        number: Its entry in the journal.
-        status: What became of it.
-        place: Where its rollout is, where a Parquet file has it already.
-        has_rollout: Whether the journal has its rollout.
-    """
-
-    number: int
-    status: str
-    place: Place | None
-    has_rollout: bool
+    number: int  # its entry in the journal
+    status: str  # what became of it
+    place: Place | None  # where its rollout is, where a Parquet file has it already
+    has_rollout: bool  # whether the journal has its rollout
 
 
 class RunWriter:

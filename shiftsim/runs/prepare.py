@@ -42,37 +42,21 @@ _MEMORY_OF_NETWORK = 1.5e9  # bytes per worker
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that has been checked and can start.
+    """A run that has been checked and can start."""
 
-    Attributes:
-        config: The settings, names resolved.
-        store: Folder or URL of the scenario store.
-        planners: The planners, by name.
-        noises: The noise models, by name.
-        batches: All tasks whose scenario exists, as they are handed out.
-        missing: Tasks whose scenario the store does not hold.
-        split: Name of the split.
-        tokens: All scenarios of the run, whatever the shard.
-        num_dropped: Scenarios left out because the filter dropped them.
-        determining: Everything that the scores depend on.
-        folder: Where the run folder will be.
-        before: What it holds now.
-        workers: Number of worker processes.
-    """
-
-    config: RunConfig
-    store: str
-    planners: Mapping[str, RunPlanner]
-    noises: Mapping[str, NoiseModel]
-    batches: tuple[Batch, ...]
-    missing: tuple[Task, ...]
-    split: str
-    tokens: tuple[str, ...]
-    num_dropped: int
-    determining: dict[str, Any]
-    folder: Path
-    before: State
-    workers: int
+    config: RunConfig  # the settings, names resolved
+    store: str  # folder or URL of the scenario store
+    planners: Mapping[str, RunPlanner]  # the planners, by name
+    noises: Mapping[str, NoiseModel]  # the noise models, by name
+    batches: tuple[Batch, ...]  # all tasks whose scenario exists, as they are handed out
+    missing: tuple[Task, ...]  # tasks whose scenario the store does not hold
+    split: str  # name of the split
+    tokens: tuple[str, ...]  # all scenarios of the run, whatever the shard
+    num_dropped: int  # scenarios left out because the filter dropped them
+    determining: dict[str, Any]  # everything that the scores depend on
+    folder: Path  # where the run folder will be
+    before: State  # what it holds now
+    workers: int  # number of worker processes
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -81,21 +65,13 @@ class Prepared:
 
 
 class Chosen(NamedTuple):
-    """The scenarios of a run.
+    """The scenarios of a run."""
 
-    Attributes:
-        split: Name of the split.
-        present: Tokens that the store holds.
-        missing: Tokens that it does not hold.
-        num_dropped: Scenarios left out because the filter dropped them.
-        determining: What identifies them.
-    """
-
-    split: str
-    present: list[str]
-    missing: list[str]
-    num_dropped: int
-    determining: dict[str, Any]
+    split: str  # name of the split
+    present: list[str]  # tokens that the store holds
+    missing: list[str]  # tokens that it does not hold
+    num_dropped: int  # scenarios left out because the filter dropped them
+    determining: dict[str, Any]  # what identifies them
 
 
 def prepare(

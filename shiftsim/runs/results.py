@@ -87,31 +87,21 @@ TABLES = {
 
 @dataclass(frozen=True, slots=True)
 class TaskResult:
-    """What became of one task.
+    """What became of one task."""
 
-    Attributes:
-        task: The task.
-        status: One of `STATUSES`.
-        scenario_type: Type of the scenario, where it could be read.
-        error: What went wrong, empty for `ok`.
-        hint: What to do about it.
-        traceback: Where it went wrong.
-        seconds: Durations by column name of `tasks.parquet` [s], or [ms] where the name says so.
-        scores: The row of `scores.parquet` beyond the key; empty unless `ok`.
-        metrics: The rows of `metrics.parquet` beyond the key.
-        rollout: The rollout, encoded; empty when it is not to be stored.
-    """
-
-    task: Task
-    status: str
-    scenario_type: str = ""
-    error: str = ""
-    hint: str = ""
-    traceback: str = ""
+    task: Task  # the task
+    status: str  # one of `STATUSES`
+    scenario_type: str = ""  # type of the scenario, where it could be read
+    error: str = ""  # what went wrong, empty for `ok`
+    hint: str = ""  # what to do about it
+    traceback: str = ""  # where it went wrong
+    # durations by column name of `tasks.parquet` [s], or [ms] where the name says so
     seconds: dict[str, float] = field(default_factory=dict)
+    # the row of `scores.parquet` beyond the key; empty unless `ok`
     scores: dict[str, Any] = field(default_factory=dict)
+    # the rows of `metrics.parquet` beyond the key
     metrics: list[dict[str, Any]] = field(default_factory=list)
-    rollout: bytes = b""
+    rollout: bytes = b""  # the rollout, encoded; empty when it is not to be stored
 
 
 @dataclass(frozen=True)

@@ -77,19 +77,12 @@ _KEY = [
 
 
 class Task(NamedTuple):
-    """One rollout to be made; also its key in every table, and the order of their rows.
+    """One rollout to be made; also its key in every table, and the order of their rows."""
 
-    Attributes:
-        planner: Planner name as in tables.
-        noise: Noise name.
-        seed: Seed of the noise; 0 without noise.
-        token: Scenario.
-    """
-
-    planner: str
-    noise: str
-    seed: int
-    token: str
+    planner: str  # planner name as in tables
+    noise: str  # noise name
+    seed: int  # seed of the noise; 0 without noise
+    token: str  # scenario
 
 
 def describe(task: Task) -> str:
@@ -99,17 +92,11 @@ def describe(task: Task) -> str:
 
 
 class Place(NamedTuple):
-    """Where a rollout is.
+    """Where a rollout is."""
 
-    Attributes:
-        file: The Parquet file.
-        row: Its first row there.
-        rows: Number of its rows.
-    """
-
-    file: Path
-    row: int
-    rows: int
+    file: Path  # the Parquet file
+    row: int  # its first row there
+    rows: int  # number of its rows
 
 
 def rollout_rows(log: SimulationLog, *, with_tracks: bool) -> pa.RecordBatch:

@@ -130,15 +130,10 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """A named list of scenario tokens.
+    """A named list of scenario tokens."""
 
-    Attributes:
-        name: As in tables and folder names.
-        tokens: The tokens, each once, in the order listed.
-    """
-
-    name: str
-    tokens: tuple[str, ...]
+    name: str  # as in tables and folder names
+    tokens: tuple[str, ...]  # the tokens, each once, in the order listed
 
     @property
     def hash(self) -> str:

@@ -33,13 +33,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What a worker is handed at once.
+    """What a worker is handed at once."""
 
-    Attributes:
-        tasks: One task, or several of one planner that are driven in lock step.
-    """
-
-    tasks: tuple[Task, ...]
+    tasks: tuple[Task, ...]  # one task, or several of one planner that are driven in lock step
 
     @property
     def planner(self) -> str:
@@ -95,19 +91,12 @@ class Scenarios:
 
 @dataclass
 class TaskRunner:
-    """Does batches of tasks, one after the other.
+    """Does batches of tasks, one after the other."""
 
-    Attributes:
-        config: The settings of the run.
-        store: Folder or URL of the scenario store.
-        planners: The planners, by name.
-        noises: The noise models, by name.
-    """
-
-    config: RunConfig
-    store: str
-    planners: Mapping[str, RunPlanner]
-    noises: Mapping[str, NoiseModel]
+    config: RunConfig  # the settings of the run
+    store: str  # folder or URL of the scenario store
+    planners: Mapping[str, RunPlanner]  # the planners, by name
+    noises: Mapping[str, NoiseModel]  # the noise models, by name
     _made: dict[str, Planner] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:

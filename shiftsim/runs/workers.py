@@ -47,19 +47,12 @@ _ONE_THREAD = {
 
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[T, R]):
-    """What became of one task.
+    """What became of one task."""
 
-    Attributes:
-        task: The task.
-        result: What the function returned; None when the worker died.
-        death: How the worker died, empty when it did not.
-        is_late: Whether it was killed because the task took longer than the limit.
-    """
-
-    task: T
-    result: R | None
-    death: str = ""
-    is_late: bool = False
+    task: T  # the task
+    result: R | None  # what the function returned; None when the worker died
+    death: str = ""  # how the worker died, empty when it did not
+    is_late: bool = False  # whether it was killed because the task took longer than the limit
 
 
 def map_unordered(

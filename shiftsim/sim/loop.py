@@ -32,22 +32,16 @@ CONTROLLERS = ("lqr", "perfect", "log-playback")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How a scenario is driven, whichever scenario and planner it is.
+    """How a scenario is driven, whichever scenario and planner it is."""
 
-    Attributes:
-        noise: Actuation noise, by name or model; added to the command before the motion model.
-        seed: Seed of the noise, and of planners that sample.
-        traffic: `nonreactive`, `reactive`, or a traffic model.
-        controller: `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan
-            says) or `log-playback` (the ego is where the recording was; plans are ignored).
-        strict: Fail where the planner falls back instead of counting the step.
-    """
-
+    # actuation noise, by name or model; added to the command before the motion model
     noise: str | NoiseModel = "none"
-    seed: int = 0
-    traffic: str | Traffic = "nonreactive"
+    seed: int = 0  # seed of the noise, and of planners that sample
+    traffic: str | Traffic = "nonreactive"  # `nonreactive`, `reactive`, or a traffic model
+    # `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says) or `log-
+    # playback` (the ego is where the recording was; plans are ignored)
     controller: str = "lqr"
-    strict: bool = False
+    strict: bool = False  # fail where the planner falls back instead of counting the step
 
     def __post_init__(self) -> None:
         one_of("controller", self.controller, CONTROLLERS)

@@ -14,18 +14,12 @@ _GOOD, _NOT_INCREASING, _NOT_FINITE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT = ran
 
 
 class Fault(NamedTuple):
-    """What is wrong with a plan.
+    """What is wrong with a plan."""
 
-    Attributes:
-        check: Name of the rule: `type`, `shapes`, `times`, `finite`, `covers the next step` or
-            `three poses`.
-        message: What is wrong, with the offending value.
-        hint: What to do about it.
-    """
-
+    # name of the rule: `type`, `shapes`, `times`, `finite`, `covers the next step` or `three poses`
     check: str
-    message: str
-    hint: str
+    message: str  # what is wrong, with the offending value
+    hint: str  # what to do about it
 
 
 def validate_plan(plan: object, now_us: int, next_us: int) -> None:

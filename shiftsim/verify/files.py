@@ -29,25 +29,16 @@ Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
 
 @dataclass
 class Source:
-    """Named values of one file, or of a part of it.
+    """Named values of one file, or of a part of it."""
 
-    Attributes:
-        name: Name of the file without its ending; begins the names of compared quantities.
-        what: What one of its values is called.
-        values: All values by name.
-        report: Receives the comparisons.
-        used: Names of the values that were read or noted; shared by all parts of a file.
-        rows: Which rows of the values this part has; None for all.
-        prefix: Of the names in the file, for a part with shorter ones.
-    """
-
-    name: str
-    what: str
-    values: Mapping[str, Any]
-    report: Report
+    name: str  # name of the file without its ending; begins the names of compared quantities
+    what: str  # what one of its values is called
+    values: Mapping[str, Any]  # all values by name
+    report: Report  # receives the comparisons
+    # names of the values that were read or noted; shared by all parts of a file
     used: set[str] = field(default_factory=set)
-    rows: Any = None
-    prefix: str = ""
+    rows: Any = None  # which rows of the values this part has; None for all
+    prefix: str = ""  # of the names in the file, for a part with shorter ones
     _parts: "dict[str, list[Source]]" = field(init=False, default_factory=dict)
 
     def __contains__(self, name: str) -> bool:

@@ -35,18 +35,14 @@ class Quantity:
 
 @dataclass
 class Report:
-    """All comparisons so far.
+    """All comparisons so far."""
 
-    Attributes:
-        quantities: Tally by quantity, in the order of first appearance.
-        mismatches: One line per case that differs.
-        not_covered: Count by description of what should be compared and was not.
-        informative: Descriptions of what need not be compared.
-    """
-
+    # tally by quantity, in the order of first appearance
     quantities: dict[str, Quantity] = field(default_factory=dict)
-    mismatches: list[str] = field(default_factory=list)
+    mismatches: list[str] = field(default_factory=list)  # one line per case that differs
+    # count by description of what should be compared and was not
     not_covered: dict[str, int] = field(default_factory=dict)
+    # descriptions of what need not be compared
     informative: list[str] = field(default_factory=list)
 
     def compare(

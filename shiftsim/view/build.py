@@ -17,17 +17,11 @@ from shiftsim.view.scene import Shown
 
 @dataclass(frozen=True)
 class Choice:
-    """Which rollouts to show.
+    """Which rollouts to show."""
 
-    Attributes:
-        planners: Only these; empty for all.
-        noises: Only these; empty for all.
-        seeds: Only these; empty for the first one of each planner and noise.
-    """
-
-    planners: tuple[str, ...] = ()
-    noises: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = ()
+    planners: tuple[str, ...] = ()  # only these; empty for all
+    noises: tuple[str, ...] = ()  # only these; empty for all
+    seeds: tuple[int, ...] = ()  # only these; empty for the first one of each planner and noise
 
     def of(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks chosen among those of one scenario, by planner, noise and seed."""

@@ -22,15 +22,10 @@ _LARGEST = 2**31 - 1
 
 @dataclass(frozen=True, slots=True)
 class Quantised:
-    """An array to be stored as multiples of a step.
+    """An array to be stored as multiples of a step."""
 
-    Attributes:
-        values: (T, …) the values; NaN is kept.
-        step: Resolution, in the unit of the values.
-    """
-
-    values: FloatArray
-    step: float
+    values: FloatArray  # (T, …) the values; NaN is kept
+    step: float  # resolution, in the unit of the values
 
 
 def pack(fields: Mapping[str, Quantised | np.ndarray]) -> str:

@@ -30,23 +30,14 @@ _TOLERANCE = 0.05  # m, of simplified map lines
 
 @dataclass(frozen=True)
 class Shown:
-    """One rollout in a replay.
+    """One rollout in a replay."""
 
-    Attributes:
-        planner: Its planner.
-        noise: Name of the noise.
-        seed: Seed of the noise.
-        log: The rollout.
-        cls: Its score in [0, 1]; None where it was not scored.
-        metrics: Rows of `metrics.parquet`.
-    """
-
-    planner: str
-    noise: str
-    seed: int
-    log: SimulationLog
-    cls: float | None = None
-    metrics: Sequence[Mapping[str, Any]] = ()
+    planner: str  # its planner
+    noise: str  # name of the noise
+    seed: int  # seed of the noise
+    log: SimulationLog  # the rollout
+    cls: float | None = None  # its score in [0, 1]; None where it was not scored
+    metrics: Sequence[Mapping[str, Any]] = ()  # rows of `metrics.parquet`
 
 
 @dataclass(frozen=True)

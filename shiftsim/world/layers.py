@@ -43,17 +43,11 @@ class Lists(NamedTuple):
 
 
 class Polylines(NamedTuple):
-    """Many polylines: line i has the vertices `xy[ptr[i] : ptr[i + 1]]`.
+    """Many polylines: line i has the vertices `xy[ptr[i] : ptr[i + 1]]`."""
 
-    Attributes:
-        xy: (V, 2) vertices [m].
-        ptr: (M + 1,) first vertex of each line.
-        arc: (V,) arc length at each vertex from the start of its line [m].
-    """
-
-    xy: FloatArray
-    ptr: IntArray
-    arc: FloatArray
+    xy: FloatArray  # (V, 2) vertices [m]
+    ptr: IntArray  # (M + 1,) first vertex of each line
+    arc: FloatArray  # (V,) arc length at each vertex from the start of its line [m]
 
     def at(self, index: int) -> FloatArray:
         """(K, 2) vertices of line `index` [m]."""
@@ -65,27 +59,17 @@ class Polylines(NamedTuple):
 
 
 class Polygons(NamedTuple):
-    """Many polygons with holes, and a uniform grid that lists the polygons near each cell.
+    """Many polygons with holes, and a uniform grid that lists the polygons near each cell."""
 
-    Attributes:
-        xy: (V, 2) vertices of all rings; the closing vertex is not repeated [m].
-        ring_ptr: (R + 1,) first vertex of each ring.
-        poly_ptr: (M + 1,) first ring of each polygon; the first ring is the shell.
-        bounds: (M, 4) min x, min y, max x, max y [m].
-        grid: (3,) x and y of the grid's corner, cell size [m].
-        shape: (2,) number of cells along x and y.
-        cell_ptr: (cells + 1,) first entry of each cell in `cell_items`, cell = ix * shape[1] + iy.
-        cell_items: Polygon indices, ascending within a cell.
-    """
-
-    xy: FloatArray
-    ring_ptr: IntArray
-    poly_ptr: IntArray
-    bounds: FloatArray
-    grid: FloatArray
-    shape: IntArray
+    xy: FloatArray  # (V, 2) vertices of all rings; the closing vertex is not repeated [m]
+    ring_ptr: IntArray  # (R + 1,) first vertex of each ring
+    poly_ptr: IntArray  # (M + 1,) first ring of each polygon; the first ring is the shell
+    bounds: FloatArray  # (M, 4) min x, min y, max x, max y [m]
+    grid: FloatArray  # (3,) x and y of the grid's corner, cell size [m]
+    shape: IntArray  # (2,) number of cells along x and y
+    # (cells + 1,) first entry of each cell in `cell_items`, cell = ix * shape[1] + iy
     cell_ptr: IntArray
-    cell_items: IntArray
+    cell_items: IntArray  # polygon indices, ascending within a cell
 
 
 def _frozen(array: Any) -> Any:
@@ -325,16 +309,11 @@ def square_around(x: float, y: float, half_width: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Layer:
-    """Map objects of one kind: their ids and polygons.
+    """Map objects of one kind: their ids and polygons."""
 
-    Attributes:
-        ids: M object ids, in the order of the source.
-        polygons: Their areas.
-        index: Position of an id in `ids`.
-    """
-
-    ids: tuple[str, ...]
-    polygons: Polygons
+    ids: tuple[str, ...]  # M object ids, in the order of the source
+    polygons: Polygons  # their areas
+    # position of an id in `ids`
     index: dict[str, int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -38,87 +38,49 @@ LAYERS = (
 
 @dataclass(frozen=True)
 class EdgeSpec:
-    """One lane or lane connector, as a reader hands it to `build_map`.
+    """One lane or lane connector, as a reader hands it to `build_map`."""
 
-    Attributes:
-        id: Object id.
-        is_connector: Whether it is a lane connector.
-        polygon: Its area.
-        baseline: (K, 2) centre line in the direction of travel [m].
-        block_id: Id of its roadblock, or roadblock connector.
-        incoming: Ids of the edges that lead into it, in the order of the source.
-        outgoing: Ids of the edges it leads to, in the order of the source.
-        left: (K, 2) left boundary [m]; None where unknown.
-        right: (K, 2) right boundary [m].
-        left_id: Id of the left boundary.
-        right_id: Id of the right boundary.
-        speed_limit: [m/s]; None where the map has none.
-        lane_index: Position in the roadblock, 0 leftmost; None for a connector.
-        left_lane: Id of the neighbour lane on the left.
-        right_lane: Id of the neighbour lane on the right.
-        has_traffic_lights: Whether lights govern the connector.
-        stop_lines: Ids of the stop polygons that belong to those lights.
-        intersection_id: Intersection a connector lies in.
-        turn_type: 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown.
-        is_bike: Whether it is a bicycle lane.
-    """
-
-    id: str
-    is_connector: bool
-    polygon: shapely.Polygon
-    baseline: FloatArray
-    block_id: str
-    incoming: Sequence[str] = ()
-    outgoing: Sequence[str] = ()
-    left: FloatArray | None = None
-    right: FloatArray | None = None
-    left_id: str = ""
-    right_id: str = ""
-    speed_limit: float | None = None
-    lane_index: int | None = None
-    left_lane: str | None = None
-    right_lane: str | None = None
-    has_traffic_lights: bool = False
-    stop_lines: Sequence[str] = ()
-    intersection_id: str | None = None
-    turn_type: int = 4
-    is_bike: bool = False
+    id: str  # object id
+    is_connector: bool  # whether it is a lane connector
+    polygon: shapely.Polygon  # its area
+    baseline: FloatArray  # (K, 2) centre line in the direction of travel [m]
+    block_id: str  # id of its roadblock, or roadblock connector
+    incoming: Sequence[str] = ()  # ids of the edges that lead into it, in the order of the source
+    outgoing: Sequence[str] = ()  # ids of the edges it leads to, in the order of the source
+    left: FloatArray | None = None  # (K, 2) left boundary [m]; None where unknown
+    right: FloatArray | None = None  # (K, 2) right boundary [m]
+    left_id: str = ""  # id of the left boundary
+    right_id: str = ""  # id of the right boundary
+    speed_limit: float | None = None  # [m/s]; None where the map has none
+    lane_index: int | None = None  # position in the roadblock, 0 leftmost; None for a connector
+    left_lane: str | None = None  # id of the neighbour lane on the left
+    right_lane: str | None = None  # id of the neighbour lane on the right
+    has_traffic_lights: bool = False  # whether lights govern the connector
+    stop_lines: Sequence[str] = ()  # ids of the stop polygons that belong to those lights
+    intersection_id: str | None = None  # intersection a connector lies in
+    turn_type: int = 4  # 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown
+    is_bike: bool = False  # whether it is a bicycle lane
 
 
 @dataclass(frozen=True)
 class BlockSpec:
-    """One roadblock or roadblock connector, as a reader hands it to `build_map`.
+    """One roadblock or roadblock connector, as a reader hands it to `build_map`."""
 
-    Attributes:
-        id: Object id.
-        is_connector: Whether it is a roadblock connector.
-        polygon: Its area.
-        incoming: Ids of the blocks that lead into it.
-        outgoing: Ids of the blocks it leads to.
-        intersection_id: Intersection a connector lies in.
-    """
-
-    id: str
-    is_connector: bool
-    polygon: shapely.Polygon
-    incoming: Sequence[str] = ()
-    outgoing: Sequence[str] = ()
-    intersection_id: str | None = None
+    id: str  # object id
+    is_connector: bool  # whether it is a roadblock connector
+    polygon: shapely.Polygon  # its area
+    incoming: Sequence[str] = ()  # ids of the blocks that lead into it
+    outgoing: Sequence[str] = ()  # ids of the blocks it leads to
+    intersection_id: str | None = None  # intersection a connector lies in
 
 
 @dataclass(frozen=True)
 class AreaSpec:
-    """One polygon of a layer without topology.
+    """One polygon of a layer without topology."""
 
-    Attributes:
-        id: Object id.
-        polygon: Its area.
-        kind: Type number of a stop polygon or an intersection, 0 elsewhere.
-    """
-
-    id: str
-    polygon: shapely.Polygon
-    kind: int = 0
+    id: str  # object id
+    polygon: shapely.Polygon  # its area
+    kind: int = 0  # type number of a stop polygon or an intersection, 0 elsewhere
 
 
 @dataclass(frozen=True)

@@ -58,15 +58,10 @@ RULES = {
 
 
 class Policy(NamedTuple):
-    """The distribution of the action, one independent beta distribution per number. B scenes.
+    """The distribution of the action, one independent beta distribution per number. B scenes."""
 
-    Attributes:
-        alpha: (B, 2)
-        beta: (B, 2)
-    """
-
-    alpha: Tensor
-    beta: Tensor
+    alpha: Tensor  # (B, 2)
+    beta: Tensor  # (B, 2)
 
     @property
     def action(self) -> Tensor:

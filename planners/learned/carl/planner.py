@@ -58,15 +58,11 @@ Action = NDArray[np.float32]
 
 
 class CarlFeatures(NamedTuple):
-    """What the network reads.
+    """What the network reads."""
 
-    Attributes:
-        pictures: (9, 256, 256), drawn over at the next step.
-        measurements: (10,) last action, then velocity [m/s] and acceleration [m/s^2] of the centre,
-            steering angle [rad] and rate [rad/s], yaw rate [rad/s] and acceleration [rad/s^2].
-    """
-
-    pictures: Raster
+    pictures: Raster  # (9, 256, 256), drawn over at the next step
+    # (10,) last action, then velocity [m/s] and acceleration [m/s^2] of the centre, steering angle
+    # [rad] and rate [rad/s], yaw rate [rad/s] and acceleration [rad/s^2]
     measurements: NDArray[np.float32]
 
 

@@ -108,15 +108,11 @@ def _quotient(dividend: int, divisor: int) -> int:
 
 
 class Crossings(NamedTuple):
-    """Scratch for the columns at which an outline crosses the rows.
+    """Scratch for the columns at which an outline crosses the rows."""
 
-    Attributes:
-        columns: (H, V) columns of each row; an area of up to V vertices can be filled.
-        counts: (H,) how many of them are used; all 0 between two areas.
-    """
-
+    # (H, V) columns of each row; an area of up to V vertices can be filled
     columns: NDArray[np.int32]
-    counts: IntArray
+    counts: IntArray  # (H,) how many of them are used; all 0 between two areas
 
 
 def make_crossings(height: int, max_vertices: int) -> Crossings:

@@ -19,47 +19,29 @@ Values = NDArray[np.uint8]
 
 
 class Lines(NamedTuple):
-    """Polylines in chunks that are left out together where they cannot be seen.
+    """Polylines in chunks that are left out together where they cannot be seen."""
 
-    Attributes:
-        xy: (V, 2) vertices [m].
-        ptr: (M + 1,) first vertex of each line.
-        chunk_ptr: (M + 1,) first chunk of each line.
-        circles: (C, 3) a circle around each chunk: x, y, radius [m].
-    """
-
-    xy: FloatArray
-    ptr: IntArray
-    chunk_ptr: IntArray
-    circles: FloatArray
+    xy: FloatArray  # (V, 2) vertices [m]
+    ptr: IntArray  # (M + 1,) first vertex of each line
+    chunk_ptr: IntArray  # (M + 1,) first chunk of each line
+    circles: FloatArray  # (C, 3) a circle around each chunk: x, y, radius [m]
 
 
 class Roads(NamedTuple):
-    """The map as CaRL sees it. I areas: roadblocks, roadblock connectors, car parks. E edges.
+    """The map as CaRL sees it. I areas: roadblocks, roadblock connectors, car parks. E edges."""
 
-    Attributes:
-        areas: Polygons: the I areas, then the intersections.
-        order: (I,) areas in the order of the spatial index.
-        num_roadblocks: How many of the areas are roadblocks.
-        num_blocks: How many are roadblocks or roadblock connectors.
-        drivable: (I,) polygon to fill for an area: itself, for a connector its intersection, or
-            NONE.
-        block_edges: Edges of a block.
-        lines: Baselines of the E edges, then boundaries of lanes, each once.
-        lines_of: (E, 4) lines of an edge: baseline, left and right boundary, baseline; NONE where
-            it has none to draw.
-        limits: (E,) value of the speed limit.
-    """
-
-    areas: Polygons
-    order: IntArray
-    num_roadblocks: int
-    num_blocks: int
+    areas: Polygons  # polygons: the I areas, then the intersections
+    order: IntArray  # (I,) areas in the order of the spatial index
+    num_roadblocks: int  # how many of the areas are roadblocks
+    num_blocks: int  # how many are roadblocks or roadblock connectors
+    # (I,) polygon to fill for an area: itself, for a connector its intersection, or NONE
     drivable: IntArray
-    block_edges: Lists
-    lines: Lines
+    block_edges: Lists  # edges of a block
+    lines: Lines  # baselines of the E edges, then boundaries of lanes, each once
+    # (E, 4) lines of an edge: baseline, left and right boundary, baseline; NONE where it has none
+    # to draw
     lines_of: IntArray
-    limits: Values
+    limits: Values  # (E,) value of the speed limit
 
 
 def make_roads(road: VectorMap) -> Roads:

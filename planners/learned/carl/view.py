@@ -42,35 +42,21 @@ _LAST_AGENT = LAST_AGENT_KIND
 
 
 class Scratch(NamedTuple):
-    """Scratch of `draw_roads`, as large as the map needs.
+    """Scratch of `draw_roads`, as large as the map needs."""
 
-    Attributes:
-        ring: (V, 2) pixels of one ring.
-        crossings: Of its outline.
-        filled: Areas that are drawn already.
-        drawn: Lines that are drawn already.
-    """
-
-    ring: IntArray
-    crossings: Crossings
-    filled: BoolArray
-    drawn: BoolArray
+    ring: IntArray  # (V, 2) pixels of one ring
+    crossings: Crossings  # of its outline
+    filled: BoolArray  # areas that are drawn already
+    drawn: BoolArray  # lines that are drawn already
 
 
 class Boxes(NamedTuple):
-    """Objects of one moment. N objects.
+    """Objects of one moment. N objects."""
 
-    Attributes:
-        poses: (N, 3) box centre x [m], y [m], heading [rad].
-        sizes: (N, 2) length, width [m].
-        velocities: (N, 2) in the map frame [m/s].
-        kinds: (N,) AgentKind codes.
-    """
-
-    poses: FloatArray
-    sizes: FloatArray
-    velocities: FloatArray
-    kinds: IntArray
+    poses: FloatArray  # (N, 3) box centre x [m], y [m], heading [rad]
+    sizes: FloatArray  # (N, 2) length, width [m]
+    velocities: FloatArray  # (N, 2) in the map frame [m/s]
+    kinds: IntArray  # (N,) AgentKind codes
 
 
 def make_scratch(roads: Roads) -> Scratch:

@@ -56,36 +56,22 @@ Single = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Inputs of the network, not normalised, and what they were made of.
+    """Inputs of the network, not normalised, and what they were made of."""
 
-    Attributes:
-        neighbor_agents_past: (32, 21, 11) x, y, cos, sin, vx, vy, width, length, one-hot kind.
-        static_objects: (5, 10) x, y, cos, sin, width, length, one-hot kind.
-        lanes: (70, 20, 12) x, y, step to the next point, offsets to the left and to the right
-            boundary, one-hot light.
-        lanes_speed_limit: (70, 1) [m/s], 0 where unknown.
-        lanes_has_speed_limit: (70, 1).
-        route_lanes: (25, 20, 12) those of the lanes that are on the route.
-        route_lanes_speed_limit: (25, 1); the network does not read it.
-        route_lanes_has_speed_limit: (25, 1); the network does not read it.
-        noise: (11, 80, 4) standard normal start noise of the sampler.
-        edges: Edges behind the lanes.
-        agents: Tracks behind the agents.
-        route: Corrected route, blocks; None where it cannot be corrected.
-    """
-
-    neighbor_agents_past: Single
-    static_objects: Single
+    neighbor_agents_past: Single  # (32, 21, 11) x, y, cos, sin, vx, vy, width, length, one-hot kind
+    static_objects: Single  # (5, 10) x, y, cos, sin, width, length, one-hot kind
+    # (70, 20, 12) x, y, step to the next point, offsets to the left and to the right boundary, one-
+    # hot light
     lanes: Single
-    lanes_speed_limit: Single
-    lanes_has_speed_limit: BoolArray
-    route_lanes: Single
-    route_lanes_speed_limit: Single
-    route_lanes_has_speed_limit: BoolArray
-    noise: Single
-    edges: IntArray
-    agents: IntArray
-    route: tuple[int, ...] | None
+    lanes_speed_limit: Single  # (70, 1) [m/s], 0 where unknown
+    lanes_has_speed_limit: BoolArray  # (70, 1)
+    route_lanes: Single  # (25, 20, 12) those of the lanes that are on the route
+    route_lanes_speed_limit: Single  # (25, 1); the network does not read it
+    route_lanes_has_speed_limit: BoolArray  # (25, 1); the network does not read it
+    noise: Single  # (11, 80, 4) standard normal start noise of the sampler
+    edges: IntArray  # edges behind the lanes
+    agents: IntArray  # tracks behind the agents
+    route: tuple[int, ...] | None  # corrected route, blocks; None where it cannot be corrected
 
     @property
     def ego_current_state(self) -> Single:

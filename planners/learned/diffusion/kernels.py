@@ -18,20 +18,14 @@ VEHICLE, PEDESTRIAN, BICYCLE, CONE, BARRIER, SIGN, GENERIC = range(7)  # state.A
 
 
 class LaneLines(NamedTuple):
-    """Every edge of a map as the network reads it, in the map frame. E edges.
+    """Every edge of a map as the network reads it, in the map frame. E edges."""
 
-    Attributes:
-        rows: (E, POINTS, 8) x, y, step to the next point (0 at the last), offset to the left and
-            to the right boundary [m].
-        bounds: (E, 4) min x, min y, max x, max y of the centre lines [m].
-        limits: (E,) speed limits [m/s], NaN where the map has none.
-        blocks: (E,) block of each edge, -1 where unknown.
-    """
-
+    # (E, POINTS, 8) x, y, step to the next point (0 at the last), offset to the left and to the
+    # right boundary [m]
     rows: FloatArray
-    bounds: FloatArray
-    limits: FloatArray
-    blocks: IntArray
+    bounds: FloatArray  # (E, 4) min x, min y, max x, max y of the centre lines [m]
+    limits: FloatArray  # (E,) speed limits [m/s], NaN where the map has none
+    blocks: IntArray  # (E,) block of each edge, -1 where unknown
 
 
 @kernel

@@ -24,46 +24,26 @@ _LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
 
 @dataclass(frozen=True, slots=True)
 class SceneTensors:
-    """Agents and map of B scenes: A rows of agents of which the first is the ego, M polygons.
+    """Agents and map of B scenes: A rows of agents of which the first is the ego, M polygons."""
 
-    Attributes:
-        position: (B, A, 21, 2) in the ego frame [m].
-        heading: (B, A, 21) [rad].
-        velocity: (B, A, 21, 2) [m/s].
-        shape: (B, A, 21, 2) width, length [m].
-        valid: (B, A, 21)
-        category: (B, A) indices of kinds.
-        current_state: (B, >= 6) x, y, heading, speed, acceleration, steering angle.
-        points: (B, M, K, 2) of the centre lines [m]; of PLUTO (B, M, 3, K, 2) of the boundaries,
-            too.
-        vectors: (B, M, K, 2) along the centre line, to the next point [m].
-        orientations: (B, M, K) of these vectors [rad].
-        centers: (B, M, 3) pose that stands for the polygon.
-        kind: (B, M) 0 lane, 1 connector, 2 crosswalk.
-        on_route: (B, M) 1 where the polygon is on the route.
-        light: (B, M) 0 green, 1 yellow, 2 red, 3 unknown.
-        has_limit: (B, M)
-        limit: (B, M) speed limit [m/s].
-        point_valid: (B, M, K)
-    """
-
-    position: Tensor
-    heading: Tensor
-    velocity: Tensor
-    shape: Tensor
-    valid: Tensor
-    category: Tensor
-    current_state: Tensor
+    position: Tensor  # (B, A, 21, 2) in the ego frame [m]
+    heading: Tensor  # (B, A, 21) [rad]
+    velocity: Tensor  # (B, A, 21, 2) [m/s]
+    shape: Tensor  # (B, A, 21, 2) width, length [m]
+    valid: Tensor  # (B, A, 21)
+    category: Tensor  # (B, A) indices of kinds
+    current_state: Tensor  # (B, >= 6) x, y, heading, speed, acceleration, steering angle
+    # (B, M, K, 2) of the centre lines [m]; of PLUTO (B, M, 3, K, 2) of the boundaries, too
     points: Tensor
-    vectors: Tensor
-    orientations: Tensor
-    centers: Tensor
-    kind: Tensor
-    on_route: Tensor
-    light: Tensor
-    has_limit: Tensor
-    limit: Tensor
-    point_valid: Tensor
+    vectors: Tensor  # (B, M, K, 2) along the centre line, to the next point [m]
+    orientations: Tensor  # (B, M, K) of these vectors [rad]
+    centers: Tensor  # (B, M, 3) pose that stands for the polygon
+    kind: Tensor  # (B, M) 0 lane, 1 connector, 2 crosswalk
+    on_route: Tensor  # (B, M) 1 where the polygon is on the route
+    light: Tensor  # (B, M) 0 green, 1 yellow, 2 red, 3 unknown
+    has_limit: Tensor  # (B, M)
+    limit: Tensor  # (B, M) speed limit [m/s]
+    point_valid: Tensor  # (B, M, K)
 
     @property
     def there(self) -> tuple[Tensor, Tensor]:

@@ -117,14 +117,10 @@ class Convolution(nn.Conv2d):
 
 
 class Scenes(NamedTuple):
-    """How the rows of several scenes lie one after another.
+    """How the rows of several scenes lie one after another."""
 
-    Attributes:
-        counts: How many rows each has.
-        masks: By scene (1, 1, 1, count) logits added to its keys; None where all take part.
-    """
-
-    counts: list[int]
+    counts: list[int]  # how many rows each has
+    # by scene (1, 1, 1, count) logits added to its keys; None where all take part
     masks: list[Tensor | None]
 
     def firsts(self, device: torch.device) -> Tensor:

@@ -46,27 +46,18 @@ DRIVE_HEADS = {
 
 @dataclass(frozen=True, slots=True)
 class Inputs(SceneTensors):
-    """One batch.
+    """One batch."""
 
-    Attributes:
-        counts: How many agents and polygons each scene has, the rest is padding; None where nothing
-            is.
-    """
-
+    # how many agents and polygons each scene has, the rest is padding; None where nothing is
     counts: Sequence[Sequence[int]] | None = None
 
 
 class Outputs(NamedTuple):
-    """What the network says.
+    """What the network says."""
 
-    Attributes:
-        trajectory: (B, modes, 80, 4) x, y [m], cosine and sine of the heading.
-        probability: (B, modes) logits.
-        prediction: (B, A - 1, 80, 2) positions of the agents [m]; None unless asked for.
-    """
-
-    trajectory: Tensor
-    probability: Tensor
+    trajectory: Tensor  # (B, modes, 80, 4) x, y [m], cosine and sine of the heading
+    probability: Tensor  # (B, modes) logits
+    # (B, A - 1, 80, 2) positions of the agents [m]; None unless asked for
     prediction: Tensor | None
 
 

@@ -40,31 +40,19 @@ _NO_LANE = f"no lane or crosswalk within {RADIUS:g} m, heading and speed are kep
 
 
 class Features(NamedTuple):
-    """What the network reads of one scene.
+    """What the network reads of one scene."""
 
-    Attributes:
-        agents: The ego and the agents.
-        road: The map.
-        current_state: (7,) of `current_state`, float32.
-        route: Blocks of the corrected route.
-    """
-
-    agents: AgentFeatures
-    road: RoadFeatures
-    current_state: np.ndarray
-    route: tuple[int, ...]
+    agents: AgentFeatures  # the ego and the agents
+    road: RoadFeatures  # the map
+    current_state: np.ndarray  # (7,) of `current_state`, float32
+    route: tuple[int, ...]  # blocks of the corrected route
 
 
 class Plans(NamedTuple):
-    """What the network says of one scene, float32.
+    """What the network says of one scene, float32."""
 
-    Attributes:
-        trajectory: (6, 80, 4) x, y [m], cosine and sine of the heading, in the ego frame.
-        probability: (6,) logits.
-    """
-
-    trajectory: np.ndarray
-    probability: np.ndarray
+    trajectory: np.ndarray  # (6, 80, 4) x, y [m], cosine and sine of the heading, in the ego frame
+    probability: np.ndarray  # (6,) logits
 
 
 class PlanTF(LearnedPlanner[Features, Plans]):

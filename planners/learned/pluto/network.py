@@ -79,48 +79,29 @@ DRIVE_SCALES = {
 
 @dataclass(frozen=True, slots=True)
 class Inputs(SceneTensors):
-    """One batch; S static objects and R reference lines.
+    """One batch; S static objects and R reference lines."""
 
-    Attributes:
-        object_pose: (B, S, 3) static objects x [m], y [m], heading [rad].
-        object_shape: (B, S, 2) width, length [m].
-        object_category: (B, S)
-        object_valid: (B, S)
-        line_points: (B, R, 120, 2) reference lines [m].
-        line_vectors: (B, R, 120, 2) to the next point [m].
-        line_orientations: (B, R, 120) [rad].
-        line_valid: (B, R, 120)
-        counts: How many agents, polygons, static objects and lines each scene has, the rest is
-            padding; None where nothing is.
-    """
-
-    object_pose: Tensor
-    object_shape: Tensor
-    object_category: Tensor
-    object_valid: Tensor
-    line_points: Tensor
-    line_vectors: Tensor
-    line_orientations: Tensor
-    line_valid: Tensor
+    object_pose: Tensor  # (B, S, 3) static objects x [m], y [m], heading [rad]
+    object_shape: Tensor  # (B, S, 2) width, length [m]
+    object_category: Tensor  # (B, S)
+    object_valid: Tensor  # (B, S)
+    line_points: Tensor  # (B, R, 120, 2) reference lines [m]
+    line_vectors: Tensor  # (B, R, 120, 2) to the next point [m]
+    line_orientations: Tensor  # (B, R, 120) [rad]
+    line_valid: Tensor  # (B, R, 120)
+    # how many agents, polygons, static objects and lines each scene has, the rest is padding; None
+    # where nothing is
     counts: Sequence[Sequence[int]] | None = None
 
 
 class Outputs(NamedTuple):
-    """What the network says.
+    """What the network says."""
 
-    Attributes:
-        trajectory: (B, R, 12, 80, 6) x, y [m], cosine and sine of the heading, velocity [m/s].
-        probability: (B, R, 12) logits, -1e6 where the reference line has no points.
-        prediction: (B, A - 1, 80, 6) of the agents, relative to their present poses.
-        ref_free_trajectory: (B, 80, 4) x, y [m], cosine and sine of the heading.
-        ego: (B, 128) its token.
-    """
-
-    trajectory: Tensor
-    probability: Tensor
-    prediction: Tensor
-    ref_free_trajectory: Tensor
-    ego: Tensor
+    trajectory: Tensor  # (B, R, 12, 80, 6) x, y [m], cosine and sine of the heading, velocity [m/s]
+    probability: Tensor  # (B, R, 12) logits, -1e6 where the reference line has no points
+    prediction: Tensor  # (B, A - 1, 80, 6) of the agents, relative to their present poses
+    ref_free_trajectory: Tensor  # (B, 80, 4) x, y [m], cosine and sine of the heading
+    ego: Tensor  # (B, 128) its token
 
 
 class StaticObjectsEncoder(nn.Module):

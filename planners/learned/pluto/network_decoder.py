@@ -125,17 +125,11 @@ class DecoderBlock(nn.Module):
 
 
 class Lines(NamedTuple):
-    """How the reference lines of B scenes lie one after another.
+    """How the reference lines of B scenes lie one after another."""
 
-    Attributes:
-        counts: How many each scene has.
-        valid: (L,) those that have points.
-        masks: By scene (1 or modes, 1, 1, count) logits added to the lines attended to.
-    """
-
-    counts: list[int]
-    valid: Tensor
-    masks: list[Tensor]
+    counts: list[int]  # how many each scene has
+    valid: Tensor  # (L,) those that have points
+    masks: list[Tensor]  # by scene (1 or modes, 1, 1, count) logits added to the lines attended to
 
 
 def make_lines(valid: Tensor, counts: Sequence[int], *, misordered_masks: bool) -> Lines:

@@ -68,42 +68,25 @@ _areas_of = PerMap(map_areas)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What one step saw.
+    """What one step saw."""
 
-    Attributes:
-        drivable: Drivable areas.
-        static: Static objects on them.
-        lines: Reference lines (K, 3).
-        agents: The agents, nearest first.
-        road: Lanes, connectors and crosswalks.
-    """
-
-    drivable: Drivable
-    static: StaticObjects
-    lines: list[FloatArray]
-    agents: AgentFeatures
-    road: RoadFeatures
+    drivable: Drivable  # drivable areas
+    static: StaticObjects  # static objects on them
+    lines: list[FloatArray]  # reference lines (K, 3)
+    agents: AgentFeatures  # the agents, nearest first
+    road: RoadFeatures  # lanes, connectors and crosswalks
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """How one step chose.
+    """How one step chose."""
 
-    Attributes:
-        poses: (P, 81, 3) proposals.
-        learned: (P,) their scores by the network.
-        agents: The agents, now and predicted.
-        scores: Of the proposals.
-        best: Number of the best one.
-        braked: Whether the emergency brake replaces it.
-    """
-
-    poses: FloatArray
-    learned: FloatArray
-    agents: Agents
-    scores: Scores
-    best: int
-    braked: bool
+    poses: FloatArray  # (P, 81, 3) proposals
+    learned: FloatArray  # (P,) their scores by the network
+    agents: Agents  # the agents, now and predicted
+    scores: Scores  # of the proposals
+    best: int  # number of the best one
+    braked: bool  # whether the emergency brake replaces it
 
 
 class Pluto(LearnedPlanner[SceneInputs, Output]):

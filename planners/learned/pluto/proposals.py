@@ -12,19 +12,13 @@ REFERENCE_FREE_SCORE = 0.25
 
 
 class Output(NamedTuple):
-    """What the network says about one scenario, in the ego frame. All float32.
+    """What the network says about one scenario, in the ego frame. All float32."""
 
-    Attributes:
-        trajectory: (R, 12, 80, 6) x, y [m], cos, sin of the heading, velocity [m/s].
-        probability: (R, 12) logits.
-        prediction: (A, 80, 6) of the agents, relative to their present poses; columns likewise.
-        ref_free_trajectory: (80, 4) x, y [m], cos, sin of the heading.
-    """
-
-    trajectory: np.ndarray
-    probability: np.ndarray
+    trajectory: np.ndarray  # (R, 12, 80, 6) x, y [m], cos, sin of the heading, velocity [m/s]
+    probability: np.ndarray  # (R, 12) logits
+    # (A, 80, 6) of the agents, relative to their present poses; columns likewise
     prediction: np.ndarray
-    ref_free_trajectory: np.ndarray
+    ref_free_trajectory: np.ndarray  # (80, 4) x, y [m], cos, sin of the heading
 
 
 def headings_of(trajectory: np.ndarray) -> np.ndarray:

@@ -32,51 +32,30 @@ SAME_LINE = 0.5  # m, |dx| + |dy| of two lines that count as one
 
 
 class Drivable(NamedTuple):
-    """Drivable areas of one step.
+    """Drivable areas of one step."""
 
-    Attributes:
-        areas: All areas of the map, those of the route marked.
-        selected: Areas near the ego.
-        limits: (M,) speed limit of each area of the map, of this step [m/s].
-    """
-
-    areas: Areas
-    selected: IntArray
-    limits: FloatArray
+    areas: Areas  # all areas of the map, those of the route marked
+    selected: IntArray  # areas near the ego
+    limits: FloatArray  # (M,) speed limit of each area of the map, of this step [m/s]
 
 
 class MapAreas(NamedTuple):
-    """What is made once per map.
+    """What is made once per map."""
 
-    Attributes:
-        areas: All areas of the map, none of them on a route.
-        limits: (M,) speed limits, 50 where the map has none [m/s].
-    """
-
-    areas: Areas
-    limits: FloatArray
+    areas: Areas  # all areas of the map, none of them on a route
+    limits: FloatArray  # (M,) speed limits, 50 where the map has none [m/s]
 
 
 class RouteLanes(NamedTuple):
-    """What is made once per scenario.
+    """What is made once per scenario."""
 
-    Attributes:
-        blocks: Blocks of the corrected route, each once.
-        starts: Connectors, then lanes of these blocks, in the order of the map.
-        has_block: (B,) whether a block is one of these.
-        is_on: (E,) whether a lane belongs to one of these blocks.
-        areas: Areas of the map, those of the route marked.
-        limits: (M,) speed limits [m/s].
-        paths: Made so far, by their lanes.
-    """
-
-    blocks: list[int]
-    starts: IntArray
-    has_block: BoolArray
-    is_on: BoolArray
-    areas: Areas
-    limits: FloatArray
-    paths: dict[tuple[int, ...], LanePath]
+    blocks: list[int]  # blocks of the corrected route, each once
+    starts: IntArray  # connectors, then lanes of these blocks, in the order of the map
+    has_block: BoolArray  # (B,) whether a block is one of these
+    is_on: BoolArray  # (E,) whether a lane belongs to one of these blocks
+    areas: Areas  # areas of the map, those of the route marked
+    limits: FloatArray  # (M,) speed limits [m/s]
+    paths: dict[tuple[int, ...], LanePath]  # made so far, by their lanes
 
 
 def map_areas(road: VectorMap) -> MapAreas:
@@ -224,19 +203,12 @@ def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:
 
 
 class LineFeatures(NamedTuple):
-    """Reference lines as the network reads them, in the ego frame. R lines of 120 points.
+    """Reference lines as the network reads them, in the ego frame. R lines of 120 points."""
 
-    Attributes:
-        position: (R, 120, 2) float32 [m].
-        vector: (R, 120, 2) float32, to the next point [m].
-        orientation: (R, 120) float32 [rad].
-        valid_mask: (R, 120).
-    """
-
-    position: np.ndarray
-    vector: np.ndarray
-    orientation: np.ndarray
-    valid_mask: BoolArray
+    position: np.ndarray  # (R, 120, 2) float32 [m]
+    vector: np.ndarray  # (R, 120, 2) float32, to the next point [m]
+    orientation: np.ndarray  # (R, 120) float32 [rad]
+    valid_mask: BoolArray  # (R, 120)
 
 
 def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures:

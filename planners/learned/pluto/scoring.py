@@ -33,43 +33,25 @@ MIN_PROGRESS = 0.1  # m
 
 
 class Scores(NamedTuple):
-    """Scores of P proposals.
+    """Scores of P proposals."""
 
-    Attributes:
-        total: (P,) what decides.
-        rule: (P,) the rule-based part.
-        factors: (3, P) no collision, drivable area, driving direction.
-        terms: (4, P) progress, speed limit, comfort, time to collision.
-        progress: (P,) along the reference line [m].
-        fault_times: (P,) of the first at-fault collision, inf if none [s].
-        driven: (P, 41, 11) states as driven by the tracker.
-        flags: (P, 41, 3) several lanes, off the road, off the route.
-        speed_limits: (P, 41) [m/s].
-    """
-
-    total: FloatArray
-    rule: FloatArray
-    factors: FloatArray
-    terms: FloatArray
-    progress: FloatArray
-    fault_times: FloatArray
-    driven: FloatArray
-    flags: BoolArray
-    speed_limits: FloatArray
+    total: FloatArray  # (P,) what decides
+    rule: FloatArray  # (P,) the rule-based part
+    factors: FloatArray  # (3, P) no collision, drivable area, driving direction
+    terms: FloatArray  # (4, P) progress, speed limit, comfort, time to collision
+    progress: FloatArray  # (P,) along the reference line [m]
+    fault_times: FloatArray  # (P,) of the first at-fault collision, inf if none [s]
+    driven: FloatArray  # (P, 41, 11) states as driven by the tracker
+    flags: BoolArray  # (P, 41, 3) several lanes, off the road, off the route
+    speed_limits: FloatArray  # (P, 41) [m/s]
 
 
 class Place(NamedTuple):
-    """The map as the scorer sees it.
+    """The map as the scorer sees it."""
 
-    Attributes:
-        drivable: Drivable areas of the step.
-        lanes: Areas of lanes and connectors.
-        baseline: (K, 2) line along which progress is measured [m].
-    """
-
-    drivable: Drivable
-    lanes: Polygons
-    baseline: FloatArray
+    drivable: Drivable  # drivable areas of the step
+    lanes: Polygons  # areas of lanes and connectors
+    baseline: FloatArray  # (K, 2) line along which progress is measured [m]
 
 
 def score(

@@ -26,45 +26,28 @@ SCORED_RADIUS = 50.0  # m, of static objects that are collided with
 
 
 class StaticObjects(NamedTuple):
-    """Static objects on the drivable areas, in the map frame. S objects.
+    """Static objects on the drivable areas, in the map frame. S objects."""
 
-    Attributes:
-        poses: (S, 3) centre x [m], y [m], heading [rad].
-        sizes: (S, 2) length, width [m].
-        categories: (S,) place of the kind in `STATIC_KINDS`.
-        distances: (S,) to the centre of the ego [m].
-    """
-
-    poses: FloatArray
-    sizes: FloatArray
-    categories: IntArray
-    distances: FloatArray
+    poses: FloatArray  # (S, 3) centre x [m], y [m], heading [rad]
+    sizes: FloatArray  # (S, 2) length, width [m]
+    categories: IntArray  # (S,) place of the kind in `STATIC_KINDS`
+    distances: FloatArray  # (S,) to the centre of the ego [m]
 
 
 class Agents(NamedTuple):
-    """Where the agents are now and will be, in the map frame. A agents.
+    """Where the agents are now and will be, in the map frame. A agents."""
 
-    Attributes:
-        poses: (A, 81, 3) centre x [m], y [m], heading [rad], every 0.1 s from now on.
-        speeds: (A, 81) [m/s].
-        sizes: (A, 2) length, width [m].
-    """
-
-    poses: FloatArray
-    speeds: FloatArray
-    sizes: FloatArray
+    poses: FloatArray  # (A, 81, 3) centre x [m], y [m], heading [rad], every 0.1 s from now on
+    speeds: FloatArray  # (A, 81) [m/s]
+    sizes: FloatArray  # (A, 2) length, width [m]
 
 
 class World(NamedTuple):
-    """Everything a proposal can hit.
+    """Everything a proposal can hit."""
 
-    Attributes:
-        others: Static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored.
-        lights: Connectors of the route whose light is red.
-    """
-
+    # static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored
     others: Others
-    lights: IntArray
+    lights: IntArray  # connectors of the route whose light is red
 
 
 def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> StaticObjects:

@@ -39,57 +39,36 @@ class LqrParameters(NamedTuple):
 
     Each of the two problems minimises q (error at the end of the horizon)^2 + r (command)^2, the
     command being held for all of it.
-
-    Attributes:
-        q_longitudinal: Cost of the speed error [s^2/m^2].
-        r_longitudinal: Cost of the acceleration [s^4/m^2].
-        q_lateral_error: Cost of the distance beside the plan [1/m^2].
-        q_heading_error: Cost of the heading error [1/rad^2].
-        q_steering: Cost of the steering angle [1/rad^2].
-        r_lateral: Cost of the steering rate [s^2/rad^2].
-        step_us: Discretisation time [us].
-        horizon: Its steps.
-        jerk_penalty: Of the speed profile, against displacements [s^4].
-        curvature_rate_penalty: Of the curvature profile, against heading changes [s^2 m^2].
-        stopping_gain: Acceleration per speed error of the stop controller [1/s].
-        stopping_speed: Where speed and plan are not above it, the stop controller acts [m/s].
-        wheel_base: Distance between the axles [m].
     """
 
-    q_longitudinal: float = 10.0
-    r_longitudinal: float = 1.0
-    q_lateral_error: float = 1.0
-    q_heading_error: float = 10.0
-    q_steering: float = 0.0
-    r_lateral: float = 1.0
-    step_us: int = 100_000
-    horizon: int = 10
-    jerk_penalty: float = 1e-4
+    q_longitudinal: float = 10.0  # cost of the speed error [s^2/m^2]
+    r_longitudinal: float = 1.0  # cost of the acceleration [s^4/m^2]
+    q_lateral_error: float = 1.0  # cost of the distance beside the plan [1/m^2]
+    q_heading_error: float = 10.0  # cost of the heading error [1/rad^2]
+    q_steering: float = 0.0  # cost of the steering angle [1/rad^2]
+    r_lateral: float = 1.0  # cost of the steering rate [s^2/rad^2]
+    step_us: int = 100_000  # discretisation time [us]
+    horizon: int = 10  # its steps
+    jerk_penalty: float = 1e-4  # of the speed profile, against displacements [s^4]
+    # of the curvature profile, against heading changes [s^2 m^2]
     curvature_rate_penalty: float = 1e-2
-    stopping_gain: float = 0.5
+    stopping_gain: float = 0.5  # acceleration per speed error of the stop controller [1/s]
+    # where speed and plan are not above it, the stop controller acts [m/s]
     stopping_speed: float = 0.2
-    wheel_base: float = PACIFICA.wheel_base
+    wheel_base: float = PACIFICA.wheel_base  # distance between the axles [m]
 
 
 NUPLAN = LqrParameters()
 
 
 class Reference(NamedTuple):
-    """What the tracker steers to.
+    """What the tracker steers to."""
 
-    Attributes:
-        status: TRACKED, or why there is none: NOT_COVERED, TOO_SHORT.
-        lateral_error: Of the rear axle, left of the plan is positive [m].
-        heading_error: Ego minus plan, in [-pi, pi) [rad].
-        speed: Of the plan one horizon ahead [m/s]; negative in reverse.
-        curvature: (horizon,) of the plan at the next steps [1/m].
-    """
-
-    status: int
-    lateral_error: float
-    heading_error: float
-    speed: float
-    curvature: FloatArray
+    status: int  # TRACKED, or why there is none: NOT_COVERED, TOO_SHORT
+    lateral_error: float  # of the rear axle, left of the plan is positive [m]
+    heading_error: float  # ego minus plan, in [-pi, pi) [rad]
+    speed: float  # of the plan one horizon ahead [m/s]; negative in reverse
+    curvature: FloatArray  # (horizon,) of the plan at the next steps [1/m]
 
 
 @lean_kernel

@@ -62,33 +62,20 @@ def norm(layer: nn.Module) -> Norm:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A `DiTBlock` at hand for one plan: its tensors are looked up once, not in every call.
+    """A `DiTBlock` at hand for one plan: its tensors are looked up once, not in every call."""
 
-    Attributes:
-        norms: The four of the block.
-        packed: Queries, keys and values of the agents.
-        joined: Out of the attention between agents.
-        mlp1: First and second layer.
-        query: Into the attention to the scene.
-        looked: Out of it.
-        mlp2: First and second layer.
-        modulation: By call: shift, scale and gate, twice, each (B, 1, hidden).
-        keys: (B * heads, C, N) of the scene's tokens, scaled.
-        values: (B * heads, N, C) of the same.
-        mask: (B * heads, 1, A) added to the logits of the agents.
-    """
-
-    norms: tuple[Norm, ...]
-    packed: Product
-    joined: Product
-    mlp1: tuple[Product, Product]
-    query: Product
-    looked: Product
-    mlp2: tuple[Product, Product]
+    norms: tuple[Norm, ...]  # the four of the block
+    packed: Product  # queries, keys and values of the agents
+    joined: Product  # out of the attention between agents
+    mlp1: tuple[Product, Product]  # first and second layer
+    query: Product  # into the attention to the scene
+    looked: Product  # out of it
+    mlp2: tuple[Product, Product]  # first and second layer
+    # by call: shift, scale and gate, twice, each (B, 1, hidden)
     modulation: list[tuple[Tensor, ...]]
-    keys: Tensor
-    values: Tensor
-    mask: Tensor
+    keys: Tensor  # (B * heads, C, N) of the scene's tokens, scaled
+    values: Tensor  # (B * heads, N, C) of the same
+    mask: Tensor  # (B * heads, 1, A) added to the logits of the agents
 
     def __call__(self, x: Tensor, call: int) -> Tensor:
         """(B, A, hidden) to the same."""
@@ -131,22 +118,14 @@ def _mlp(layers: tuple[Product, Product], x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """The network at hand for one plan.
+    """The network at hand for one plan."""
 
-    Attributes:
-        entry: First and second layer into the blocks.
-        kinds: (A, hidden) embedding of an agent's kind, ego or neighbour.
-        blocks: The blocks.
-        norms: The three of the last layer.
-        exit: First and second layer out of the blocks.
-        modulation: By call: shift and scale of the last layer, each (B, 1, hidden).
-    """
-
-    entry: tuple[Product, Product]
-    kinds: Tensor
-    blocks: list[Block]
-    norms: tuple[Norm, ...]
-    exit: tuple[Product, Product]
+    entry: tuple[Product, Product]  # first and second layer into the blocks
+    kinds: Tensor  # (A, hidden) embedding of an agent's kind, ego or neighbour
+    blocks: list[Block]  # the blocks
+    norms: tuple[Norm, ...]  # the three of the last layer
+    exit: tuple[Product, Product]  # first and second layer out of the blocks
+    # by call: shift and scale of the last layer, each (B, 1, hidden)
     modulation: list[tuple[Tensor, ...]]
 
     def __call__(self, x: Tensor, call: int) -> Tensor:

@@ -21,29 +21,17 @@ STATE = 4  # x, y, cos, sin
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Numbers of the sampler; S steps, from time i to time i + 1.
+    """Numbers of the sampler; S steps, from time i to time i + 1."""
 
-    Attributes:
-        times: (S + 1,) times from 1 to about 0.001.
-        log_alpha: (S + 1,) logarithm of `alpha`.
-        alpha: (S + 1,) factor of the data at each time.
-        sigma: (S + 1,) factor of the noise at each time.
-        half_snr: (S + 1,) lambda, half the logarithm of the signal-to-noise ratio.
-        h: (S,) lambda of the next time minus lambda of this one.
-        c_x: (S,) factor of the state in a step.
-        c_x0: (S,) factor of the predicted data in a step.
-        r0: (S - 1,) h of a step over that of the next one.
-    """
-
-    times: Tensor
-    log_alpha: Tensor
-    alpha: Tensor
-    sigma: Tensor
-    half_snr: Tensor
-    h: Tensor
-    c_x: Tensor
-    c_x0: Tensor
-    r0: Tensor
+    times: Tensor  # (S + 1,) times from 1 to about 0.001
+    log_alpha: Tensor  # (S + 1,) logarithm of `alpha`
+    alpha: Tensor  # (S + 1,) factor of the data at each time
+    sigma: Tensor  # (S + 1,) factor of the noise at each time
+    half_snr: Tensor  # (S + 1,) lambda, half the logarithm of the signal-to-noise ratio
+    h: Tensor  # (S,) lambda of the next time minus lambda of this one
+    c_x: Tensor  # (S,) factor of the state in a step
+    c_x0: Tensor  # (S,) factor of the predicted data in a step
+    r0: Tensor  # (S - 1,) h of a step over that of the next one
 
     @property
     def call_times(self) -> Tensor:

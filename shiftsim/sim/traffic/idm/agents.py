@@ -28,17 +28,11 @@ _MIN_VERTICES = 3  # of a baseline: a path of fewer than two cannot be driven, a
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where an agent is put on the lane graph.
+    """Where an agent is put on the lane graph."""
 
-    Attributes:
-        edge: Lane or connector.
-        progress: Arc length on its baseline [m].
-        pose: (3,) nearest pose on the baseline: x [m], y [m], heading [rad].
-    """
-
-    edge: int
-    progress: float
-    pose: FloatArray
+    edge: int  # lane or connector
+    progress: float  # arc length on its baseline [m]
+    pose: FloatArray  # (3,) nearest pose on the baseline: x [m], y [m], heading [rad]
 
 
 def find_start(map: VectorMap, pose: FloatArray) -> Start | None:

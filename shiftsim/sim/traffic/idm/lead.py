@@ -25,17 +25,11 @@ _MARGIN = 1.1  # corridors lie within this many half widths of their line
 
 
 class Corridor(NamedTuple):
-    """The path ahead of an agent, which is buffered by half its width with flat ends.
+    """The path ahead of an agent, which is buffered by half its width with flat ends."""
 
-    Attributes:
-        line: (K, 2) vertices [m].
-        runs: (R, 4) bounds of its runs of segments [m].
-        half_width: Of the buffer [m].
-    """
-
-    line: FloatArray
-    runs: FloatArray
-    half_width: float
+    line: FloatArray  # (K, 2) vertices [m]
+    runs: FloatArray  # (R, 4) bounds of its runs of segments [m]
+    half_width: float  # of the buffer [m]
 
 
 @lean_kernel

@@ -29,137 +29,78 @@ _EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the pa
 
 
 class IdmParameters(NamedTuple):
-    """Parameters of the reactive traffic; the defaults are nuPlan's.
+    """Parameters of the reactive traffic; the defaults are nuPlan's."""
 
-    Attributes:
-        target_speed: Speed on a free road where the map has no limit [m/s].
-        min_gap: Gap kept at standstill [m].
-        headway: Time gap kept, and how far footprints reach ahead [s].
-        accel_max: Largest acceleration [m/s^2].
-        decel_max: Comfortable deceleration, positive [m/s^2].
-        min_path_length: Path kept ahead at standstill [m].
-        radius: Agents farther from the ego than this are removed for good [m].
-    """
-
-    target_speed: float = 10.0
-    min_gap: float = 1.0
-    headway: float = 1.5
-    accel_max: float = 1.0
-    decel_max: float = 2.0
-    min_path_length: float = 20.0
-    radius: float = 100.0
+    target_speed: float = 10.0  # speed on a free road where the map has no limit [m/s]
+    min_gap: float = 1.0  # gap kept at standstill [m]
+    headway: float = 1.5  # time gap kept, and how far footprints reach ahead [s]
+    accel_max: float = 1.0  # largest acceleration [m/s^2]
+    decel_max: float = 2.0  # comfortable deceleration, positive [m/s^2]
+    min_path_length: float = 20.0  # path kept ahead at standstill [m]
+    radius: float = 100.0  # agents farther from the ego than this are removed for good [m]
 
 
 class LaneGraph(NamedTuple):
-    """What reactive agents read of a map. E edges.
+    """What reactive agents read of a map. E edges."""
 
-    Attributes:
-        baselines: E centre lines.
-        outgoing: Edges an edge leads to.
-        speed_limits: (E,) [m/s], NaN where the map has none.
-        has_lights: (E,) whether lights govern the edge.
-        stop_lines: Stop polygons of an edge.
-        stops: The stop polygons.
-        status: (E,) LightStatus codes of the present step.
-    """
-
-    baselines: Polylines
-    outgoing: Lists
-    speed_limits: FloatArray
-    has_lights: BoolArray
-    stop_lines: Lists
-    stops: Polygons
-    status: IntArray
+    baselines: Polylines  # E centre lines
+    outgoing: Lists  # edges an edge leads to
+    speed_limits: FloatArray  # (E,) [m/s], NaN where the map has none
+    has_lights: BoolArray  # (E,) whether lights govern the edge
+    stop_lines: Lists  # stop polygons of an edge
+    stops: Polygons  # the stop polygons
+    status: IntArray  # (E,) LightStatus codes of the present step
 
 
 class Fleet(NamedTuple):
-    """State of the reactive agents, in the order of their construction. A agents.
+    """State of the reactive agents, in the order of their construction. A agents."""
 
-    Attributes:
-        alive: (A,) whether the agent is still simulated.
-        size: (A, 2) length, width [m].
-        progress: (A,) along the path, not clamped to it [m].
-        speed: (A,) along the path [m/s].
-        target: (A,) speed on a free road [m/s].
-        pose: (A, 3) on the path at the last propagation: x [m], y [m], heading [rad].
-        route: (A, 5) edges of the path, oldest first.
-        route_size: (A,) how many of them.
-        path: (A, K, 4) vertices of the path: x [m], y [m], heading [rad], progress [m].
-        path_size: (A,) how many of them.
-    """
-
-    alive: BoolArray
-    size: FloatArray
-    progress: FloatArray
-    speed: FloatArray
-    target: FloatArray
-    pose: FloatArray
-    route: IntArray
-    route_size: IntArray
-    path: FloatArray
-    path_size: IntArray
+    alive: BoolArray  # (A,) whether the agent is still simulated
+    size: FloatArray  # (A, 2) length, width [m]
+    progress: FloatArray  # (A,) along the path, not clamped to it [m]
+    speed: FloatArray  # (A,) along the path [m/s]
+    target: FloatArray  # (A,) speed on a free road [m/s]
+    pose: FloatArray  # (A, 3) on the path at the last propagation: x [m], y [m], heading [rad]
+    route: IntArray  # (A, 5) edges of the path, oldest first
+    route_size: IntArray  # (A,) how many of them
+    path: FloatArray  # (A, K, 4) vertices of the path: x [m], y [m], heading [rad], progress [m]
+    path_size: IntArray  # (A,) how many of them
 
 
 class Footprints(NamedTuple):
     """What can be in an agent's way: A agents, then the ego, then replayed tracks; M in all.
 
     The footprint of an agent is its box and the buffer of the piece of its path just ahead.
-
-    Attributes:
-        present: (M,) whether it is there.
-        bounds: (M, 4) min x, min y, max x, max y [m].
-        box: (M, 4, 2) corners [m].
-        curve: (A, V, 2) buffers of the path pieces just ahead of the agents [m].
-        curve_size: (A,) how many vertices of them count; 0 before the first step.
     """
 
-    present: BoolArray
-    bounds: FloatArray
-    box: FloatArray
-    curve: FloatArray
-    curve_size: IntArray
+    present: BoolArray  # (M,) whether it is there
+    bounds: FloatArray  # (M, 4) min x, min y, max x, max y [m]
+    box: FloatArray  # (M, 4, 2) corners [m]
+    curve: FloatArray  # (A, V, 2) buffers of the path pieces just ahead of the agents [m]
+    curve_size: IntArray  # (A,) how many vertices of them count; 0 before the first step
 
 
 class Scratch(NamedTuple):
-    """Room for intermediate results of one agent.
+    """Room for intermediate results of one agent."""
 
-    Attributes:
-        line: (K, 2) a piece of a path [m].
-        keep: (K,) flags of its vertices.
-        runs: (R, 4) bounds of the line's runs of segments [m].
-        outline: (W, 2) outline of the buffer of a path [m].
-        near: (M,) footprints that may be in the corridor.
-        apart: (M,) lower bounds of the gaps to them [m].
-    """
-
-    line: FloatArray
-    keep: BoolArray
-    runs: FloatArray
-    outline: FloatArray
-    near: IntArray
-    apart: FloatArray
+    line: FloatArray  # (K, 2) a piece of a path [m]
+    keep: BoolArray  # (K,) flags of its vertices
+    runs: FloatArray  # (R, 4) bounds of the line's runs of segments [m]
+    outline: FloatArray  # (W, 2) outline of the buffer of a path [m]
+    near: IntArray  # (M,) footprints that may be in the corridor
+    apart: FloatArray  # (M,) lower bounds of the gaps to them [m]
 
 
 class Scene(NamedTuple):
-    """The reactive traffic of one rollout.
+    """The reactive traffic of one rollout."""
 
-    Attributes:
-        parameters: How agents drive; all numbers are floats.
-        graph: The lanes.
-        fleet: The agents.
-        agents: (A,) their tracks.
-        replayed: (R,) tracks that are replayed from the log.
-        footprints: Of agents, ego and replayed tracks.
-        scratch: Intermediate results.
-    """
-
-    parameters: IdmParameters
-    graph: LaneGraph
-    fleet: Fleet
-    agents: IntArray
-    replayed: IntArray
-    footprints: Footprints
-    scratch: Scratch
+    parameters: IdmParameters  # how agents drive; all numbers are floats
+    graph: LaneGraph  # the lanes
+    fleet: Fleet  # the agents
+    agents: IntArray  # (A,) their tracks
+    replayed: IntArray  # (R,) tracks that are replayed from the log
+    footprints: Footprints  # of agents, ego and replayed tracks
+    scratch: Scratch  # intermediate results
 
 
 class Row(NamedTuple):
