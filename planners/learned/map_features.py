@@ -22,7 +22,7 @@ _ZERO_BIN = 1e-6  # divisor of a bin without length
 
 
 class RoadObjects(NamedTuple):
-    """Lanes, then connectors, then crosswalks of a map, each in the order of its layer; M in all."""
+    """Lanes, then connectors, then crosswalks of a map, each in the order of its layer."""
 
     lines: FloatArray  # (M, 3, 21, 2) centre, left and right polyline in the map frame [m]
     angles: FloatArray  # (M, 3, 20) orientation of the steps [rad]
