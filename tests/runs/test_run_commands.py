@@ -12,6 +12,8 @@ from pyarrow import parquet
 
 import shiftsim
 from shiftsim.cli import main
+from shiftsim.runs.journal import has_entries
+from shiftsim.runs.results import JOURNAL
 
 HERE = Path(__file__).parent
 sys.path.append(str(HERE))  # worker processes import `drivers`, too
@@ -117,8 +119,7 @@ def test_a_request_to_end_keeps_what_is_finished_and_says_how_to_go_on(toy, tmp_
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     )
-    journal = tmp_path / "run" / "unfinished.jsonl"
-    while not (journal.exists() and journal.stat().st_size):
+    while not has_entries(tmp_path / "run" / JOURNAL):
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
