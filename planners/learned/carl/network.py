@@ -130,8 +130,7 @@ class CarlNetwork(nn.Module):
         self.dist_mu = nn.Sequential(Linear(FEATURES, ACTIONS))
         self.dist_sigma = nn.Sequential(Linear(FEATURES, ACTIONS))
         self.value_head = nn.Sequential(
-            *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES),
-            Linear(FEATURES, 1),
+            *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES), Linear(FEATURES, 1)
         )
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Policy:

@@ -88,11 +88,7 @@ def line_bounds(lines: Polylines) -> FloatArray:
 
 @kernel
 def lanes_in_square(
-    areas: Polygons,
-    lines: Polylines,
-    bounds: FloatArray,
-    num_lanes: int,
-    square: FloatArray,
+    areas: Polygons, lines: Polylines, bounds: FloatArray, num_lanes: int, square: FloatArray
 ) -> IntArray:
     """Lanes whose area, and connectors whose centre line shares a point with a square, ascending.
 

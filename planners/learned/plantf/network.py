@@ -79,10 +79,7 @@ class TrajectoryDecoder(nn.Module):
 
 def _head(outputs: int, *, bias: bool = True) -> nn.Sequential:
     return nn.Sequential(
-        Linear(DIM, 2 * DIM, bias=bias),
-        nn.LayerNorm(2 * DIM),
-        nn.ReLU(),
-        Linear(2 * DIM, outputs),
+        Linear(DIM, 2 * DIM, bias=bias), nn.LayerNorm(2 * DIM), nn.ReLU(), Linear(2 * DIM, outputs)
     )
 
 

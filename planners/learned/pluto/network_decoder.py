@@ -47,10 +47,7 @@ class FourierEmbedding(nn.Module):
         self.freqs = nn.Embedding(inputs, NUM_FREQUENCIES)
         self.mlps = nn.ModuleList(
             nn.Sequential(
-                Linear(2 * NUM_FREQUENCIES + 1, DIM),
-                nn.LayerNorm(DIM),
-                nn.ReLU(),
-                Linear(DIM, DIM),
+                Linear(2 * NUM_FREQUENCIES + 1, DIM), nn.LayerNorm(DIM), nn.ReLU(), Linear(DIM, DIM)
             )
             for _ in range(inputs)
         )
@@ -79,12 +76,7 @@ class DecoderBlock(nn.Module):
         self.norm1, self.norm2, self.norm3, self.norm4 = (nn.LayerNorm(DIM) for _ in range(4))
 
     def forward(
-        self,
-        x: Tensor,
-        lines: "Lines",
-        mode_position: Tensor,
-        tokens: Tensor,
-        scenes: Scenes,
+        self, x: Tensor, lines: "Lines", mode_position: Tensor, tokens: Tensor, scenes: Scenes
     ) -> Tensor:
         """Refine queries.
 
@@ -165,12 +157,7 @@ class PlanningDecoder(nn.Module):
         self.pi_head = MlpLayer(DIM, DIM, 1)
 
     def forward(
-        self,
-        seen: SeenLines,
-        counts: Sequence[int],
-        tokens: Tensor,
-        scenes: Scenes,
-        egos: Tensor,
+        self, seen: SeenLines, counts: Sequence[int], tokens: Tensor, scenes: Scenes, egos: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Decode.
 
