@@ -16,15 +16,9 @@ from typing import Any, NamedTuple
 
 from shiftsim.errors import CheckpointError, nearest
 from shiftsim.files import checkpoint_folder
+from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
-from shiftsim.planners.learned.match import (
-    differences,
-    empty_state,
-    most_like,
-    network_module,
-    shapes_of,
-)
 from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
 from shiftsim.planners.table import PUBLISHED
 
@@ -61,7 +55,7 @@ def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
     The arguments and errors are those of `load_weights`.
     """
     weights = load_weights(spec, planner, device=device)
-    network = network_module(planner).build_network(weights.args)
+    network = match.network_module(planner).build_network(weights.args)
     network.load_state_dict(weights.state)
     return network.to(resolve_device(device)).eval()
 
@@ -236,8 +230,8 @@ def checked_state(
     Raises:
         CheckpointError: One is missing, unexpected, of another shape, or not finite.
     """
-    wanted = empty_state(planner, args)
-    problems = differences(shapes_of(found.state), shapes_of(wanted))
+    wanted = match.empty_state(planner, args)
+    problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)
         raise CheckpointError(
@@ -257,7 +251,7 @@ def checked_state(
 
 def _require_likeness(found: Checkpoint, planner: str) -> None:
     """Raise where a checkpoint is not of the planner's network, but perhaps of another's."""
-    other = most_like(shapes_of(found.state))
+    other = match.most_like(match.shapes_of(found.state))
     if other == planner:
         return
     name = f"checkpoint {str(found.path)!r} is not for planner {planner!r}"
@@ -322,5 +316,5 @@ def _deterministic(spec: str, planner: str) -> dict[str, Any]:
     import torch
 
     variant = _known_deterministic(spec).removeprefix("deterministic:")
-    state = network_weights(network_module(planner), variant)
+    state = network_weights(match.network_module(planner), variant)
     return {name: torch.from_numpy(value) for name, value in state.items()}

@@ -24,24 +24,9 @@ from shiftsim.planners.learned.features import (
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
+from shiftsim.planners.learned.pluto import proposals, reference
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
-from shiftsim.planners.learned.pluto.proposals import (
-    Output,
-    best_proposals,
-    headings_of,
-    predicted_agents,
-    to_map,
-)
-from shiftsim.planners.learned.pluto.reference import (
-    Drivable,
-    RouteLanes,
-    drivable_near,
-    line_features,
-    map_areas,
-    reference_lines,
-    route_lanes,
-)
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, nearest_line, score
 from shiftsim.planners.learned.pluto.world import (
     Agents,
@@ -63,14 +48,14 @@ NO_LINE = (
     "no lane of the route is near the ego and fits its heading, the reference-free plan is driven"
 )
 
-_areas_of = PerMap(map_areas)
+_areas_of = PerMap(reference.map_areas)
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
     """What one step saw."""
 
-    drivable: Drivable  # drivable areas
+    drivable: reference.Drivable  # drivable areas
     static: StaticObjects  # static objects on them
     lines: list[FloatArray]  # reference lines (K, 3)
     agents: AgentFeatures  # the agents, nearest first
@@ -89,7 +74,7 @@ class Choice:
     braked: bool  # whether the emergency brake replaces it
 
 
-class Pluto(LearnedPlanner[SceneInputs, Output]):
+class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
     """PLUTO with its rule-based choice.
 
     Attributes:
@@ -104,7 +89,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         """Load the network; arguments and errors as in the base."""
         super().__init__(checkpoint, device=device)
         self._scene: SceneInfo | None = None
-        self.route: RouteLanes | None = None
+        self.route: reference.RouteLanes | None = None
         self.sight: Sight | None = None
         self.choice: Choice | None = None
 
@@ -123,16 +108,16 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         road, history = scene.map, observation.history
         ego, center = history.ego[-1], observation.ego.center
         if self.route is None:
-            self.route = route_lanes(road, _areas_of(road), self._corrected(ego[:3]))
+            self.route = reference.route_lanes(road, _areas_of(road), self._corrected(ego[:3]))
         route = self.route
-        drivable = drivable_near(road, route, center[0], center[1])
+        drivable = reference.drivable_near(road, route, center[0], center[1])
         static = static_objects(history.tracks, drivable, center[0], center[1])
-        lines = reference_lines(road, route, ego[:3], center)
+        lines = reference.reference_lines(road, route, ego[:3], center)
         agents = agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
         near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
         self.sight = Sight(drivable, static, lines, agents, near)
-        return scene_inputs(ego, agents, near, static, line_features(lines, ego[:3]))
+        return scene_inputs(ego, agents, near, static, reference.line_features(lines, ego[:3]))
 
     def _corrected(self, rear: FloatArray) -> tuple[int, ...]:
         """Blocks of the corrected route; none where none of the route is on the map."""
@@ -150,7 +135,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
             return NO_LINE
         return short_history(len(history.ego))
 
-    def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
+    def infer(self, features: Sequence[SceneInputs]) -> list[proposals.Output]:
         """One forward pass."""
         import torch
 
@@ -158,9 +143,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
         with torch.inference_mode():
             outputs = self.network(Inputs(*stack(features, self.device)))
-        arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
+        arrays = [getattr(outputs, name).cpu().numpy() for name in proposals.Output._fields]
         return [
-            Output(
+            proposals.Output(
                 trajectory[: len(scene.line_valid)],
                 logits[: len(scene.line_valid)],
                 prediction[: len(scene.category) - 1],
@@ -169,15 +154,15 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
             for scene, trajectory, logits, prediction, free in zip(features, *arrays, strict=True)
         ]
 
-    def decode(self, output: Output, observation: Observation) -> Trajectory:
+    def decode(self, output: proposals.Output, observation: Observation) -> Trajectory:
         """The best proposal, an emergency brake, or the reference-free trajectory."""
         assert self.sight is not None
         assert self._scene is not None
         rear = observation.history.ego[-1, :3]
         self.degraded, self.choice = self._why_fallback(observation.history), None
         if not self.sight.lines:
-            free = headings_of(output.ref_free_trajectory)
-            return _plan(to_map(free, rear), observation)
+            free = proposals.headings_of(output.ref_free_trajectory)
+            return _plan(proposals.to_map(free, rear), observation)
         self.choice = choice = self._choose(output, observation)
         if not choice.braked:
             return _plan(choice.poses[choice.best, 1:], observation)
@@ -185,16 +170,16 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         states = brake(choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle)
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
-    def _choose(self, output: Output, observation: Observation) -> Choice:
+    def _choose(self, output: proposals.Output, observation: Observation) -> Choice:
         scene, sight = self._scene, self.sight
         assert scene is not None
         assert sight is not None
         ego, tracks = observation.history.ego[-1], observation.history.tracks
-        poses, learned = best_proposals(output, ego[:3])
+        poses, learned = proposals.best_proposals(output, ego[:3])
         seen, rows = sight.agents, sight.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
-        motion = predicted_agents(output, local, *present, ego[:3])
+        motion = proposals.predicted_agents(output, local, *present, ego[:3])
         agents = Agents(*motion, tracks.sizes[-1, rows])
         world = self.world_of(observation, agents)
         place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
