@@ -57,14 +57,10 @@ class Finding:
 
 
 def check_planner(planner: Any, scenario: Scenario) -> list[Finding]:
-    """Try a planner on one scenario.
+    """Try a planner on one scenario of at least three iterations; what was found, errors first.
 
-    Args:
-        planner: A planner, or a class or function without arguments that makes one.
-        scenario: Any scenario with at least three iterations.
-
-    Returns:
-        What was found, errors first; the run time is always among it.
+    `planner` is one, or a class or function without arguments that makes one. The run time is
+    always among the findings.
     """
     findings: list[Finding] = []
     is_made = isinstance(planner, type) or not hasattr(planner, "plan")

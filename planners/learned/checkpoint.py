@@ -89,10 +89,7 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
 def checkpoint_fingerprint(spec: str, planner: str) -> str:
     """What tells these weights from others: SHA-256 of the files, or the deterministic name.
 
-    Several checkpoints of an ensemble give several, separated by commas. Files are hashed once.
-
-    Raises:
-        CheckpointError: There is no such file.
+    Several checkpoints of an ensemble give several, separated by commas.
     """
     return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec, planner))
 
@@ -107,11 +104,7 @@ def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
 
 
 def find_checkpoint(spec: str, planner: str = "") -> Path:
-    """The file that is meant, by default the published one of the planner.
-
-    Raises:
-        CheckpointError: There is none, or a folder holds several.
-    """
+    """The file that is meant, by default the published one; else a CheckpointError."""
     given, named = Path(spec).expanduser(), checkpoint_folder() / spec
     if planner and not spec:
         given = named = _published_path(planner)
@@ -148,11 +141,7 @@ def how_to_get(planner: str) -> str:
 
 
 def open_checkpoint(path: Path) -> Checkpoint:
-    """The weights in a file, whatever planner they are of.
-
-    Raises:
-        CheckpointError: It is no checkpoint, or it is damaged.
-    """
+    """The weights in a file, whatever planner they are of; else a CheckpointError."""
     contents = read_contents(path)
     entry = next((e for e in _ENTRIES if isinstance(contents.entries.get(e), dict)), "")
     holder = contents.entries[entry] if entry else contents.entries
@@ -206,11 +195,7 @@ def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
 
 
 def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
-    """Settings that a planner's network needs beside the weights; None for those without.
-
-    Raises:
-        CheckpointError: They are missing.
-    """
+    """Settings that a planner's network needs beside the weights; None for those without."""
     if planner not in _WITH_ARGS:
         return None
     if found.args is None:
@@ -227,8 +212,7 @@ def checked_state(
 ) -> dict[str, Any]:
     """All tensors of a planner's network, and no other, in its own types.
 
-    Raises:
-        CheckpointError: One is missing, unexpected, of another shape, or not finite.
+    A CheckpointError says which is missing, unexpected, of another shape, or not finite.
     """
     wanted = match.empty_state(planner, args)
     problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))

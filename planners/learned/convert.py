@@ -48,10 +48,7 @@ class Inspection:
 
 
 def inspect_checkpoint(spec: str) -> Inspection:
-    """Look into a checkpoint file.
-
-    Args:
-        spec: File, folder that holds one, or name in the folder of checkpoints.
+    """Look into a checkpoint: a file, a folder that holds one, or a name in their folder.
 
     Raises:
         CheckpointError: It is no checkpoint, or it is damaged.
@@ -82,12 +79,7 @@ def inspect_checkpoint(spec: str) -> Inspection:
 def convert_checkpoint(spec: str, out: Path) -> Inspection:
     """Write the weights that a planner loads, and nothing else, to a safetensors file.
 
-    Args:
-        spec: As for `inspect_checkpoint`.
-        out: The file to write; its metadata names planner, args and the hash of the source.
-
-    Returns:
-        What is in the new file.
+    Its metadata names planner, args and the hash of the source. Returns what is in the new file.
 
     Raises:
         CheckpointError: The source is not complete, or of no planner known here.

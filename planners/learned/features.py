@@ -66,14 +66,9 @@ class AgentFeatures(NamedTuple):
 
 
 def agent_features(history: History, center: FloatArray, max_agents: int) -> AgentFeatures:
-    """Histories of the ego and of the agents that are present.
+    """Histories of the ego and of the present agents nearest to `center`, its box's centre [m].
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
-
-    Args:
-        history: The last samples.
-        center: (2,) or more: centre of the ego's box, from which agents are counted [m].
-        max_agents: How many agents are kept, the nearest ones.
     """
     tracks = history.tracks
     nearest = _nearest_agents(tracks, center, max_agents)

@@ -106,15 +106,12 @@ def _resample(xy: FloatArray, arc: FloatArray, out: FloatArray) -> None:
 
 
 def oriented_rectangle(ring: FloatArray) -> FloatArray:
-    """(4, 2) corners of the smallest rectangle around a polygon, one side along its convex hull.
+    """(4, 2) corners of the smallest rectangle around a ring (V, 2), one side along its hull [m].
 
     The first side lies along the hull's edge. Every edge of a rectangle does equally well, so that
     the last bit of an area decides which corner comes first (nuPlan rule 305): sides are compared
     in the order of the hull, clockwise from its lowest vertex, and measured from the origin of the
     map.
-
-    Args:
-        ring: (V, 2) vertices [m].
     """
     hull = _clockwise_hull(ring)
     edges = np.roll(hull, -1, axis=0) - hull
@@ -181,18 +178,10 @@ def road_features(
     lights: IntArray,
     on_route: BoolArray,
 ) -> RoadFeatures:
-    """Objects whose area touches a square around the ego, and with a point near it.
+    """Objects whose area touches a square around `center`, and with a point near it.
 
-    Args:
-        road: The map.
-        ego: (3,) rear axle x [m], y [m], heading [rad]: the frame of the features.
-        center: (2,) or more: box centre, around which objects are looked for [m].
-        radius: Half side of the square [m].
-        lights: (E,) status by edge of `LightLookup`.
-        on_route: (B,) whether a block is on the route.
-
-    Returns:
-        The objects, in the order of `RoadObjects`.
+    `radius` is half the side of the square [m], the rear axle `ego` (3,) the frame of the features,
+    `lights` (E,) are of `LightLookup`, `on_route` (B,) blocks. In the order of `RoadObjects`.
     """
     known = road_objects(road)
     square = square_around(float(center[0]), float(center[1]), radius)

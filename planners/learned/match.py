@@ -32,18 +32,13 @@ def network_module(planner: str) -> Any:
 
 
 def empty_state(planner: str, args: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The network's state with names, shapes and types, but without values.
-
-    Raises:
-        CheckpointError: The network cannot be built from `args`.
-    """
+    """The network's state with names, shapes and types, but without values."""
     import torch
 
     module = network_module(planner)
     try:
         with torch.device("meta"):
-            state: dict[str, Any] = module.build_network(args).state_dict()
-            return state
+            return module.build_network(args).state_dict()
     except _CANNOT_BUILD as error:
         raise CheckpointError(
             f"no network of {planner} can be built from its args ({type(error).__name__}: {error})",

@@ -284,11 +284,7 @@ def _call_known(function: Callable[..., Any], _kind: object, arguments: Any, _st
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """A JSON file that holds one object, such as `args.json`.
-
-    Raises:
-        CheckpointError: It does not.
-    """
+    """A JSON file that holds one object, such as `args.json`; else a CheckpointError."""
     try:
         value = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:

@@ -88,19 +88,16 @@ class FeaturesExtractor(nn.Module):
 
     def see(self, pictures: Tensor) -> Tensor:
         """(B, 9, 256, 256) values from 0 to 255, to (B, 1024)."""
-        flat: Tensor = self.cnn(pictures.to(torch.float32, copy=True).div_(255.0))
-        return flat
+        return self.cnn(pictures.to(torch.float32, copy=True).div_(255.0))
 
     def feel(self, measurements: Tensor) -> Tensor:
         """(B, 10) to (B, 256)."""
-        state: Tensor = self.state_linear(measurements)
-        return state
+        return self.state_linear(measurements)
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Tensor:
         """(B, 9, 256, 256) and (B, 10) to (B, 256)."""
         joined = torch.cat([self.see(pictures), self.feel(measurements)], dim=1)
-        features: Tensor = self.linear(joined)
-        return features
+        return self.linear(joined)
 
 
 class _Constants(nn.Module):
@@ -146,8 +143,7 @@ class CarlNetwork(nn.Module):
 
     def value(self, features: Tensor, value_measurements: Tensor) -> Tensor:
         """(B, 1) what the critic expects, from (B, 256) features and (B, 4) measurements."""
-        value: Tensor = self.value_head(torch.cat([features, value_measurements], dim=1))
-        return value
+        return self.value_head(torch.cat([features, value_measurements], dim=1))
 
 
 def _softplus(x: Tensor) -> Tensor:

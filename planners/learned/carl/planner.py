@@ -50,15 +50,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
     name = "carl"
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
-        """Load the networks.
-
-        Args:
-            checkpoint: A file, several separated by commas, or a folder with one folder for each.
-            device: `cpu`, `cuda` or `cuda:N`.
-
-        Raises:
-            CheckpointError: A checkpoint is missing, damaged or of another network.
-        """
+        """Load the networks, of several checkpoints as `split_ensemble` has them."""
         parts = split_ensemble(checkpoint, self.name)
         self.networks = [load_network(part, self.name, device=device) for part in parts]
         self.device = resolve_device(device)
@@ -161,12 +153,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 
 
 def command_of(action: Action, ego: FloatArray) -> state.Command:
-    """What an action asks of the motion model.
-
-    Args:
-        action: (2,) acceleration and steering, in [-1, 1].
-        ego: (11,) ego state.
-    """
+    """What an action (2,) in [-1, 1], acceleration and steering, asks of the motion model."""
     throttle, steering = float(action[0]), float(action[1])
     steering_rate = (steering * MAX_STEERING - float(ego[state.STEERING])) / DT
     acceleration = throttle * (MAX_ACCELERATION if throttle >= 0.0 else MAX_BRAKING)

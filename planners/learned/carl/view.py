@@ -74,11 +74,7 @@ def make_scratch(roads: Roads) -> Scratch:
 
 @kernel
 def picture_frame(center: FloatArray) -> FloatArray:
-    """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle.
-
-    Args:
-        center: (3,) centre of the ego x [m], y [m], heading [rad].
-    """
+    """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle."""
     cos, sin = np.cos(center[2]), np.sin(center[2])
     return np.array([center[0] + AHEAD * cos, center[1] + AHEAD * sin, cos, sin])
 
@@ -136,16 +132,10 @@ def draw_roads(
     on_route: BoolArray,
     lights: IntArray,
 ) -> None:
-    """Draw what the map has, and the lights.
+    """Draw what the map has, and the lights, into `rasters` (9, 256, 256) of zeros.
 
-    Args:
-        rasters: (9, 256, 256) of zeros.
-        roads: The map.
-        scratch: Scratch for the map.
-        frame: (4,) of the raster.
-        found: Areas in it.
-        on_route: (B,) blocks of the route.
-        lights: (E,) LightStatus by edge, ABSENT where there is none.
+    `found` are the areas in the raster, `on_route` (B,) the blocks of the route, `lights` (E,) the
+    LightStatus by edge, ABSENT where there is none.
     """
     scratch.filled[:] = False
     scratch.drawn[:] = False

@@ -105,13 +105,7 @@ class FeatureBuilder:
 
 
 def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> IntArray:
-    """Edges that the network sees, nearest first.
-
-    Args:
-        road: The map.
-        bounds: Of its centre lines (`LaneLines`).
-        anchor: (3,) rear axle.
-    """
+    """Edges seen from a rear axle (3,), nearest first; `bounds` as in `LaneLines`."""
     x, y = float(anchor[0]), float(anchor[1])
     areas, lines, square = road.edges.polygons, road.baselines, square_around(x, y, RADIUS)
     near = kernels.lanes_in_square(areas, lines, bounds, road.num_lanes, square)
@@ -119,12 +113,7 @@ def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> Int
 
 
 def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
-    """Positions of the chosen lanes that are on the route, in the order of the lanes.
-
-    Args:
-        blocks: Block of each chosen lane.
-        route: Blocks in order.
-    """
+    """Positions of the chosen lanes whose block is on the route, in the order of the lanes."""
     # nuPlan rule 333: of the route counts one stretch without a gap, the first
     seen = set(blocks.tolist())
     stretch: set[int] = set()
@@ -168,14 +157,7 @@ def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, 
 def _choose_agents(
     present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
 ) -> Any:
-    """Tracks that the network sees, nearest first.
-
-    Args:
-        present: (N,) whether each track is there now.
-        poses: (N, 3) their present poses.
-        kinds: (N,) their kinds.
-        anchor: (3,) rear axle.
-    """
+    """Tracks that the network sees, nearest first."""
     order = _by_distance(present & (kinds <= kernels.BICYCLE), poses, anchor)
     if len(order) <= kernels.AGENTS:
         return order

@@ -121,8 +121,7 @@ class PlanTfNetwork(nn.Module):
         """(T, 128) of poses (T, 3)."""
         angle = poses[:, 2]
         where = torch.stack([poses[:, 0], poses[:, 1], angle.cos(), angle.sin()], dim=-1)
-        out: Tensor = self.pos_emb(where)
-        return out
+        return self.pos_emb(where)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:

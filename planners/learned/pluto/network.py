@@ -194,11 +194,7 @@ def _all_counts(seen: Inputs) -> list[list[int]]:
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
-    """The network, without weights; there is one architecture.
-
-    Args:
-        args: None, or for tests `misordered_masks`, as the official code has them.
-    """
+    """The network, without weights; `args` is for tests: `misordered_masks`, as official."""
     network = PlutoNetwork()
     network.planning_decoder.misordered_masks = bool(args and args["misordered_masks"])
     return network

@@ -35,8 +35,7 @@ class MlpLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
-        out: Tensor = self.mlp(x)
-        return out
+        return self.mlp(x)
 
 
 class FourierEmbedding(nn.Module):
@@ -60,8 +59,7 @@ class FourierEmbedding(nn.Module):
         total = self.mlps[0](waves[..., 0, :])
         for index in range(1, len(self.mlps)):
             total = total + self.mlps[index](waves[..., index, :])
-        out: Tensor = self.to_out(total)
-        return out
+        return self.to_out(total)
 
 
 class DecoderBlock(nn.Module):
@@ -78,18 +76,7 @@ class DecoderBlock(nn.Module):
     def forward(
         self, x: Tensor, lines: "Lines", mode_position: Tensor, tokens: Tensor, scenes: Scenes
     ) -> Tensor:
-        """Refine queries.
-
-        Args:
-            x: (L, modes, 128) queries.
-            lines: How the reference lines lie.
-            mode_position: (1, modes, 128).
-            tokens: (T, 128) of the scenes.
-            scenes: How they lie.
-
-        Returns:
-            (L, modes, 128)
-        """
+        """Refine queries (L, modes, 128) of reference lines by tokens (T, 128) of the scenes."""
         x = x + self._among_lines(self.norm1(x), lines)
         normed = self.norm2(x)
         placed = normed + mode_position
@@ -112,8 +99,7 @@ class DecoderBlock(nn.Module):
                 q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1), mask
             )
             mixed.append(by_mode.transpose(0, 1))
-        out: Tensor = self.r2r_attn.out_proj(torch.cat(mixed))
-        return out
+        return self.r2r_attn.out_proj(torch.cat(mixed))
 
 
 class Lines(NamedTuple):
@@ -159,17 +145,10 @@ class PlanningDecoder(nn.Module):
     def forward(
         self, seen: SeenLines, counts: Sequence[int], tokens: Tensor, scenes: Scenes, egos: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Decode.
+        """Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
 
-        Args:
-            seen: Inputs of the network, with the reference lines.
-            counts: How many lines of each scene are no padding.
-            tokens: (T, 128) of the scenes.
-            scenes: How they lie.
-            egos: (B, 128) the tokens of the egos.
-
-        Returns:
-            Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
+        `counts` says how many lines of each scene are no padding; `tokens` (T, 128) are those of
+        the scenes, `egos` (B, 128) of the egos.
         """
         valid = seen.line_valid
         shape = (*valid.shape[:2], MODES)
@@ -201,5 +180,4 @@ class PlanningDecoder(nn.Module):
         parts = (points - points[:, :, :1], seen.line_vectors, directions)
         start = torch.cat([points[:, :, 0], angles[:, :, :1]], dim=-1)
         lines = self.r_encoder(torch.cat(parts, dim=-1), seen.line_valid)
-        out: Tensor = lines + self.r_pos_emb(start)
-        return out
+        return lines + self.r_pos_emb(start)

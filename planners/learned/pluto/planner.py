@@ -190,12 +190,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         return Choice(poses, learned, agents, scores, best, braked)
 
     def world_of(self, observation: Observation, agents: Agents) -> World:
-        """What the proposals of the last step can collide with.
-
-        Args:
-            observation: Of the last step.
-            agents: The agents, now and predicted.
-        """
+        """What the proposals of the last step, of this observation, can collide with."""
         scene, sight, route = self._scene, self.sight, self.route
         assert scene is not None
         assert sight is not None

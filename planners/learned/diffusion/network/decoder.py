@@ -129,14 +129,9 @@ class Prepared:
     modulation: list[tuple[Tensor, ...]]
 
     def __call__(self, x: Tensor, call: int) -> Tensor:
-        """One call of the network.
+        """Clean trajectories of noisy ones (B, A, 4 * steps), ego first, at a prepared time.
 
-        Args:
-            x: (B, A, 4 * steps) noisy trajectories, ego first; on a CPU at least `rows.ROWS`.
-            call: Which of the prepared times.
-
-        Returns:
-            (B, A, 4 * steps) clean ones.
+        On a CPU, A is at least `rows.ROWS`.
         """
         shape = x.shape
         first, second = self.entry
@@ -180,8 +175,7 @@ class TimeEmbedder(nn.Module):
         """(S,) times in [0, 1] to (S, hidden)."""
         steps = torch.arange(FREQUENCIES, dtype=torch.float32, device=times.device)
         phase = times[:, None] * torch.exp(-math.log(LONGEST) * steps / FREQUENCIES)
-        out: Tensor = self.mlp(torch.cat([torch.cos(phase), torch.sin(phase)], dim=-1))
-        return out
+        return self.mlp(torch.cat([torch.cos(phase), torch.sin(phase)], dim=-1))
 
 
 class DiTBlock(nn.Module):
@@ -253,13 +247,10 @@ class DiT(nn.Module):
         self.final_layer = FinalLayer(hidden, 4 * POSES)
 
     def prepare(self, context: Tensor, route: Tensor, absent: Tensor, times: Tensor) -> Prepared:
-        """What the calls at all `times` share.
+        """What the calls at all `times` (S,) share.
 
-        Args:
-            context: (B, N, hidden) tokens of the scene.
-            route: (B, hidden) of `route_encoder`.
-            absent: (B, A) agents that are not there; the ego always is.
-            times: (S,) at which the network will be called.
+        `context` (B, N, hidden) are tokens of the scene, `route` (B, hidden) that of the route,
+        `absent` (B, A) agents that are not there; the ego always is.
         """
         condition = functional.silu(route + self.t_embedder(times)[:, None])[:, :, None]
         one = torch.ones((), device=context.device)

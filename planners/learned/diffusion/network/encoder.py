@@ -42,8 +42,7 @@ class Mixer(nn.Module):
         """
         self.tokens_mlp.add_over_rows_to(x, self.norm1(x))
         hidden = self.channels_mlp.hidden(self.norm2(x)).mean(dim=1)
-        out: Tensor = x.mean(dim=1) + self.channels_mlp.fc2(hidden)
-        return out
+        return x.mean(dim=1) + self.channels_mlp.fc2(hidden)
 
 
 class MixerEncoder(nn.Module):
@@ -73,8 +72,7 @@ class MixerEncoder(nn.Module):
 
     def token(self, x: Tensor) -> Tensor:
         """(N, CHANNELS) to (N, hidden)."""
-        out: Tensor = self.emb_project(self.norm(x))
-        return out
+        return self.emb_project(self.norm(x))
 
 
 class AgentEncoder(MixerEncoder):
@@ -101,8 +99,7 @@ class StaticEncoder(nn.Module):
 
     def forward(self, objects: Tensor) -> Tensor:
         """(N, 10) to (N, hidden)."""
-        out: Tensor = self.projection(objects)
-        return out
+        return self.projection(objects)
 
 
 class LaneEncoder(MixerEncoder):
@@ -151,8 +148,7 @@ class Fusion(nn.Module):
         """(B, N, hidden) to the same; `mask` is added to the logits."""
         for block in self.blocks:
             x = block(x, mask)
-        out: Tensor = self.norm(x)
-        return out
+        return self.norm(x)
 
 
 class SceneEncoder(nn.Module):
@@ -169,17 +165,10 @@ class SceneEncoder(nn.Module):
     def forward(
         self, agents: Tensor, objects: Tensor, lanes: Tensor, limit: Tensor, has_limit: Tensor
     ) -> Tensor:
-        """Tokens of a scene: agents, static objects, lanes.
+        """Tokens (B, A + O + L, hidden) of normalised agents, static objects and lanes.
 
-        Args:
-            agents: (B, A, samples, 11) normalised histories.
-            objects: (B, O, 10) normalised static objects.
-            lanes: (B, L, points, 12) normalised lanes.
-            limit: (B, L, 1) normalised speed limits.
-            has_limit: (B, L, 1) whether they are known.
-
-        Returns:
-            (B, A + O + L, hidden).
+        Agents are (B, A, samples, 11), objects (B, O, 10), lanes (B, L, points, 12), limits and
+        whether they are known (B, L, 1).
         """
         used = [
             (agents[..., :AGENT_COLUMNS] != 0.0).any(dim=-1).any(dim=-1),
@@ -204,8 +193,7 @@ class SceneEncoder(nn.Module):
             out[where] = token
         valid[:, 0] = True  # an empty scene still has one key: a zero token
         mask = torch.zeros_like(valid, dtype=tokens.dtype).masked_fill(~valid, NO_KEY)
-        fused: Tensor = self.fusion(tokens, mask[:, None, None, :])
-        return fused
+        return self.fusion(tokens, mask[:, None, None, :])
 
 
 def _positions(rows: Tensor, kind: int) -> Tensor:

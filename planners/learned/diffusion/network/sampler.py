@@ -79,15 +79,9 @@ SCHEDULE = make_schedule()
 
 
 def sample(network: Callable[[Tensor, int], Tensor], current: Tensor, noise: Tensor) -> Tensor:
-    """Trajectories from noise.
+    """(B, A, T, 4) normalised states from noise (B, A, T - 1, 4), the present ones (B, A, 4) first.
 
-    Args:
-        network: Clean trajectories of noisy ones (B, A, 4 * T) and the number of the call.
-        current: (B, A, 4) present states, which stay as they are.
-        noise: (B, A, T - 1, 4) standard normal.
-
-    Returns:
-        (B, A, T, 4) normalised states, the present ones first.
+    `network` gives clean trajectories of noisy ones (B, A, 4 * T) and the number of the call.
     """
     x = torch.cat([current[:, :, None], TEMPERATURE * noise], dim=2).flatten(2)
     before = x
