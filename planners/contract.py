@@ -177,15 +177,14 @@ def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | No
 def _check_repeats(
     planner: Any, copy: Any, first: Plans, scenario: Scenario, findings: list[Finding]
 ) -> None:
-    other = None if copy is None else _drive(copy, scenario, findings, [])
-    if other is not None and (where := _first_difference(first, other)) is not None:
-        text = f"two planners of the same make differ at iteration {where}"
-        findings.append(_error("deterministic", text))
-        return
-    again = _drive(planner, scenario, findings, [])
-    if again is not None and (where := _first_difference(first, again)) is not None:
-        text = f"after a reset the planner differs at iteration {where}"
-        findings.append(_error("survives reset", text))
+    for subject, check, text in (
+        (copy, "deterministic", "two planners of the same make differ"),
+        (planner, "survives reset", "after a reset the planner differs"),
+    ):
+        again = None if subject is None else _drive(subject, scenario, findings, [])
+        if again is not None and (where := _first_difference(first, again)) is not None:
+            findings.append(_error(check, f"{text} at iteration {where}"))
+            return
 
 
 def _first_difference(a: Plans, b: Plans) -> int | None:

@@ -19,7 +19,7 @@ from shiftsim.files import checkpoint_folder
 from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
-from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
+from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object, unreadable
 from shiftsim.planners.table import PUBLISHED
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
@@ -134,9 +134,8 @@ def how_to_get(planner: str) -> str:
     if planner not in PUBLISHED:
         return "check the path"
     return (
-        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, "
-        "then --checkpoint PATH; "
-        "to try without: --checkpoint deterministic:drive (scores mean nothing)"
+        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, then "
+        "--checkpoint PATH; to try without: --checkpoint deterministic:drive (scores mean nothing)"
     )
 
 
@@ -240,9 +239,8 @@ def _require_likeness(found: Checkpoint, planner: str) -> None:
         return
     name = f"checkpoint {str(found.path)!r} is not for planner {planner!r}"
     if other:
-        raise CheckpointError(
-            f"{name}: it looks like {other!r}", f"--planner {other}, or {how_to_get(planner)}"
-        )
+        hint = f"--planner {other}, or {how_to_get(planner)}"
+        raise CheckpointError(f"{name}: it looks like {other!r}", hint)
     raise CheckpointError(f"{name}, nor for any other known here", how_to_get(planner))
 
 
@@ -252,9 +250,7 @@ def file_hash(path: Path) -> str:
         status = path.stat()
         return _file_hash(path.resolve(), status.st_mtime_ns, status.st_size)
     except OSError as error:
-        raise CheckpointError(
-            f"checkpoint {str(path)!r} cannot be read ({error.strerror})", "check the path"
-        ) from error
+        raise unreadable(path, error) from error
 
 
 @lru_cache
@@ -290,9 +286,8 @@ def _inside(folder: Path) -> Path:
 
 def _known_deterministic(spec: str) -> str:
     if spec not in DETERMINISTIC:
-        raise CheckpointError(
-            f"checkpoint {spec!r} unknown", hint=f"there are {' and '.join(DETERMINISTIC)}"
-        )
+        hint = f"there are {' and '.join(DETERMINISTIC)}"
+        raise CheckpointError(f"checkpoint {spec!r} unknown", hint)
     return spec
 
 

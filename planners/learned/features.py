@@ -25,7 +25,6 @@ class PerMap(Generic[Arrays]):
     """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
 
     def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
-        """Nothing is built before it is asked for."""
         self._build = build
         self._kept: list[tuple[VectorMap, Arrays]] = []
 

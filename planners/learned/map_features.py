@@ -139,11 +139,7 @@ def _clockwise_hull(ring: FloatArray) -> FloatArray:
 
 
 class LightLookup:
-    """Traffic lights by edge; the ids of one scenario are looked up once.
-
-    Attributes:
-        edges: Those that lights are listed for.
-    """
+    """Traffic lights by edge, `edges` with a light; the ids of one scenario are looked up once."""
 
     def __init__(self, road: VectorMap, default: LightStatus = LightStatus.UNKNOWN) -> None:
         """Take the map of the scenario, and the status of edges for which no light is listed."""
@@ -201,17 +197,8 @@ def road_features(
         [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
     )
     return RoadFeatures(
-        objects=kept,
-        points=points,
-        vectors=vectors,
-        orientations=orientations,
-        centers=centers,
-        valid=valid,
-        kind=known.kind[kept],
-        on_route=routed,
-        light=light,
-        has_limit=has_limit,
-        limit=np.where(has_limit, limit, 0.0).astype(np.float32),
+        *(kept, points, vectors, orientations, centers, valid, known.kind[kept], routed, light),
+        *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
     )
 
 

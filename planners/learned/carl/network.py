@@ -100,28 +100,15 @@ class FeaturesExtractor(nn.Module):
         return self.linear(joined)
 
 
-class _Constants(nn.Module):
-    """Holds numbers of the checkpoint that nothing reads."""
-
-    def __init__(self, values: Mapping[str, list[float]]) -> None:
-        super().__init__()
-        for name, value in values.items():
-            self.register_buffer(name, torch.tensor(value))
-
-
 class CarlNetwork(nn.Module):
     """Policy and critic."""
 
     def __init__(self) -> None:
         super().__init__()
-        inner: dict[str, list[float]] = {}
+        self.action_dist = nn.Module()
         for name, value in _CONSTANTS.items():
             owner, _, leaf = name.rpartition(".")
-            if owner:
-                inner[leaf] = value
-            else:
-                self.register_buffer(leaf, torch.tensor(value))
-        self.action_dist = _Constants(inner)
+            self.get_submodule(owner).register_buffer(leaf, torch.tensor(value))
         self.features_extractor = FeaturesExtractor()
         self.policy_head = _perceptron(FEATURES, FEATURES, FEATURES)
         self.dist_mu = nn.Sequential(Linear(FEATURES, ACTIONS))

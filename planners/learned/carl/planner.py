@@ -89,18 +89,10 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
         box = (*center.tolist(), scene.vehicle.length, scene.vehicle.width)
         view.draw_box(self._pictures[view.EGO], frame, *box, value, scratch)
-        return CarlFeatures(
-            self._pictures,
-            np.concatenate(
-                [
-                    self._last_action,
-                    velocity,
-                    state.center_accelerations(ego, scene.vehicle),
-                    ego[state.STEERING : state.YAW_ACCEL + 1],
-                ],
-                dtype=np.float32,
-            ),
-        )
+        acceleration = state.center_accelerations(ego, scene.vehicle)
+        turning = ego[state.STEERING : state.YAW_ACCEL + 1]
+        parts = [self._last_action, velocity, acceleration, turning]
+        return CarlFeatures(self._pictures, np.concatenate(parts, dtype=np.float32))
 
     def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
         """Actions (2,) in [-1, 1]: acceleration and steering."""
@@ -132,10 +124,8 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         elif len(known) < len(set(scene.route)):
             self._route_flaw = "the route has blocks that the map does not have"
         if known:
-            footprint = boxes_to_corners(
-                center, np.array([scene.vehicle.length, scene.vehicle.width])
-            )
-            start = find_start(road, known, ego[:3], footprint)
+            size = np.array([scene.vehicle.length, scene.vehicle.width])
+            start = find_start(road, known, ego[:3], boxes_to_corners(center, size))
             self.route = correct_route(road, known, start)
         self._on_route = np.zeros(len(road.blocks), np.bool_)
         self._on_route[self.route] = True
@@ -172,9 +162,6 @@ def _boxes(observation: Observation) -> view.Boxes:
     """The present objects."""
     tracks = observation.history.tracks
     rows = np.flatnonzero(tracks.valid[-1])
-    return view.Boxes(
-        tracks.poses[-1][rows],
-        tracks.sizes[-1][rows],
-        tracks.velocities[-1][rows],
-        tracks.kinds[rows],
-    )
+    parts = (tracks.poses, tracks.sizes, tracks.velocities)
+    poses, sizes, velocities = (part[-1][rows] for part in parts)
+    return view.Boxes(poses, sizes, velocities, tracks.kinds[rows])

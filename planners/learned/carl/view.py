@@ -15,8 +15,7 @@ from shiftsim.planners.learned.carl.raster import (
     Crossings,
     Raster,
     draw_line,
-    fill_area,
-    fill_box,
+    fill,
     make_crossings,
 )
 from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
@@ -188,7 +187,7 @@ def _fill_shell(
     for vertex in range(start, stop):
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
         scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
-    fill_area(raster, scratch.ring[: stop - start], YES, scratch.crossings)
+    fill(raster, scratch.ring[: stop - start], YES, scratch.crossings, False)
 
 
 @kernel
@@ -249,4 +248,4 @@ def draw_box(
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
-    fill_box(raster, pixels, value, scratch.crossings)
+    fill(raster, pixels, value, scratch.crossings, True)

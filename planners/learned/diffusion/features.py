@@ -72,7 +72,6 @@ class FeatureBuilder:
     """Features of one scenario."""
 
     def __init__(self, scene: SceneInfo, lanes: kernels.LaneLines) -> None:
-        """Prepare for a scenario on a map whose lanes are given."""
         self._road, self._lanes = scene.map, lanes
         blocks = route_blocks(scene)
         self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None

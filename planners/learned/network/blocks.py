@@ -328,14 +328,8 @@ class MapEncoder(nn.Module):
         tokens = self.polygon_encoder(points, seen.point_valid)
         known = self.speed_limit_emb(seen.limit[..., None])
         speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
-        out: Tensor = (
-            tokens
-            + self.type_emb(seen.kind)
-            + self.on_route_emb(seen.on_route)
-            + self.traffic_light_emb(seen.light)
-            + speed
-        )
-        return out
+        tokens = tokens + self.type_emb(seen.kind) + self.on_route_emb(seen.on_route)
+        return tokens + self.traffic_light_emb(seen.light) + speed
 
 
 def along_line(middle: Tensor, seen: SceneTensors) -> list[Tensor]:

@@ -137,9 +137,8 @@ class PlanningDecoder(nn.Module):
         self.m_pos = nn.Parameter(torch.zeros(1, MODES, DIM))
         self.decoder_blocks = nn.ModuleList(DecoderBlock() for _ in range(DEPTH))
         self.cat_x_proj = Linear(2 * DIM, DIM)
-        self.loc_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.yaw_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.vel_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        heads = (MlpLayer(DIM, 2 * DIM, 2 * STEPS) for _ in range(3))
+        self.loc_head, self.yaw_head, self.vel_head = heads
         self.pi_head = MlpLayer(DIM, DIM, 1)
 
     def forward(

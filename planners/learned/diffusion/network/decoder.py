@@ -196,18 +196,14 @@ class DiTBlock(nn.Module):
     def at_hand(self, context: Tensor, modulation: list[tuple[Tensor, ...]], mask: Tensor) -> Block:
         """The block for one plan: tokens of the scene (B, N, hidden), the rest as in `Block`."""
         attend = self.cross_attn
-        first, weight, bias = (
-            attend.out_proj.in_features,
-            attend.in_proj_weight,
-            attend.in_proj_bias,
-        )
+        first, weight = attend.out_proj.in_features, attend.in_proj_weight
         keys, values = (attend.heads(part) for part in attend.keys_values(context))
         return Block(
             norms=tuple(norm(getattr(self, f"norm{number}")) for number in (1, 2, 3, 4)),
             packed=Product(self.attn.in_proj_weight.t(), self.attn.in_proj_bias),
             joined=product(self.attn.out_proj),
             mlp1=(product(self.mlp1.fc1), product(self.mlp1.fc2)),
-            query=Product(weight[:first].t(), bias[:first]),
+            query=Product(weight[:first].t(), attend.in_proj_bias[:first]),
             looked=product(attend.out_proj),
             mlp2=(product(self.mlp2.fc1), product(self.mlp2.fc2)),
             modulation=modulation,

@@ -178,18 +178,14 @@ class SceneEncoder(nn.Module):
         valid = torch.cat(used, dim=1)
         tokens = agents.new_zeros(*valid.shape, self.pos_emb.out_features)
         split = [part.shape[1] for part in used]
-        rows = [agents[used[0]], objects[used[1]], lanes[used[2]]]
-        for out, where, token in zip(
-            torch.split(tokens, split, dim=1),
-            used,
-            (
-                self.neighbor_encoder(rows[0]) + self.pos_emb(_positions(rows[0][:, -1], 0)),
-                self.static_encoder(rows[1]) + self.pos_emb(_positions(rows[1], 1)),
-                self.lane_encoder(rows[2], limit[used[2]], has_limit[used[2]])
-                + self.pos_emb(_lane_positions(rows[2][:, MIDDLE])),
-            ),
-            strict=True,
-        ):
+        agent, static, lane = agents[used[0]], objects[used[1]], lanes[used[2]]
+        made = (
+            self.neighbor_encoder(agent) + self.pos_emb(_positions(agent[:, -1], 0)),
+            self.static_encoder(static) + self.pos_emb(_positions(static, 1)),
+            self.lane_encoder(lane, limit[used[2]], has_limit[used[2]])
+            + self.pos_emb(_lane_positions(lane[:, MIDDLE])),
+        )
+        for out, where, token in zip(torch.split(tokens, split, dim=1), used, made, strict=True):
             out[where] = token
         valid[:, 0] = True  # an empty scene still has one key: a zero token
         mask = torch.zeros_like(valid, dtype=tokens.dtype).masked_fill(~valid, NO_KEY)

@@ -54,17 +54,8 @@ def make_schedule() -> Schedule:
     sigma = torch.sqrt(1.0 - torch.exp(2.0 * log_alpha))
     half_snr = _half_snr(log_alpha)
     h = half_snr.diff()
-    return Schedule(
-        times=times,
-        log_alpha=log_alpha,
-        alpha=alpha,
-        sigma=sigma,
-        half_snr=half_snr,
-        h=h,
-        c_x=sigma[1:] / sigma[:-1],
-        c_x0=-alpha[1:] * torch.expm1(-h),
-        r0=h[:-1] / h[1:],
-    )
+    c_x, c_x0, r0 = sigma[1:] / sigma[:-1], -alpha[1:] * torch.expm1(-h), h[:-1] / h[1:]
+    return Schedule(times, log_alpha, alpha, sigma, half_snr, h, c_x, c_x0, r0)
 
 
 def _log_alpha(time: Tensor) -> Tensor:
