@@ -11,13 +11,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import box_corners
-from shiftsim.planners.learned.carl.raster import (
-    Crossings,
-    Raster,
-    draw_line,
-    fill,
-    make_crossings,
-)
+from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
 from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
