@@ -57,14 +57,10 @@ class Finding:
 
 
 def check_planner(planner: Any, scenario: Scenario) -> list[Finding]:
-    """Try a planner on one scenario.
+    """Try a planner on one scenario of at least three iterations; what was found, errors first.
 
-    Args:
-        planner: A planner, or a class or function without arguments that makes one.
-        scenario: Any scenario with at least three iterations.
-
-    Returns:
-        What was found, errors first; the run time is always among it.
+    `planner` is one, or a class or function without arguments that makes one. The run time is
+    always among the findings.
     """
     findings: list[Finding] = []
     is_made = isinstance(planner, type) or not hasattr(planner, "plan")
@@ -181,15 +177,14 @@ def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | No
 def _check_repeats(
     planner: Any, copy: Any, first: Plans, scenario: Scenario, findings: list[Finding]
 ) -> None:
-    other = None if copy is None else _drive(copy, scenario, findings, [])
-    if other is not None and (where := _first_difference(first, other)) is not None:
-        text = f"two planners of the same make differ at iteration {where}"
-        findings.append(_error("deterministic", text))
-        return
-    again = _drive(planner, scenario, findings, [])
-    if again is not None and (where := _first_difference(first, again)) is not None:
-        text = f"after a reset the planner differs at iteration {where}"
-        findings.append(_error("survives reset", text))
+    for subject, check, text in (
+        (copy, "deterministic", "two planners of the same make differ"),
+        (planner, "survives reset", "after a reset the planner differs"),
+    ):
+        again = None if subject is None else _drive(subject, scenario, findings, [])
+        if again is not None and (where := _first_difference(first, again)) is not None:
+            findings.append(_error(check, f"{text} at iteration {where}"))
+            return
 
 
 def _first_difference(a: Plans, b: Plans) -> int | None:

@@ -69,10 +69,7 @@ _ENTRIES = (
         ("target_velocity", *_IDM),
     ),
     PlannerEntry(
-        "log-future",
-        "oracle",
-        f"{_HERE}.basic.log_future:LogFuture",
-        "drives the recorded future",
+        "log-future", "oracle", f"{_HERE}.basic.log_future:LogFuture", "drives the recorded future"
     ),
     PlannerEntry(
         "pdm-closed",

@@ -13,10 +13,8 @@ class LogFuture:
     """Plans the recorded states of the coming 8 s, whatever the simulated ego does."""
 
     name = "log-future"
-
-    def __init__(self) -> None:
-        self._scenario: Scenario | None = None
-        self._previous: Trajectory | None = None
+    _scenario: Scenario | None = None
+    _previous: Trajectory | None = None
 
     def reset(self, scene: SceneInfo) -> None:
         """Take the recording of the new scenario."""

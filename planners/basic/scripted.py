@@ -11,14 +11,10 @@ from shiftsim.world.state import AX, AY, NUM_STATE, STEERING, VX, VY, YAW_RATE, 
 
 SAMPLES = 81  # 8 s at 0.1 s
 _REQUIRED = {"x": 0, "y": 1, "heading": 2}
-_OPTIONAL = {
-    "vx": VX,
-    "vy": VY,
-    "ax": AX,
-    "ay": AY,
-    "tire_steering_angle": STEERING,
-    "angular_velocity": YAW_RATE,
-}
+_OPTIONAL = dict(
+    vx=VX, vy=VY, ax=AX, ay=AY, tire_steering_angle=STEERING, angular_velocity=YAW_RATE
+)
+_HINT = "scripts are tables with scene, planner, time_us, x, y and heading"
 _PREFIX = "scripted_"  # of the script's name in reference files
 
 
@@ -115,16 +111,10 @@ def _read_columns(path: Path) -> dict[str, Any]:
         read = pa.csv.read_csv if path.suffix.lower() == ".csv" else pa.parquet.read_table
         table = read(path)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            f"{path}: not a readable Parquet or CSV file ({error})",
-            hint="scripts are tables with scene, planner, time_us, x, y and heading",
-        ) from error
+        raise DataError(f"{path}: not a readable Parquet or CSV file ({error})", _HINT) from error
     for name in ("scene", "planner", "time_us", *_REQUIRED):
         if name not in table.column_names:
-            raise DataError(
-                f"{path}: column {name!r} is missing",
-                hint="scripts are tables with scene, planner, time_us, x, y and heading",
-            )
+            raise DataError(f"{path}: column {name!r} is missing", _HINT)
     return {name: table[name].to_numpy() for name in table.column_names}
 
 

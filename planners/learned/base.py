@@ -26,16 +26,7 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
     degraded: str = ""  # why the last plan is a fallback; empty when it is not
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            checkpoint: File, folder, name, or `deterministic:base|drive`; see `load_weights`.
-            device: `cpu`, `cuda`, `cuda:N` or `auto`.
-
-        Raises:
-            CheckpointError: The checkpoint is missing, damaged or of another network.
-            MissingExtraError: PyTorch is not installed.
-        """
+        """Load the network; arguments and errors are those of `load_weights`."""
         self.network = load_network(checkpoint, self.name, device=device)
         self.device = resolve_device(device)
 

@@ -16,16 +16,10 @@ from typing import Any, NamedTuple
 
 from shiftsim.errors import CheckpointError, nearest
 from shiftsim.files import checkpoint_folder
+from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
-from shiftsim.planners.learned.match import (
-    differences,
-    empty_state,
-    most_like,
-    network_module,
-    shapes_of,
-)
-from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object
+from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object, unreadable
 from shiftsim.planners.table import PUBLISHED
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
@@ -61,7 +55,7 @@ def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
     The arguments and errors are those of `load_weights`.
     """
     weights = load_weights(spec, planner, device=device)
-    network = network_module(planner).build_network(weights.args)
+    network = match.network_module(planner).build_network(weights.args)
     network.load_state_dict(weights.state)
     return network.to(resolve_device(device)).eval()
 
@@ -95,10 +89,7 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
 def checkpoint_fingerprint(spec: str, planner: str) -> str:
     """What tells these weights from others: SHA-256 of the files, or the deterministic name.
 
-    Several checkpoints of an ensemble give several, separated by commas. Files are hashed once.
-
-    Raises:
-        CheckpointError: There is no such file.
+    Several checkpoints of an ensemble give several, separated by commas.
     """
     return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec, planner))
 
@@ -113,11 +104,7 @@ def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
 
 
 def find_checkpoint(spec: str, planner: str = "") -> Path:
-    """The file that is meant, by default the published one of the planner.
-
-    Raises:
-        CheckpointError: There is none, or a folder holds several.
-    """
+    """The file that is meant, by default the published one; else a CheckpointError."""
     given, named = Path(spec).expanduser(), checkpoint_folder() / spec
     if planner and not spec:
         given = named = _published_path(planner)
@@ -147,18 +134,13 @@ def how_to_get(planner: str) -> str:
     if planner not in PUBLISHED:
         return "check the path"
     return (
-        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, "
-        "then --checkpoint PATH; "
-        "to try without: --checkpoint deterministic:drive (scores mean nothing)"
+        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, then "
+        "--checkpoint PATH; to try without: --checkpoint deterministic:drive (scores mean nothing)"
     )
 
 
 def open_checkpoint(path: Path) -> Checkpoint:
-    """The weights in a file, whatever planner they are of.
-
-    Raises:
-        CheckpointError: It is no checkpoint, or it is damaged.
-    """
+    """The weights in a file, whatever planner they are of; else a CheckpointError."""
     contents = read_contents(path)
     entry = next((e for e in _ENTRIES if isinstance(contents.entries.get(e), dict)), "")
     holder = contents.entries[entry] if entry else contents.entries
@@ -212,11 +194,7 @@ def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
 
 
 def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
-    """Settings that a planner's network needs beside the weights; None for those without.
-
-    Raises:
-        CheckpointError: They are missing.
-    """
+    """Settings that a planner's network needs beside the weights; None for those without."""
     if planner not in _WITH_ARGS:
         return None
     if found.args is None:
@@ -233,11 +211,10 @@ def checked_state(
 ) -> dict[str, Any]:
     """All tensors of a planner's network, and no other, in its own types.
 
-    Raises:
-        CheckpointError: One is missing, unexpected, of another shape, or not finite.
+    A CheckpointError says which is missing, unexpected, of another shape, or not finite.
     """
-    wanted = empty_state(planner, args)
-    problems = differences(shapes_of(found.state), shapes_of(wanted))
+    wanted = match.empty_state(planner, args)
+    problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)
         raise CheckpointError(
@@ -257,14 +234,13 @@ def checked_state(
 
 def _require_likeness(found: Checkpoint, planner: str) -> None:
     """Raise where a checkpoint is not of the planner's network, but perhaps of another's."""
-    other = most_like(shapes_of(found.state))
+    other = match.most_like(match.shapes_of(found.state))
     if other == planner:
         return
     name = f"checkpoint {str(found.path)!r} is not for planner {planner!r}"
     if other:
-        raise CheckpointError(
-            f"{name}: it looks like {other!r}", f"--planner {other}, or {how_to_get(planner)}"
-        )
+        hint = f"--planner {other}, or {how_to_get(planner)}"
+        raise CheckpointError(f"{name}: it looks like {other!r}", hint)
     raise CheckpointError(f"{name}, nor for any other known here", how_to_get(planner))
 
 
@@ -274,9 +250,7 @@ def file_hash(path: Path) -> str:
         status = path.stat()
         return _file_hash(path.resolve(), status.st_mtime_ns, status.st_size)
     except OSError as error:
-        raise CheckpointError(
-            f"checkpoint {str(path)!r} cannot be read ({error.strerror})", "check the path"
-        ) from error
+        raise unreadable(path, error) from error
 
 
 @lru_cache
@@ -312,9 +286,8 @@ def _inside(folder: Path) -> Path:
 
 def _known_deterministic(spec: str) -> str:
     if spec not in DETERMINISTIC:
-        raise CheckpointError(
-            f"checkpoint {spec!r} unknown", hint=f"there are {' and '.join(DETERMINISTIC)}"
-        )
+        hint = f"there are {' and '.join(DETERMINISTIC)}"
+        raise CheckpointError(f"checkpoint {spec!r} unknown", hint)
     return spec
 
 
@@ -322,5 +295,5 @@ def _deterministic(spec: str, planner: str) -> dict[str, Any]:
     import torch
 
     variant = _known_deterministic(spec).removeprefix("deterministic:")
-    state = network_weights(network_module(planner), variant)
+    state = network_weights(match.network_module(planner), variant)
     return {name: torch.from_numpy(value) for name, value in state.items()}

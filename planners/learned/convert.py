@@ -6,13 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import CheckpointError
-from shiftsim.planners.learned.checkpoint import (
-    checked_state,
-    file_hash,
-    find_checkpoint,
-    needed_args,
-    open_checkpoint,
-)
+from shiftsim.planners.learned import checkpoint
 from shiftsim.planners.learned.device import require_torch
 from shiftsim.planners.learned.match import most_like, shapes_of
 
@@ -54,21 +48,18 @@ class Inspection:
 
 
 def inspect_checkpoint(spec: str) -> Inspection:
-    """Look into a checkpoint file.
-
-    Args:
-        spec: File, folder that holds one, or name in the folder of checkpoints.
+    """Look into a checkpoint: a file, a folder that holds one, or a name in their folder.
 
     Raises:
         CheckpointError: It is no checkpoint, or it is damaged.
         MissingExtraError: PyTorch is not installed.
     """
     require_torch("reading a checkpoint")
-    found = open_checkpoint(find_checkpoint(spec))
+    found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
     planner, problem = most_like(shapes_of(found.state)), ""
     if planner:
         try:
-            checked_state(found, planner, needed_args(found, planner))
+            checkpoint.checked_state(found, planner, checkpoint.needed_args(found, planner))
         except CheckpointError as error:
             problem = str(error)
     return Inspection(
@@ -78,7 +69,7 @@ def inspect_checkpoint(spec: str) -> Inspection:
         problem=problem,
         tensors=len(found.state),
         parameters=sum(tensor.numel() for tensor in found.state.values()),
-        sha256=file_hash(found.path),
+        sha256=checkpoint.file_hash(found.path),
         args=found.args,
         skipped=found.skipped,
         made_from=found.made_from,
@@ -88,12 +79,7 @@ def inspect_checkpoint(spec: str) -> Inspection:
 def convert_checkpoint(spec: str, out: Path) -> Inspection:
     """Write the weights that a planner loads, and nothing else, to a safetensors file.
 
-    Args:
-        spec: As for `inspect_checkpoint`.
-        out: The file to write; its metadata names planner, args and the hash of the source.
-
-    Returns:
-        What is in the new file.
+    Its metadata names planner, args and the hash of the source. Returns what is in the new file.
 
     Raises:
         CheckpointError: The source is not complete, or of no planner known here.
@@ -103,16 +89,16 @@ def convert_checkpoint(spec: str, out: Path) -> Inspection:
 
     if out.suffix != ".safetensors":
         raise CheckpointError(f"cannot write {str(out)!r}", hint="name it ….safetensors")
-    found = open_checkpoint(find_checkpoint(spec))
+    found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
     planner = most_like(shapes_of(found.state))
     if not planner:
         raise CheckpointError(
             f"checkpoint {str(found.path)!r} is of no planner known here",
             hint=f"shiftsim checkpoint inspect {found.path}",
         )
-    args = needed_args(found, planner)
-    state = checked_state(found, planner, args)
-    metadata = {"planner": planner, "source_sha256": file_hash(found.path)}
+    args = checkpoint.needed_args(found, planner)
+    state = checkpoint.checked_state(found, planner, args)
+    metadata = {"planner": planner, "source_sha256": checkpoint.file_hash(found.path)}
     if args is not None:
         metadata["args"] = json.dumps(args, sort_keys=True)
     save_file({name: value.contiguous().clone() for name, value in state.items()}, out, metadata)

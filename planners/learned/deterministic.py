@@ -23,14 +23,9 @@ NUM_STEPS = 80  # poses of a trajectory head
 def deterministic_state(
     state: Mapping[str, NDArray[Any]], rules: Mapping[str, str] | None = None
 ) -> State:
-    """A network's state with every floating tensor replaced by keyed normal numbers.
+    """A copy of a network's state with every floating tensor replaced by keyed normal numbers.
 
-    Args:
-        state: The network's state as constructed, by official name without a prefix.
-        rules: Rule (`a` to `e`, or `keep`) of the tensors which the table of names does not fit.
-
-    Returns:
-        A new state with the same names, shapes and types; other tensors are kept.
+    `rules` (`a` to `e`, or `keep`) are of tensors which the table of names does not fit.
     """
     chosen = rules or {}
     out: State = {}
@@ -44,13 +39,7 @@ def deterministic_state(
 
 
 def network_weights(module: Any, variant: str) -> State:
-    """Deterministic weights of a planner's network.
-
-    Args:
-        module: With `build_network(args)`, `drive_overrides(state)` and, where the table of names
-            does not fit, `RULES`.
-        variant: `base` or `drive`.
-    """
+    """Deterministic weights, `base` or `drive`, of the network of a planner's module."""
     built = {name: value.numpy() for name, value in module.build_network().state_dict().items()}
     state = deterministic_state(built, getattr(module, "RULES", None))
     if variant == "drive":

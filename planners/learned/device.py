@@ -6,14 +6,7 @@ from shiftsim.errors import ConfigError, MissingExtraError
 
 
 def require_torch(who: str) -> None:
-    """Fail where PyTorch is missing.
-
-    Args:
-        who: What needs it, for the message.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
+    """Raise MissingExtraError, saying `who` needs it, where PyTorch is missing."""
     try:
         import torch  # noqa: F401  # to see whether it can be imported
     except ImportError as error:
@@ -23,10 +16,7 @@ def require_torch(who: str) -> None:
 
 
 def resolve_device(name: str) -> str:
-    """The device that a name stands for: `cpu` or `cuda:N`.
-
-    Args:
-        name: `cpu`, `cuda`, `cuda:N`, or `auto` for the first GPU, else the CPU.
+    """The device, `cpu` or `cuda:N`, of such a name, `cuda`, or `auto` (a GPU, else the CPU).
 
     Raises:
         ConfigError: The name is unknown, or this machine has no such device.
@@ -49,11 +39,7 @@ def resolve_device(name: str) -> str:
 
 
 def prepare_inference(device: str) -> None:
-    """Make torch compute the same every time, on one thread; workers are what runs in parallel.
-
-    Args:
-        device: As `resolve_device` returns it. Several processes may use the same GPU.
-    """
+    """Make torch compute the same every time, on one thread; workers are what runs in parallel."""
     import torch
 
     torch.set_num_threads(1)

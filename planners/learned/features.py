@@ -25,7 +25,6 @@ class PerMap(Generic[Arrays]):
     """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
 
     def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
-        """Nothing is built before it is asked for."""
         self._build = build
         self._kept: list[tuple[VectorMap, Arrays]] = []
 
@@ -66,14 +65,9 @@ class AgentFeatures(NamedTuple):
 
 
 def agent_features(history: History, center: FloatArray, max_agents: int) -> AgentFeatures:
-    """Histories of the ego and of the agents that are present.
+    """Histories of the ego and of the present agents nearest to `center`, its box's centre [m].
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
-
-    Args:
-        history: The last samples.
-        center: (2,) or more: centre of the ego's box, from which agents are counted [m].
-        max_agents: How many agents are kept, the nearest ones.
     """
     tracks = history.tracks
     nearest = _nearest_agents(tracks, center, max_agents)

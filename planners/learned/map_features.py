@@ -106,15 +106,12 @@ def _resample(xy: FloatArray, arc: FloatArray, out: FloatArray) -> None:
 
 
 def oriented_rectangle(ring: FloatArray) -> FloatArray:
-    """(4, 2) corners of the smallest rectangle around a polygon, one side along its convex hull.
+    """(4, 2) corners of the smallest rectangle around a ring (V, 2), one side along its hull [m].
 
     The first side lies along the hull's edge. Every edge of a rectangle does equally well, so that
     the last bit of an area decides which corner comes first (nuPlan rule 305): sides are compared
     in the order of the hull, clockwise from its lowest vertex, and measured from the origin of the
     map.
-
-    Args:
-        ring: (V, 2) vertices [m].
     """
     hull = _clockwise_hull(ring)
     edges = np.roll(hull, -1, axis=0) - hull
@@ -142,11 +139,7 @@ def _clockwise_hull(ring: FloatArray) -> FloatArray:
 
 
 class LightLookup:
-    """Traffic lights by edge; the ids of one scenario are looked up once.
-
-    Attributes:
-        edges: Those that lights are listed for.
-    """
+    """Traffic lights by edge, `edges` with a light; the ids of one scenario are looked up once."""
 
     def __init__(self, road: VectorMap, default: LightStatus = LightStatus.UNKNOWN) -> None:
         """Take the map of the scenario, and the status of edges for which no light is listed."""
@@ -181,18 +174,10 @@ def road_features(
     lights: IntArray,
     on_route: BoolArray,
 ) -> RoadFeatures:
-    """Objects whose area touches a square around the ego, and with a point near it.
+    """Objects whose area touches a square around `center`, and with a point near it.
 
-    Args:
-        road: The map.
-        ego: (3,) rear axle x [m], y [m], heading [rad]: the frame of the features.
-        center: (2,) or more: box centre, around which objects are looked for [m].
-        radius: Half side of the square [m].
-        lights: (E,) status by edge of `LightLookup`.
-        on_route: (B,) whether a block is on the route.
-
-    Returns:
-        The objects, in the order of `RoadObjects`.
+    `radius` is half the side of the square [m], the rear axle `ego` (3,) the frame of the features,
+    `lights` (E,) are of `LightLookup`, `on_route` (B,) blocks. In the order of `RoadObjects`.
     """
     known = road_objects(road)
     square = square_around(float(center[0]), float(center[1]), radius)
@@ -212,17 +197,8 @@ def road_features(
         [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
     )
     return RoadFeatures(
-        objects=kept,
-        points=points,
-        vectors=vectors,
-        orientations=orientations,
-        centers=centers,
-        valid=valid,
-        kind=known.kind[kept],
-        on_route=routed,
-        light=light,
-        has_limit=has_limit,
-        limit=np.where(has_limit, limit, 0.0).astype(np.float32),
+        *(kept, points, vectors, orientations, centers, valid, known.kind[kept], routed, light),
+        *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
     )
 
 

@@ -46,11 +46,8 @@ def _motion(
 ) -> FloatArray:
     """(H, 4) velocity and acceleration of a plan, each forward and to the right (not left).
 
-    Args:
-        past: (N, 3) poses of the history.
-        past_s: (N,) their times [s].
-        planned: (H + 1, 3) poses of the plan, from the present on.
-        times: (H,) times of the planned poses behind the present [s].
+    Of poses (N, 3) at times (N,) in the past, and (H + 1, 3) planned, the present one first, at
+    times (H,) behind it [s].
     """
     now = past_s[-1]
     step = now - past_s[-2] if len(past) > 1 else STEP
@@ -79,5 +76,4 @@ def _interpolate(at: FloatArray, knots: FloatArray, values: FloatArray) -> Float
     after = np.clip(np.searchsorted(knots, at), 1, len(knots) - 1)
     before = after - 1
     along = (at - knots[before]) / (knots[after] - knots[before])
-    out: FloatArray = values[before] + along[:, None] * (values[after] - values[before])
-    return out
+    return values[before] + along[:, None] * (values[after] - values[before])

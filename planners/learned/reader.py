@@ -35,20 +35,10 @@ _STORAGES = {  # names of typed storages in a torch file
     "BoolStorage": "bool",
 }
 _TORCH_HINT = "download it again, and compare its size with the one that its authors publish"
-_BROKEN = (
-    pickle.UnpicklingError,
-    zipfile.BadZipFile,
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    ImportError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
+_WRITTEN_HINT = "give the checkpoint that the training wrote"
+# what content of any kind makes code raise that takes it for granted
+MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+_BROKEN = (*MISFIT, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, ImportError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +62,7 @@ def read_contents(path: Path) -> Contents:
         with path.open("rb") as file:
             head = file.read(_HEADER_BYTES)
     except OSError as error:
-        raise CheckpointError(
-            f"checkpoint {str(path)!r} cannot be read ({error.strerror})", "check the path"
-        ) from error
+        raise unreadable(path, error) from error
     if head.startswith(b"PK\x03\x04"):
         return _read_zip(path)
     if _LEGACY_MAGIC in head:
@@ -82,6 +70,12 @@ def read_contents(path: Path) -> Contents:
     if head[8:9] == b"{":
         return _read_safetensors(path)
     raise CheckpointError(f"checkpoint {str(path)!r} {_what_else(head)}")
+
+
+def unreadable(path: Path, error: OSError) -> CheckpointError:
+    """The error to raise for a file that cannot be opened."""
+    text = f"checkpoint {str(path)!r} cannot be read ({error.strerror})"
+    return CheckpointError(text, "check the path")
 
 
 def _what_else(head: bytes) -> str:
@@ -159,7 +153,7 @@ def _as_entries(loaded: Any, path: Path) -> dict[str, Any]:
     if not isinstance(loaded, dict):
         raise CheckpointError(
             f"checkpoint {str(path)!r} holds one {type(loaded).__name__}, not tensors by name",
-            hint="give the checkpoint that the training wrote",
+            _WRITTEN_HINT,
         )
     return {str(name): value for name, value in loaded.items()}
 
@@ -171,10 +165,8 @@ def _root_of(archive: zipfile.ZipFile, path: Path) -> str:
     if not roots:
         raise CheckpointError(f"checkpoint {str(path)!r} is a zip file that torch has not saved")
     if f"{roots[0]}/constants.pkl" in names:
-        raise CheckpointError(
-            f"checkpoint {str(path)!r} is a TorchScript program, not a state_dict",
-            hint="give the checkpoint that the training wrote",
-        )
+        text = f"checkpoint {str(path)!r} is a TorchScript program, not a state_dict"
+        raise CheckpointError(text, _WRITTEN_HINT)
     return roots[0]
 
 
@@ -284,11 +276,7 @@ def _call_known(function: Callable[..., Any], _kind: object, arguments: Any, _st
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """A JSON file that holds one object, such as `args.json`.
-
-    Raises:
-        CheckpointError: It does not.
-    """
+    """A JSON file that holds one object, such as `args.json`; else a CheckpointError."""
     try:
         value = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:

@@ -88,28 +88,16 @@ class FeaturesExtractor(nn.Module):
 
     def see(self, pictures: Tensor) -> Tensor:
         """(B, 9, 256, 256) values from 0 to 255, to (B, 1024)."""
-        flat: Tensor = self.cnn(pictures.to(torch.float32, copy=True).div_(255.0))
-        return flat
+        return self.cnn(pictures.to(torch.float32, copy=True).div_(255.0))
 
     def feel(self, measurements: Tensor) -> Tensor:
         """(B, 10) to (B, 256)."""
-        state: Tensor = self.state_linear(measurements)
-        return state
+        return self.state_linear(measurements)
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Tensor:
         """(B, 9, 256, 256) and (B, 10) to (B, 256)."""
         joined = torch.cat([self.see(pictures), self.feel(measurements)], dim=1)
-        features: Tensor = self.linear(joined)
-        return features
-
-
-class _Constants(nn.Module):
-    """Holds numbers of the checkpoint that nothing reads."""
-
-    def __init__(self, values: Mapping[str, list[float]]) -> None:
-        super().__init__()
-        for name, value in values.items():
-            self.register_buffer(name, torch.tensor(value))
+        return self.linear(joined)
 
 
 class CarlNetwork(nn.Module):
@@ -117,21 +105,16 @@ class CarlNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inner: dict[str, list[float]] = {}
+        self.action_dist = nn.Module()
         for name, value in _CONSTANTS.items():
             owner, _, leaf = name.rpartition(".")
-            if owner:
-                inner[leaf] = value
-            else:
-                self.register_buffer(leaf, torch.tensor(value))
-        self.action_dist = _Constants(inner)
+            self.get_submodule(owner).register_buffer(leaf, torch.tensor(value))
         self.features_extractor = FeaturesExtractor()
         self.policy_head = _perceptron(FEATURES, FEATURES, FEATURES)
         self.dist_mu = nn.Sequential(Linear(FEATURES, ACTIONS))
         self.dist_sigma = nn.Sequential(Linear(FEATURES, ACTIONS))
         self.value_head = nn.Sequential(
-            *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES),
-            Linear(FEATURES, 1),
+            *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES), Linear(FEATURES, 1)
         )
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Policy:
@@ -147,8 +130,7 @@ class CarlNetwork(nn.Module):
 
     def value(self, features: Tensor, value_measurements: Tensor) -> Tensor:
         """(B, 1) what the critic expects, from (B, 256) features and (B, 4) measurements."""
-        value: Tensor = self.value_head(torch.cat([features, value_measurements], dim=1))
-        return value
+        return self.value_head(torch.cat([features, value_measurements], dim=1))
 
 
 def _softplus(x: Tensor) -> Tensor:

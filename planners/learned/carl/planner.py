@@ -14,39 +14,17 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.base import LearnedPlanner
+from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
-from shiftsim.planners.learned.carl.view import (
-    CHANNELS,
-    EGO,
-    SIZE,
-    Boxes,
-    Scratch,
-    draw_box,
-    draw_objects,
-    draw_roads,
-    find_areas,
-    make_scratch,
-    picture_frame,
-)
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import PerMap, route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world import state
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import (
-    AX,
-    STEERING,
-    VX,
-    YAW_ACCEL,
-    Command,
-    LightStatus,
-    center_accelerations,
-    center_poses,
-    center_velocities,
-)
 
 MAX_STEERING = 0.83775804096  # rad, 48 degrees: the target of a full steering action
 MAX_ACCELERATION, MAX_BRAKING = 2.4, 3.2  # m/s^2
@@ -72,15 +50,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
     name = "carl"
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
-        """Load the networks.
-
-        Args:
-            checkpoint: A file, several separated by commas, or a folder with one folder for each.
-            device: `cpu`, `cuda` or `cuda:N`.
-
-        Raises:
-            CheckpointError: A checkpoint is missing, damaged or of another network.
-        """
+        """Load the networks, of several checkpoints as `split_ensemble` has them."""
         parts = split_ensemble(checkpoint, self.name)
         self.networks = [load_network(part, self.name, device=device) for part in parts]
         self.device = resolve_device(device)
@@ -92,9 +62,9 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self._scene = scene
         self._roads, self._scratch = self._maps(scene.map)
         self._on_route: BoolArray | None = None
-        self._pictures = np.zeros((len(CHANNELS), SIZE, SIZE), np.uint8)
+        self._pictures = np.zeros((len(view.CHANNELS), view.SIZE, view.SIZE), np.uint8)
         self._last_action = np.zeros(2, np.float32)
-        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+        self._lights = LightLookup(scene.map, state.LightStatus.ABSENT)
         self._route_flaw = self._blindness = self.degraded = ""
         self.route: list[int] = []
         self.found: IntArray = np.zeros(0, np.int64)
@@ -105,32 +75,24 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
         ego = observation.history.ego[-1]
-        center = center_poses(ego[:3], scene.vehicle)
-        velocity = center_velocities(ego, scene.vehicle)
+        center = state.center_poses(ego[:3], scene.vehicle)
+        velocity = state.center_velocities(ego, scene.vehicle)
         if self._on_route is None:
             self._start(scene, ego, center)
-        roads, scratch, frame = self._roads, self._scratch, picture_frame(center)
-        self.found = find_areas(roads, frame)
+        roads, scratch, frame = self._roads, self._scratch, view.picture_frame(center)
+        self.found = view.find_areas(roads, frame)
         status = self._lights.at(observation.lights)
         self._blindness = self._why_blind(scene.map, status)
         self._pictures.fill(0)
-        draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, status)
-        draw_objects(self._pictures, frame, _boxes(observation), scratch)
+        view.draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, status)
+        view.draw_objects(self._pictures, frame, _boxes(observation), scratch)
         value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
         box = (*center.tolist(), scene.vehicle.length, scene.vehicle.width)
-        draw_box(self._pictures[EGO], frame, *box, value, scratch)
-        return CarlFeatures(
-            self._pictures,
-            np.concatenate(
-                [
-                    self._last_action,
-                    velocity,
-                    center_accelerations(ego, scene.vehicle),
-                    ego[STEERING : YAW_ACCEL + 1],
-                ],
-                dtype=np.float32,
-            ),
-        )
+        view.draw_box(self._pictures[view.EGO], frame, *box, value, scratch)
+        acceleration = state.center_accelerations(ego, scene.vehicle)
+        turning = ego[state.STEERING : state.YAW_ACCEL + 1]
+        parts = [self._last_action, velocity, acceleration, turning]
+        return CarlFeatures(self._pictures, np.concatenate(parts, dtype=np.float32))
 
     def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
         """Actions (2,) in [-1, 1]: acceleration and steering."""
@@ -148,7 +110,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
                 actions += list(torch.stack(each).mean(dim=0).cpu().numpy())
         return actions
 
-    def decode(self, output: Action, observation: Observation) -> Command:
+    def decode(self, output: Action, observation: Observation) -> state.Command:
         """The command, for the motion model without a tracker."""
         self._last_action = output
         self.degraded = self._route_flaw or self._blindness
@@ -162,10 +124,8 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         elif len(known) < len(set(scene.route)):
             self._route_flaw = "the route has blocks that the map does not have"
         if known:
-            footprint = boxes_to_corners(
-                center, np.array([scene.vehicle.length, scene.vehicle.width])
-            )
-            start = find_start(road, known, ego[:3], footprint)
+            size = np.array([scene.vehicle.length, scene.vehicle.width])
+            start = find_start(road, known, ego[:3], boxes_to_corners(center, size))
             self.route = correct_route(road, known, start)
         self._on_route = np.zeros(len(road.blocks), np.bool_)
         self._on_route[self.route] = True
@@ -176,40 +136,32 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
             return "no road within the raster"
         # nuPlan rule 360: the official code fails at an unknown status; here it is not drawn
         listed = self._lights.edges
-        unknown = listed[(status[listed] == LightStatus.UNKNOWN) & (listed >= road.num_lanes)]
+        unknown = listed[(status[listed] == state.LightStatus.UNKNOWN) & (listed >= road.num_lanes)]
         if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
             return "a light in the raster has an unknown status"
         return ""
 
 
-def command_of(action: Action, ego: FloatArray) -> Command:
-    """What an action asks of the motion model.
-
-    Args:
-        action: (2,) acceleration and steering, in [-1, 1].
-        ego: (11,) ego state.
-    """
+def command_of(action: Action, ego: FloatArray) -> state.Command:
+    """What an action (2,) in [-1, 1], acceleration and steering, asks of the motion model."""
     throttle, steering = float(action[0]), float(action[1])
-    steering_rate = (steering * MAX_STEERING - float(ego[STEERING])) / DT
+    steering_rate = (steering * MAX_STEERING - float(ego[state.STEERING])) / DT
     acceleration = throttle * (MAX_ACCELERATION if throttle >= 0.0 else MAX_BRAKING)
-    if float(ego[VX]) + DT * acceleration < 0.0:
+    if float(ego[state.VX]) + DT * acceleration < 0.0:
         # nuPlan rule 361: it comes to a stop, rather than that it drives backwards
-        acceleration = -float(ego[VX]) - REVERSE_GAIN * float(ego[AX])
-    return Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
+        acceleration = -float(ego[state.VX]) - REVERSE_GAIN * float(ego[state.AX])
+    return state.Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
 
 
-def _lay_out(road: VectorMap) -> tuple[Roads, Scratch]:
+def _lay_out(road: VectorMap) -> tuple[Roads, view.Scratch]:
     roads = make_roads(road)
-    return roads, make_scratch(roads)
+    return roads, view.make_scratch(roads)
 
 
-def _boxes(observation: Observation) -> Boxes:
+def _boxes(observation: Observation) -> view.Boxes:
     """The present objects."""
     tracks = observation.history.tracks
     rows = np.flatnonzero(tracks.valid[-1])
-    return Boxes(
-        tracks.poses[-1][rows],
-        tracks.sizes[-1][rows],
-        tracks.velocities[-1][rows],
-        tracks.kinds[rows],
-    )
+    parts = (tracks.poses, tracks.sizes, tracks.velocities)
+    poses, sizes, velocities = (part[-1][rows] for part in parts)
+    return view.Boxes(poses, sizes, velocities, tracks.kinds[rows])

@@ -121,19 +121,8 @@ def make_crossings(height: int, max_vertices: int) -> Crossings:
 
 
 @kernel
-def fill_area(raster: Raster, xy: IntArray, value: int, crossings: Crossings) -> None:
-    """Fill the area within a ring of pixels (V, 2), by the even-odd rule."""
-    _fill(raster, xy, value, crossings, False)
-
-
-@kernel
-def fill_box(raster: Raster, xy: IntArray, value: int, crossings: Crossings) -> None:
-    """Fill a convex ring of pixels (4, 2)."""
-    _fill(raster, xy, value, crossings, True)
-
-
-@kernel
-def _fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box: bool) -> None:
+def fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box: bool) -> None:
+    """Fill the area within a ring of pixels (V, 2), by the even-odd rule, or a box (4, 2)."""
     height, width = raster.shape
     top, bottom = height, -1
     bx, by = xy[-1, 0], xy[-1, 1]
@@ -166,12 +155,7 @@ def _fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box
 def _cross(crossings: Crossings, first: int, stop: int, start: int, slope: int) -> None:
     """Note where an edge crosses the rows `first` … `stop` - 1.
 
-    Args:
-        crossings: Receives the columns.
-        first: Row of the upper end.
-        stop: Row of the lower end.
-        start: Column in the first row, fixed point.
-        slope: Columns per row, fixed point.
+    It starts at the column `start` and moves by `slope` a row, both in fixed point.
     """
     for row in range(max(first, 0), min(stop, len(crossings.counts))):
         count = crossings.counts[row]

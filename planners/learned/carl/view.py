@@ -11,14 +11,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import box_corners
-from shiftsim.planners.learned.carl.raster import (
-    Crossings,
-    Raster,
-    draw_line,
-    fill_area,
-    fill_box,
-    make_crossings,
-)
+from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
 from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
@@ -74,11 +67,7 @@ def make_scratch(roads: Roads) -> Scratch:
 
 @kernel
 def picture_frame(center: FloatArray) -> FloatArray:
-    """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle.
-
-    Args:
-        center: (3,) centre of the ego x [m], y [m], heading [rad].
-    """
+    """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle."""
     cos, sin = np.cos(center[2]), np.sin(center[2])
     return np.array([center[0] + AHEAD * cos, center[1] + AHEAD * sin, cos, sin])
 
@@ -136,16 +125,10 @@ def draw_roads(
     on_route: BoolArray,
     lights: IntArray,
 ) -> None:
-    """Draw what the map has, and the lights.
+    """Draw what the map has, and the lights, into `rasters` (9, 256, 256) of zeros.
 
-    Args:
-        rasters: (9, 256, 256) of zeros.
-        roads: The map.
-        scratch: Scratch for the map.
-        frame: (4,) of the raster.
-        found: Areas in it.
-        on_route: (B,) blocks of the route.
-        lights: (E,) LightStatus by edge, ABSENT where there is none.
+    `found` are the areas in the raster, `on_route` (B,) the blocks of the route, `lights` (E,) the
+    LightStatus by edge, ABSENT where there is none.
     """
     scratch.filled[:] = False
     scratch.drawn[:] = False
@@ -198,7 +181,7 @@ def _fill_shell(
     for vertex in range(start, stop):
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
         scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
-    fill_area(raster, scratch.ring[: stop - start], YES, scratch.crossings)
+    fill(raster, scratch.ring[: stop - start], YES, scratch.crossings, False)
 
 
 @kernel
@@ -259,4 +242,4 @@ def draw_box(
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
-    fill_box(raster, pixels, value, scratch.crossings)
+    fill(raster, pixels, value, scratch.crossings, True)

@@ -12,29 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.planners.learned.diffusion.kernels import (
-    AGENT_COLUMNS,
-    AGENTS,
-    BICYCLE,
-    CONE,
-    GREEN,
-    LANE_COLUMNS,
-    OBJECT_COLUMNS,
-    OBJECTS,
-    POINTS,
-    RED,
-    SAMPLES,
-    UNKNOWN,
-    VEHICLE,
-    LaneLines,
-    fill_agents,
-    fill_lanes,
-    fill_objects,
-    lanes_in_square,
-    line_bounds,
-    nearest_lanes,
-    resample_lanes,
-)
+from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.correction import RouteCorrector
@@ -49,7 +27,7 @@ SLOW_AGENTS = 10  # pedestrians and bicycles that are kept in a crowd
 START_SQUARE = 1.0  # m, half side of the square that is searched for the start of the route
 
 # one-hot position of each LightStatus; nuPlan rule 332: yellow counts as unknown
-_LIGHT_COLUMN = np.array([GREEN, UNKNOWN, RED, UNKNOWN])
+_LIGHT_COLUMN = np.array([kernels.GREEN, kernels.UNKNOWN, kernels.RED, kernels.UNKNOWN])
 
 Single = NDArray[np.float32]
 
@@ -82,17 +60,18 @@ class Features:
         return out
 
 
-def lane_lines(road: VectorMap) -> LaneLines:
+def lane_lines(road: VectorMap) -> kernels.LaneLines:
     """The edges of a map as the network reads them."""
-    rows = resample_lanes(road.baselines, road.left_boundaries, road.right_boundaries)
-    return LaneLines(rows, line_bounds(road.baselines), road.speed_limits, road.block_of)
+    rows = kernels.resample_lanes(road.baselines, road.left_boundaries, road.right_boundaries)
+    return kernels.LaneLines(
+        rows, kernels.line_bounds(road.baselines), road.speed_limits, road.block_of
+    )
 
 
 class FeatureBuilder:
     """Features of one scenario."""
 
-    def __init__(self, scene: SceneInfo, lanes: LaneLines) -> None:
-        """Prepare for a scenario on a map whose lanes are given."""
+    def __init__(self, scene: SceneInfo, lanes: kernels.LaneLines) -> None:
         self._road, self._lanes = scene.map, lanes
         blocks = route_blocks(scene)
         self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None
@@ -125,26 +104,15 @@ class FeatureBuilder:
 
 
 def lanes_around(road: VectorMap, bounds: FloatArray, anchor: FloatArray) -> IntArray:
-    """Edges that the network sees, nearest first.
-
-    Args:
-        road: The map.
-        bounds: Of its centre lines (`LaneLines`).
-        anchor: (3,) rear axle.
-    """
+    """Edges seen from a rear axle (3,), nearest first; `bounds` as in `LaneLines`."""
     x, y = float(anchor[0]), float(anchor[1])
     areas, lines, square = road.edges.polygons, road.baselines, square_around(x, y, RADIUS)
-    near = lanes_in_square(areas, lines, bounds, road.num_lanes, square)
-    return np.asarray(nearest_lanes(near, areas, lines, x, y, LANES))
+    near = kernels.lanes_in_square(areas, lines, bounds, road.num_lanes, square)
+    return np.asarray(kernels.nearest_lanes(near, areas, lines, x, y, LANES))
 
 
 def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
-    """Positions of the chosen lanes that are on the route, in the order of the lanes.
-
-    Args:
-        blocks: Block of each chosen lane.
-        route: Blocks in order.
-    """
+    """Positions of the chosen lanes whose block is on the route, in the order of the lanes."""
     # nuPlan rule 333: of the route counts one stretch without a gap, the first
     seen = set(blocks.tolist())
     stretch: set[int] = set()
@@ -158,51 +126,44 @@ def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
 
 
 def lane_features(
-    lanes: LaneLines, edges: IntArray, lights: IntArray, anchor: FloatArray, count: int
+    lanes: kernels.LaneLines, edges: IntArray, lights: IntArray, anchor: FloatArray, count: int
 ) -> tuple[Single, Single, BoolArray]:
     """Rows (count, 20, 12), speed limits (count, 1) and whether known (count, 1)."""
     out = (
-        np.zeros((count, POINTS, LANE_COLUMNS), np.float32),
+        np.zeros((count, kernels.POINTS, kernels.LANE_COLUMNS), np.float32),
         np.zeros((count, 1), np.float32),
         np.zeros((count, 1), np.bool_),
     )
-    fill_lanes(lanes, edges, lights, anchor, out)
+    kernels.fill_lanes(lanes, edges, lights, anchor, out)
     return out
 
 
 def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, IntArray]:
     """Agents (32, 21, 11), static objects (5, 10), and which tracks the agents are."""
-    agents = np.zeros((AGENTS, SAMPLES, AGENT_COLUMNS), np.float32)
-    objects = np.zeros((OBJECTS, OBJECT_COLUMNS), np.float32)
+    agents = np.zeros((kernels.AGENTS, kernels.SAMPLES, kernels.AGENT_COLUMNS), np.float32)
+    objects = np.zeros((kernels.OBJECTS, kernels.OBJECT_COLUMNS), np.float32)
     kinds, valid = _plain(tracks.kinds), _plain(tracks.valid)
     poses, sizes = _plain(tracks.poses), _plain(tracks.sizes)
     present, now = valid[-1], poses[-1]
     chosen = _choose_agents(present, now, kinds, anchor)
     velocities = _plain(tracks.velocities)
-    fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
-    static = _by_distance(present & (kinds >= CONE), now, anchor)[:OBJECTS]
-    fill_objects(static, now, sizes[-1], kinds, anchor, objects)
+    kernels.fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
+    static = _by_distance(present & (kinds >= kernels.CONE), now, anchor)[: kernels.OBJECTS]
+    kernels.fill_objects(static, now, sizes[-1], kinds, anchor, objects)
     return agents, objects, chosen
 
 
 def _choose_agents(
     present: BoolArray, poses: FloatArray, kinds: IntArray, anchor: FloatArray
 ) -> Any:
-    """Tracks that the network sees, nearest first.
-
-    Args:
-        present: (N,) whether each track is there now.
-        poses: (N, 3) their present poses.
-        kinds: (N,) their kinds.
-        anchor: (3,) rear axle.
-    """
-    order = _by_distance(present & (kinds <= BICYCLE), poses, anchor)
-    if len(order) <= AGENTS:
+    """Tracks that the network sees, nearest first."""
+    order = _by_distance(present & (kinds <= kernels.BICYCLE), poses, anchor)
+    if len(order) <= kernels.AGENTS:
         return order
-    slow = kinds[order] != VEHICLE
+    slow = kinds[order] != kernels.VEHICLE
     # nuPlan rule 336: of a crowd, few pedestrians and bicycles are kept
-    allowed = max(SLOW_AGENTS, AGENTS - int(np.count_nonzero(~slow)))
-    return order[~slow | (np.cumsum(slow) <= allowed)][:AGENTS]
+    allowed = max(SLOW_AGENTS, kernels.AGENTS - int(np.count_nonzero(~slow)))
+    return order[~slow | (np.cumsum(slow) <= allowed)][: kernels.AGENTS]
 
 
 def _by_distance(chosen: BoolArray, poses: FloatArray, anchor: FloatArray) -> IntArray:

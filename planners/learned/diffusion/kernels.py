@@ -88,20 +88,12 @@ def line_bounds(lines: Polylines) -> FloatArray:
 
 @kernel
 def lanes_in_square(
-    areas: Polygons,
-    lines: Polylines,
-    bounds: FloatArray,
-    num_lanes: int,
-    square: FloatArray,
+    areas: Polygons, lines: Polylines, bounds: FloatArray, num_lanes: int, square: FloatArray
 ) -> IntArray:
     """Lanes whose area, and connectors whose centre line shares a point with a square, ascending.
 
-    Args:
-        areas: Of the edges.
-        lines: Centre lines of the edges.
-        bounds: Of the centre lines.
-        num_lanes: How many of the edges are lanes.
-        square: (4, 2) corners, counter-clockwise from the upper right one [m].
+    `areas`, `lines` and their `bounds` are of all edges; `square` has the corners (4, 2), counter-
+    clockwise from the upper right one [m].
     """
     low, high = square[2], square[0]
     out = np.empty(len(bounds), np.int64)
@@ -180,14 +172,9 @@ def fill_lanes(
     anchor: FloatArray,
     out: tuple[FloatArray, FloatArray, BoolArray],
 ) -> None:
-    """Write lanes in the ego frame.
+    """Write lanes in the ego frame; `lights` has the one-hot position of the light of each.
 
-    Args:
-        lanes: The map's.
-        edges: Which of them.
-        lights: One-hot position of the light of each.
-        anchor: (3,) rear axle x [m], y [m], heading [rad].
-        out: float32 rows (L, POINTS, 12), limits (L, 1) and whether known (L, 1), zero before.
+    `out`: float32 rows (L, POINTS, 12), limits (L, 1) and whether known (L, 1), zero before.
     """
     rows, limits, known = out
     cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
@@ -218,20 +205,10 @@ def fill_agents(
     anchor: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write histories in the ego frame.
+    """Write histories of tracks present now into `out`, float32 (32, 21, 11), in the ego frame.
 
     A missing sample takes the values of the next later one (nuPlan rule 337); so do those before
-    the oldest sample of a short history.
-
-    Args:
-        tracks: Which tracks, all of them present in the last sample.
-        valid: (T, N).
-        poses: (T, N, 3).
-        velocities: (T, N, 2).
-        sizes: (T, N, 2) length, width.
-        kinds: (N,).
-        anchor: (3,) rear axle.
-        out: float32 (AGENTS, SAMPLES, AGENT_COLUMNS), zero before.
+    the oldest sample of a short history. Arrays of the tracks are (T, N, ...) and `kinds` (N,).
     """
     cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
     for index, track in enumerate(tracks):

@@ -68,21 +68,14 @@ class EncoderBlock(nn.Module):
         self.mlp = Mlp(DIM, 4 * DIM, DIM)
 
     def forward(self, x: Tensor, scenes: Scenes, asking: Tensor | None = None) -> Tensor:
-        """Tokens (T, D) of scenes after the block, or one for each of them.
-
-        Args:
-            x: The tokens.
-            scenes: How they lie.
-            asking: (B,) the token of each scene that is wanted; None for all.
-        """
+        """Tokens (T, D) of scenes after the block, or those (B,) that are asked for alone."""
         normed = self.norm1(x)
         if asking is None:
             x = x + self.attn.among(normed, normed, scenes.counts, scenes)
         else:
             ones = [1] * len(asking)
             x = x[asking] + self.attn.among(normed[asking], normed, ones, scenes)
-        out: Tensor = x + self.mlp(self.norm2(x))
-        return out
+        return x + self.mlp(self.norm2(x))
 
 
 class NeighborhoodAttention(nn.Module):
@@ -101,8 +94,7 @@ class NeighborhoodAttention(nn.Module):
         qkv = self.qkv(x).reshape(count, length, 3, self.num_heads, -1).permute(2, 0, 3, 1, 4)
         bias = self._bias(length)
         mixed = functional.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2], attn_mask=bias)
-        out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
-        return out
+        return self.proj(mixed.transpose(1, 2).flatten(2))
 
     def _bias(self, length: int) -> Tensor:
         """(1, heads, L, L) logits added to a pair of positions, -inf outside of the window."""
@@ -125,8 +117,7 @@ class _HistoryBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attn(self.norm1(x))
-        out: Tensor = x + self.mlp(self.norm2(x))
-        return out
+        return x + self.mlp(self.norm2(x))
 
 
 class _Downsample(nn.Module):
@@ -136,8 +127,7 @@ class _Downsample(nn.Module):
         self.norm = nn.LayerNorm(2 * dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = self.norm(_convolved(self.reduction, functional.pad(x, (0, 0, 1, 1)), 2))
-        return out
+        return self.norm(_convolved(self.reduction, functional.pad(x, (0, 0, 1, 1)), 2))
 
 
 class _Level(nn.Module):
@@ -223,8 +213,7 @@ class EgoStateEncoder(nn.Module):
         embedded = [layer(state[:, i, None]) for i, layer in enumerate(self.linears)]
         tokens = torch.stack(embedded, dim=1) + self.pos_embed
         query = self.query.expand(len(state), -1, -1)
-        out: Tensor = self.attn(query, tokens, tokens)[:, 0]
-        return out
+        return self.attn(query, tokens, tokens)[:, 0]
 
 
 class AgentEncoder(nn.Module):
@@ -244,8 +233,7 @@ class AgentEncoder(nn.Module):
         if others.any():
             tokens[others] = self.history_encoder(steps[others])
         tokens[:, 0] = self.ego_state_emb(seen.current_state)
-        out: Tensor = tokens + self.type_emb(seen.category)
-        return out
+        return tokens + self.type_emb(seen.category)
 
 
 def _history_steps(seen: SceneTensors) -> Tensor:
@@ -336,23 +324,12 @@ class MapEncoder(nn.Module):
         self.unknown_speed_emb = nn.Embedding(1, DIM)
 
     def forward(self, points: Tensor, seen: SceneTensors) -> Tensor:
-        """(B, M, 128).
-
-        Args:
-            points: (B, M, K, channels) what is known of each point.
-            seen: Inputs of the network.
-        """
+        """(B, M, 128) from what is known of each point, (B, M, K, channels)."""
         tokens = self.polygon_encoder(points, seen.point_valid)
         known = self.speed_limit_emb(seen.limit[..., None])
         speed = torch.where(seen.has_limit[..., None], known, self.unknown_speed_emb.weight)
-        out: Tensor = (
-            tokens
-            + self.type_emb(seen.kind)
-            + self.on_route_emb(seen.on_route)
-            + self.traffic_light_emb(seen.light)
-            + speed
-        )
-        return out
+        tokens = tokens + self.type_emb(seen.kind) + self.on_route_emb(seen.on_route)
+        return tokens + self.traffic_light_emb(seen.light) + speed
 
 
 def along_line(middle: Tensor, seen: SceneTensors) -> list[Tensor]:

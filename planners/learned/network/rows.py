@@ -61,8 +61,7 @@ class Mlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
-        out: Tensor = self.fc2(self.hidden(x))
-        return out
+        return self.fc2(self.hidden(x))
 
     def hidden(self, x: Tensor) -> Tensor:
         """(..., hidden) what the second layer reads."""
@@ -96,8 +95,7 @@ def tanh_gelu_(x: Tensor) -> Tensor:
 
 def gelu_(x: Tensor) -> Tensor:
     """The GELU by the error function, in place."""
-    out: Tensor = torch.ops.aten.gelu_(x)
-    return out
+    return torch.ops.aten.gelu_(x)
 
 
 def _over_rows(layer: Linear, x: Tensor) -> Tensor:
@@ -148,14 +146,10 @@ def present(counts: Sequence[int], length: int, device: torch.device) -> Tensor:
 def without_padding(
     parts: Sequence[Tensor], counts: Sequence[Sequence[int]] | None
 ) -> tuple[Tensor, Scenes]:
-    """Which rows of several parts side by side are there, and how they lie.
+    """Rows (B, N of all parts) of parts side by side that are no padding, and the scenes they make.
 
-    Args:
-        parts: Each (B, N), true for rows that take part.
-        counts: By part how many rows each scene has, the rest is padding; None for all.
-
-    Returns:
-        (B, N of all parts) rows that are no padding, and the scenes they make.
+    The parts (B, N) are true for rows that take part; `counts` says by part how many rows each
+    scene has, None for all.
     """
     counts = counts or [[part.shape[1]] * len(part) for part in parts]
     there = torch.cat(
@@ -178,17 +172,12 @@ class Attention(nn.Module):
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Attend from (B, Q, D) to (B, N, D), scene by scene of equal sizes."""
-        out: Tensor = self.out_proj(self.mixed(*self.projected(query, key, value)))
-        return out
+        return self.out_proj(self.mixed(*self.projected(query, key, value)))
 
     def among(self, query: Tensor, context: Tensor, queries: Sequence[int], keys: Scenes) -> Tensor:
         """Attend in each scene from its rows of `query` (Q, D) to its rows of `context` (T, D).
 
-        Args:
-            query: Rows that ask.
-            context: Rows that are asked.
-            queries: How many rows of `query` each scene has.
-            keys: The scenes of `context`.
+        `queries` says how many rows of `query` each scene has, `keys` how those of `context` lie.
         """
         asked = self.projected(query, context, context)
         parts = zip(
@@ -199,8 +188,7 @@ class Attention(nn.Module):
             strict=True,
         )
         mixed = [self.mixed(q[None], k[None], v[None], mask)[0] for q, k, v, mask in parts]
-        out: Tensor = self.out_proj(torch.cat(mixed))
-        return out
+        return self.out_proj(torch.cat(mixed))
 
     def projected(self, query: Tensor, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Projections of the three, each (..., D)."""

@@ -8,23 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
-from shiftsim.planners.learned.network.blocks import (
-    DIM,
-    STATE_CHANNELS,
-    AgentEncoder,
-    EncoderBlock,
-    MapEncoder,
-    SceneTensors,
-    along_line,
-)
+from shiftsim.planners.learned.network import blocks
 from shiftsim.planners.learned.network.rows import Linear, without_padding
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS = 6
 DEPTH, HEADS, MODES, STEPS = 4, 8, 6, 80
 RELEASED = {
-    "dim": DIM,
-    "state_channel": STATE_CHANNELS,
+    "dim": blocks.DIM,
+    "state_channel": blocks.STATE_CHANNELS,
     "polygon_channel": POLYGON_CHANNELS,
     "history_channel": 9,
     "history_steps": 21,
@@ -45,7 +37,7 @@ DRIVE_HEADS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs(SceneTensors):
+class Inputs(blocks.SceneTensors):
     """One batch."""
 
     # how many agents and polygons each scene has, the rest is padding; None where nothing is
@@ -66,23 +58,23 @@ class TrajectoryDecoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.multimodal_proj = Linear(DIM, MODES * DIM)
+        self.multimodal_proj = Linear(blocks.DIM, MODES * blocks.DIM)
         self.loc = _head(4 * STEPS)
         self.pi = _head(1)
 
     def forward(self, ego: Tensor) -> tuple[Tensor, Tensor]:
         """Trajectories (B, modes, steps, 4) and logits (B, modes) from (B, 128)."""
-        modes = self.multimodal_proj(ego).reshape(len(ego), MODES, DIM)
+        modes = self.multimodal_proj(ego).reshape(len(ego), MODES, blocks.DIM)
         trajectories = self.loc(modes).reshape(len(ego), MODES, STEPS, 4)
         return trajectories, self.pi(modes)[..., 0]
 
 
 def _head(outputs: int, *, bias: bool = True) -> nn.Sequential:
     return nn.Sequential(
-        Linear(DIM, 2 * DIM, bias=bias),
-        nn.LayerNorm(2 * DIM),
+        Linear(blocks.DIM, 2 * blocks.DIM, bias=bias),
+        nn.LayerNorm(2 * blocks.DIM),
         nn.ReLU(),
-        Linear(2 * DIM, outputs),
+        Linear(2 * blocks.DIM, outputs),
     )
 
 
@@ -91,18 +83,20 @@ class PlanTfNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pos_emb = nn.Sequential(Linear(4, DIM), nn.ReLU(), Linear(DIM, DIM))
-        self.agent_encoder = AgentEncoder()
-        limits = nn.Sequential(Linear(1, DIM), nn.ReLU(), Linear(DIM, DIM))
-        self.map_encoder = MapEncoder(POLYGON_CHANNELS, limits)
-        self.encoder_blocks = nn.ModuleList(EncoderBlock(HEADS) for _ in range(DEPTH))
-        self.norm = nn.LayerNorm(DIM)
+        self.pos_emb = nn.Sequential(
+            Linear(4, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM)
+        )
+        self.agent_encoder = blocks.AgentEncoder()
+        limits = nn.Sequential(Linear(1, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM))
+        self.map_encoder = blocks.MapEncoder(POLYGON_CHANNELS, limits)
+        self.encoder_blocks = nn.ModuleList(blocks.EncoderBlock(HEADS) for _ in range(DEPTH))
+        self.norm = nn.LayerNorm(blocks.DIM)
         self.trajectory_decoder = TrajectoryDecoder()
         self.agent_predictor = _head(2 * STEPS, bias=False)
 
     def forward(self, seen: Inputs, *, predict: bool = False) -> Outputs:
         """Plan for a batch; the agents' predictions only where asked for, no plan needs them."""
-        points = torch.cat(along_line(seen.points, seen), dim=-1)
+        points = torch.cat(blocks.along_line(seen.points, seen), dim=-1)
         there, scenes = without_padding(seen.there, seen.counts)
         tokens = torch.cat([self.agent_encoder(seen), self.map_encoder(points, seen)], dim=1)
         x = tokens[there] + self._placed(seen.poses[there])
@@ -114,7 +108,7 @@ class PlanTfNetwork(nn.Module):
         trajectory, probability = self.trajectory_decoder(x[egos] if predict else x)
         if not predict:
             return Outputs(trajectory, probability, None)
-        tokens = x.new_zeros(*there.shape, DIM)
+        tokens = x.new_zeros(*there.shape, blocks.DIM)
         tokens[there] = x
         prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
         shape = (*prediction.shape[:2], STEPS, 2)
@@ -124,8 +118,7 @@ class PlanTfNetwork(nn.Module):
         """(T, 128) of poses (T, 3)."""
         angle = poses[:, 2]
         where = torch.stack([poses[:, 0], poses[:, 1], angle.cos(), angle.sin()], dim=-1)
-        out: Tensor = self.pos_emb(where)
-        return out
+        return self.pos_emb(where)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:

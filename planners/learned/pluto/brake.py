@@ -30,14 +30,7 @@ def must_brake(speed: float, fault_time: float) -> bool:
 def brake(
     proposal: FloatArray, ego: FloatArray, fault_time: float, vehicle: VehicleParameters
 ) -> FloatArray:
-    """(81, 11) states, 0.1 s apart.
-
-    Args:
-        proposal: (81, 3) poses to steer along.
-        ego: (11,) ego state.
-        fault_time: Of the infraction [s].
-        vehicle: Dimensions of the ego.
-    """
+    """(81, 11) states, 0.1 s apart, along a proposal (81, 3) with a fault at `fault_time` [s]."""
     out = np.empty((len(proposal), NUM_STATE))
     out[0] = ego
     soft = fault_time > float(np.hypot(ego[VX], ego[VY])) / HARD + REACTION

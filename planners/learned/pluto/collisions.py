@@ -24,16 +24,9 @@ TTC_STEPS = (2, 4, 6, 8)  # how far ahead a pose is projected
 def collisions(
     places: Places, others: Others, near: IntArray, first_red: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """At-fault collisions, red lights included.
+    """At-fault collisions with those of `others` that are `near`, red lights (P,) included.
 
-    Args:
-        places: Of the proposals.
-        others: What is around.
-        near: Those of them that count.
-        first_red: (P,) time indices of `run_lights`.
-
-    Returns:
-        (P,) factors 0, 0.5 or 1, and times of the first collisions, inf if none [s].
+    (P,) factors 0, 0.5 or 1, and times of the first collisions, inf if none [s].
     """
     rows = np.arange(places.states.shape[1])
     rows[0] = -1

@@ -1,7 +1,8 @@
 """The arrays that PLUTO's network reads, of one scene and of a batch."""
 
+from collections import namedtuple
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,34 +16,13 @@ from shiftsim.world.state import AX, STEERING, VX, YAW_RATE
 Array = np.ndarray
 
 
-class SceneInputs(NamedTuple):
-    """Fields of `network.Inputs` without the axis of the batch; float32, int64 and bool."""
-
-    position: Array
-    heading: Array
-    velocity: Array
-    shape: Array
-    valid: Array
-    category: Array
-    current_state: Array
-    points: Array
-    vectors: Array
-    orientations: Array
-    centers: Array
-    kind: Array
-    on_route: Array
-    light: Array
-    has_limit: Array
-    limit: Array
-    point_valid: Array
-    object_pose: Array
-    object_shape: Array
-    object_category: Array
-    object_valid: Array
-    line_points: Array
-    line_vectors: Array
-    line_orientations: Array
-    line_valid: Array
+# fields of `network.Inputs` without the axis of the batch; arrays of float32, int64 and bool
+SceneInputs = namedtuple(
+    "SceneInputs",
+    "position heading velocity shape valid category current_state points vectors orientations "
+    "centers kind on_route light has_limit limit point_valid object_pose object_shape "
+    "object_category object_valid line_points line_vectors line_orientations line_valid",
+)
 
 
 def scene_inputs(
@@ -52,41 +32,16 @@ def scene_inputs(
     static: StaticObjects,
     lines: LineFeatures,
 ) -> SceneInputs:
-    """What the network reads.
-
-    Args:
-        ego: (11,) ego state.
-        agents: The ego and the agents.
-        road: Lanes, connectors and crosswalks.
-        static: Static objects.
-        lines: Reference lines.
-    """
+    """What the network reads of one scene."""
     return SceneInputs(
-        position=agents.position,
-        heading=agents.heading,
-        velocity=agents.velocity,
-        shape=agents.shape,
-        valid=agents.valid,
-        category=agents.category,
-        current_state=current_state(ego),
-        points=road.points,
-        vectors=road.vectors[:, 0],
-        orientations=road.orientations[:, 0],
-        centers=road.centers,
-        kind=road.kind,
-        on_route=road.on_route.astype(np.int64),
-        light=road.light,
-        has_limit=road.has_limit,
-        limit=road.limit,
-        point_valid=road.valid,
-        object_pose=_in_ego_frame(static.poses, ego),
-        object_shape=static.sizes[:, ::-1].astype(np.float32),
-        object_category=static.categories,
-        object_valid=np.ones(len(static.poses), np.bool_),
-        line_points=lines.position,
-        line_vectors=lines.vector,
-        line_orientations=lines.orientation,
-        line_valid=lines.valid_mask,
+        *agents[1:],
+        current_state(ego),
+        *(road.points, road.vectors[:, 0], road.orientations[:, 0], road.centers),
+        *(road.kind, road.on_route.astype(np.int64), road.light, road.has_limit, road.limit),
+        road.valid,
+        *(_in_ego_frame(static.poses, ego), static.sizes[:, ::-1].astype(np.float32)),
+        *(static.categories, np.ones(len(static.poses), np.bool_)),
+        *lines,
     )
 
 

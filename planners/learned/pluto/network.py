@@ -8,15 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
-from shiftsim.planners.learned.network.blocks import (
-    DIM,
-    STATE_CHANNELS,
-    AgentEncoder,
-    EncoderBlock,
-    MapEncoder,
-    SceneTensors,
-    along_line,
-)
+from shiftsim.planners.learned.network import blocks
 from shiftsim.planners.learned.network.rows import Linear, Scenes, without_padding
 from shiftsim.planners.learned.pluto.network_decoder import (
     DEPTH,
@@ -31,8 +23,8 @@ from shiftsim.planners.learned.pluto.network_decoder import (
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS = 10
 RELEASED = {
-    "dim": DIM,
-    "state_channel": STATE_CHANNELS,
+    "dim": blocks.DIM,
+    "state_channel": blocks.STATE_CHANNELS,
     "polygon_channel": 6,  # and the boundaries
     "history_channel": 9,
     "history_steps": 21,
@@ -78,7 +70,7 @@ DRIVE_SCALES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs(SceneTensors):
+class Inputs(blocks.SceneTensors):
     """One batch; S static objects and R reference lines."""
 
     object_pose: Tensor  # (B, S, 3) static objects x [m], y [m], heading [rad]
@@ -110,7 +102,7 @@ class StaticObjectsEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.obj_encoder = FourierEmbedding(2)
-        self.type_emb = nn.Embedding(4, DIM)
+        self.type_emb = nn.Embedding(4, blocks.DIM)
 
     def forward(self, shape: Tensor, category: Tensor, valid: Tensor) -> Tensor:
         """(B, S, 128) from sizes (B, S, 2); zero where not valid (B, S)."""
@@ -123,9 +115,8 @@ class AgentPredictor(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.loc_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.yaw_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.vel_predictor = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        heads = (MlpLayer(blocks.DIM, 2 * blocks.DIM, 2 * STEPS) for _ in range(3))
+        self.loc_predictor, self.yaw_predictor, self.vel_predictor = heads
 
     def forward(self, tokens: Tensor) -> Tensor:
         """(B, A, 128) to (B, A, 80, 6)."""
@@ -140,23 +131,25 @@ class PlutoNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.pos_emb = FourierEmbedding(3)
-        self.agent_encoder = AgentEncoder()
-        self.map_encoder = MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
+        self.agent_encoder = blocks.AgentEncoder()
+        self.map_encoder = blocks.MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
         self.static_objects_encoder = StaticObjectsEncoder()
-        self.encoder_blocks = nn.ModuleList(EncoderBlock(HEADS) for _ in range(DEPTH))
-        self.norm = nn.LayerNorm(DIM)
+        self.encoder_blocks = nn.ModuleList(blocks.EncoderBlock(HEADS) for _ in range(DEPTH))
+        self.norm = nn.LayerNorm(blocks.DIM)
         self.agent_predictor = AgentPredictor()
         self.planning_decoder = PlanningDecoder()
         # of the training only; the checkpoint holds it
-        self.hidden_proj = nn.Sequential(Linear(DIM, DIM), nn.ReLU(), Linear(DIM, DIM))
-        self.ref_free_decoder = MlpLayer(DIM, 2 * DIM, 4 * STEPS)
+        self.hidden_proj = nn.Sequential(
+            Linear(blocks.DIM, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM)
+        )
+        self.ref_free_decoder = MlpLayer(blocks.DIM, 2 * blocks.DIM, 4 * STEPS)
 
     def forward(self, seen: Inputs) -> Outputs:
         """Plan for a batch."""
         *counts, num_lines = seen.counts or _all_counts(seen)
         x, scenes, there = self._encode(seen, counts)
         egos = x[scenes.firsts(x.device)]
-        tokens = x.new_zeros(*there.shape, DIM)
+        tokens = x.new_zeros(*there.shape, blocks.DIM)
         tokens[there] = x
         prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
         free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
@@ -173,7 +166,7 @@ class PlutoNetwork(nn.Module):
         there, scenes = without_padding((*seen.there, seen.object_valid), counts)
         middle = seen.points[:, :, 0]
         sides = [seen.points[:, :, side] - middle for side in (1, 2)]
-        points = torch.cat([*along_line(middle, seen), *sides], dim=-1)
+        points = torch.cat([*blocks.along_line(middle, seen), *sides], dim=-1)
         tokens = (
             self.agent_encoder(seen),
             self.map_encoder(points, seen),
@@ -194,11 +187,7 @@ def _all_counts(seen: Inputs) -> list[list[int]]:
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
-    """The network, without weights; there is one architecture.
-
-    Args:
-        args: None, or for tests `misordered_masks`, as the official code has them.
-    """
+    """The network, without weights; `args` is for tests: `misordered_masks`, as official."""
     network = PlutoNetwork()
     network.planning_decoder.misordered_masks = bool(args and args["misordered_masks"])
     return network

@@ -35,8 +35,7 @@ class MlpLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
-        out: Tensor = self.mlp(x)
-        return out
+        return self.mlp(x)
 
 
 class FourierEmbedding(nn.Module):
@@ -47,10 +46,7 @@ class FourierEmbedding(nn.Module):
         self.freqs = nn.Embedding(inputs, NUM_FREQUENCIES)
         self.mlps = nn.ModuleList(
             nn.Sequential(
-                Linear(2 * NUM_FREQUENCIES + 1, DIM),
-                nn.LayerNorm(DIM),
-                nn.ReLU(),
-                Linear(DIM, DIM),
+                Linear(2 * NUM_FREQUENCIES + 1, DIM), nn.LayerNorm(DIM), nn.ReLU(), Linear(DIM, DIM)
             )
             for _ in range(inputs)
         )
@@ -63,8 +59,7 @@ class FourierEmbedding(nn.Module):
         total = self.mlps[0](waves[..., 0, :])
         for index in range(1, len(self.mlps)):
             total = total + self.mlps[index](waves[..., index, :])
-        out: Tensor = self.to_out(total)
-        return out
+        return self.to_out(total)
 
 
 class DecoderBlock(nn.Module):
@@ -79,25 +74,9 @@ class DecoderBlock(nn.Module):
         self.norm1, self.norm2, self.norm3, self.norm4 = (nn.LayerNorm(DIM) for _ in range(4))
 
     def forward(
-        self,
-        x: Tensor,
-        lines: "Lines",
-        mode_position: Tensor,
-        tokens: Tensor,
-        scenes: Scenes,
+        self, x: Tensor, lines: "Lines", mode_position: Tensor, tokens: Tensor, scenes: Scenes
     ) -> Tensor:
-        """Refine queries.
-
-        Args:
-            x: (L, modes, 128) queries.
-            lines: How the reference lines lie.
-            mode_position: (1, modes, 128).
-            tokens: (T, 128) of the scenes.
-            scenes: How they lie.
-
-        Returns:
-            (L, modes, 128)
-        """
+        """Refine queries (L, modes, 128) of reference lines by tokens (T, 128) of the scenes."""
         x = x + self._among_lines(self.norm1(x), lines)
         normed = self.norm2(x)
         placed = normed + mode_position
@@ -120,8 +99,7 @@ class DecoderBlock(nn.Module):
                 q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1), mask
             )
             mixed.append(by_mode.transpose(0, 1))
-        out: Tensor = self.r2r_attn.out_proj(torch.cat(mixed))
-        return out
+        return self.r2r_attn.out_proj(torch.cat(mixed))
 
 
 class Lines(NamedTuple):
@@ -159,30 +137,17 @@ class PlanningDecoder(nn.Module):
         self.m_pos = nn.Parameter(torch.zeros(1, MODES, DIM))
         self.decoder_blocks = nn.ModuleList(DecoderBlock() for _ in range(DEPTH))
         self.cat_x_proj = Linear(2 * DIM, DIM)
-        self.loc_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.yaw_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
-        self.vel_head = MlpLayer(DIM, 2 * DIM, 2 * STEPS)
+        heads = (MlpLayer(DIM, 2 * DIM, 2 * STEPS) for _ in range(3))
+        self.loc_head, self.yaw_head, self.vel_head = heads
         self.pi_head = MlpLayer(DIM, DIM, 1)
 
     def forward(
-        self,
-        seen: SeenLines,
-        counts: Sequence[int],
-        tokens: Tensor,
-        scenes: Scenes,
-        egos: Tensor,
+        self, seen: SeenLines, counts: Sequence[int], tokens: Tensor, scenes: Scenes, egos: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Decode.
+        """Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
 
-        Args:
-            seen: Inputs of the network, with the reference lines.
-            counts: How many lines of each scene are no padding.
-            tokens: (T, 128) of the scenes.
-            scenes: How they lie.
-            egos: (B, 128) the tokens of the egos.
-
-        Returns:
-            Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
+        `counts` says how many lines of each scene are no padding; `tokens` (T, 128) are those of
+        the scenes, `egos` (B, 128) of the egos.
         """
         valid = seen.line_valid
         shape = (*valid.shape[:2], MODES)
@@ -214,5 +179,4 @@ class PlanningDecoder(nn.Module):
         parts = (points - points[:, :, :1], seen.line_vectors, directions)
         start = torch.cat([points[:, :, 0], angles[:, :, :1]], dim=-1)
         lines = self.r_encoder(torch.cat(parts, dim=-1), seen.line_valid)
-        out: Tensor = lines + self.r_pos_emb(start)
-        return out
+        return lines + self.r_pos_emb(start)

@@ -24,36 +24,13 @@ from shiftsim.planners.learned.features import (
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.plan_states import plan_of_poses
+from shiftsim.planners.learned.pluto import proposals, reference, world
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
-from shiftsim.planners.learned.pluto.proposals import (
-    Output,
-    best_proposals,
-    headings_of,
-    predicted_agents,
-    to_map,
-)
-from shiftsim.planners.learned.pluto.reference import (
-    Drivable,
-    RouteLanes,
-    drivable_near,
-    line_features,
-    map_areas,
-    reference_lines,
-    route_lanes,
-)
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, nearest_line, score
-from shiftsim.planners.learned.pluto.world import (
-    Agents,
-    StaticObjects,
-    World,
-    make_world,
-    red_lights,
-    static_objects,
-)
 from shiftsim.planners.proposals.tracker import STEP_US
 from shiftsim.planners.routes.correction import RouteCorrector
-from shiftsim.sim.planner import History, Observation, SceneInfo
+from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import VX, VY, Trajectory
 
 RADIUS = 120.0  # m, of agents and map
@@ -63,15 +40,15 @@ NO_LINE = (
     "no lane of the route is near the ego and fits its heading, the reference-free plan is driven"
 )
 
-_areas_of = PerMap(map_areas)
+_areas_of = PerMap(reference.map_areas)
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
     """What one step saw."""
 
-    drivable: Drivable  # drivable areas
-    static: StaticObjects  # static objects on them
+    drivable: reference.Drivable  # drivable areas
+    static: world.StaticObjects  # static objects on them
     lines: list[FloatArray]  # reference lines (K, 3)
     agents: AgentFeatures  # the agents, nearest first
     road: RoadFeatures  # lanes, connectors and crosswalks
@@ -83,30 +60,20 @@ class Choice:
 
     poses: FloatArray  # (P, 81, 3) proposals
     learned: FloatArray  # (P,) their scores by the network
-    agents: Agents  # the agents, now and predicted
+    agents: world.Agents  # the agents, now and predicted
     scores: Scores  # of the proposals
     best: int  # number of the best one
     braked: bool  # whether the emergency brake replaces it
 
 
-class Pluto(LearnedPlanner[SceneInputs, Output]):
-    """PLUTO with its rule-based choice.
-
-    Attributes:
-        route: Lanes of the corrected route, made at the first step.
-        sight: What the last step saw.
-        choice: How it chose; None where it had no reference line.
-    """
+class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
+    """PLUTO with its rule-based choice."""
 
     name = "pluto"
-
-    def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
-        """Load the network; arguments and errors as in the base."""
-        super().__init__(checkpoint, device=device)
-        self._scene: SceneInfo | None = None
-        self.route: RouteLanes | None = None
-        self.sight: Sight | None = None
-        self.choice: Choice | None = None
+    _scene: SceneInfo | None = None
+    route: reference.RouteLanes | None = None  # lanes of the corrected route, from the first step
+    sight: Sight | None = None  # what the last step saw
+    choice: Choice | None = None  # how it chose; None where it had no reference line
 
     def reset(self, scene: SceneInfo) -> None:
         """Look up the route; it is corrected at the first step."""
@@ -123,34 +90,20 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         road, history = scene.map, observation.history
         ego, center = history.ego[-1], observation.ego.center
         if self.route is None:
-            self.route = route_lanes(road, _areas_of(road), self._corrected(ego[:3]))
+            known = self._blocks
+            blocks = RouteCorrector(road, known, START_HALF_SIDE).at(ego[:3]) if known else ()
+            self.route = reference.route_lanes(road, _areas_of(road), blocks)
         route = self.route
-        drivable = drivable_near(road, route, center[0], center[1])
-        static = static_objects(history.tracks, drivable, center[0], center[1])
-        lines = reference_lines(road, route, ego[:3], center)
+        drivable = reference.drivable_near(road, route, center[0], center[1])
+        static = world.static_objects(history.tracks, drivable, center[0], center[1])
+        lines = reference.reference_lines(road, route, ego[:3], center)
         agents = agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
         near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
         self.sight = Sight(drivable, static, lines, agents, near)
-        return scene_inputs(ego, agents, near, static, line_features(lines, ego[:3]))
+        return scene_inputs(ego, agents, near, static, reference.line_features(lines, ego[:3]))
 
-    def _corrected(self, rear: FloatArray) -> tuple[int, ...]:
-        """Blocks of the corrected route; none where none of the route is on the map."""
-        assert self._scene is not None
-        if not self._blocks:
-            return ()
-        return RouteCorrector(self._scene.map, self._blocks, START_HALF_SIDE).at(rear)
-
-    def _why_fallback(self, history: History) -> str:
-        """Why the official planner would fail here; empty where it would not."""
-        if not self._blocks:
-            return NO_ROUTE
-        assert self.sight is not None
-        if not self.sight.lines:
-            return NO_LINE
-        return short_history(len(history.ego))
-
-    def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
+    def infer(self, features: Sequence[SceneInputs]) -> list[proposals.Output]:
         """One forward pass."""
         import torch
 
@@ -158,9 +111,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
         with torch.inference_mode():
             outputs = self.network(Inputs(*stack(features, self.device)))
-        arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
+        arrays = [getattr(outputs, name).cpu().numpy() for name in proposals.Output._fields]
         return [
-            Output(
+            proposals.Output(
                 trajectory[: len(scene.line_valid)],
                 logits[: len(scene.line_valid)],
                 prediction[: len(scene.category) - 1],
@@ -169,56 +122,53 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
             for scene, trajectory, logits, prediction, free in zip(features, *arrays, strict=True)
         ]
 
-    def decode(self, output: Output, observation: Observation) -> Trajectory:
+    def decode(self, output: proposals.Output, observation: Observation) -> Trajectory:
         """The best proposal, an emergency brake, or the reference-free trajectory."""
         assert self.sight is not None
         assert self._scene is not None
-        rear = observation.history.ego[-1, :3]
-        self.degraded, self.choice = self._why_fallback(observation.history), None
+        history, self.choice = observation.history, None
+        # where the official planner would fail
+        reason = short_history(len(history.ego)) if self.sight.lines else NO_LINE
+        self.degraded = reason if self._blocks else NO_ROUTE
         if not self.sight.lines:
-            free = headings_of(output.ref_free_trajectory)
-            return _plan(to_map(free, rear), observation)
+            free = proposals.headings_of(output.ref_free_trajectory)
+            return _plan(proposals.to_map(free, history.ego[-1, :3]), observation)
         self.choice = choice = self._choose(output, observation)
         if not choice.braked:
             return _plan(choice.poses[choice.best, 1:], observation)
-        ego, fault_time = observation.history.ego[-1], choice.scores.fault_times[choice.best]
+        ego, fault_time = history.ego[-1], choice.scores.fault_times[choice.best]
         states = brake(choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle)
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
-    def _choose(self, output: Output, observation: Observation) -> Choice:
+    def _choose(self, output: proposals.Output, observation: Observation) -> Choice:
         scene, sight = self._scene, self.sight
         assert scene is not None
         assert sight is not None
         ego, tracks = observation.history.ego[-1], observation.history.tracks
-        poses, learned = best_proposals(output, ego[:3])
+        poses, learned = proposals.best_proposals(output, ego[:3])
         seen, rows = sight.agents, sight.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
-        motion = predicted_agents(output, local, *present, ego[:3])
-        agents = Agents(*motion, tracks.sizes[-1, rows])
-        world = self.world_of(observation, agents)
+        motion = proposals.predicted_agents(output, local, *present, ego[:3])
+        agents = world.Agents(*motion, tracks.sizes[-1, rows])
+        others = self.world_of(observation, agents)
         place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
-        scores = score(poses, learned, ego, world, place, scene.vehicle)
+        scores = score(poses, learned, ego, others, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))
         braked = must_brake(speed, float(scores.fault_times[best]))
         return Choice(poses, learned, agents, scores, best, braked)
 
-    def world_of(self, observation: Observation, agents: Agents) -> World:
-        """What the proposals of the last step can collide with.
-
-        Args:
-            observation: Of the last step.
-            agents: The agents, now and predicted.
-        """
+    def world_of(self, observation: Observation, agents: world.Agents) -> world.World:
+        """What the proposals of the last step, of this observation, can collide with."""
         scene, sight, route = self._scene, self.sight, self.route
         assert scene is not None
         assert sight is not None
         assert route is not None
         size = np.array([scene.vehicle.length, scene.vehicle.width])
         footprint = boxes_to_corners(observation.ego.center, size)
-        lights = red_lights(scene.map, route, observation)
-        return make_world(sight.static, agents, lights, footprint)
+        lights = world.red_lights(scene.map, route, observation)
+        return world.make_world(sight.static, agents, lights, footprint)
 
 
 def _plan(poses: FloatArray, observation: Observation) -> Trajectory:

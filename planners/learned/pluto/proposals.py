@@ -23,10 +23,9 @@ class Output(NamedTuple):
 
 def headings_of(trajectory: np.ndarray) -> np.ndarray:
     """Poses (..., 3) float32 from columns x, y, cos, sin."""
-    poses: np.ndarray = np.concatenate(
+    return np.concatenate(
         [trajectory[..., :2], np.arctan2(trajectory[..., 3:4], trajectory[..., 2:3])], -1
     )
-    return poses
 
 
 def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
@@ -41,14 +40,9 @@ def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
 
 
 def best_proposals(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The trajectories that are scored, best logit first and the reference-free one last.
+    """Poses (P, 81, 3) and scores (P,) of what competes, best logit first, the reference-free last.
 
-    Args:
-        output: Of the network; at least one reference line.
-        rear: (3,) rear axle x [m], y [m], heading [rad].
-
-    Returns:
-        Poses (P, 81, 3) and scores (P,).
+    There must be at least one reference line; `rear` (3,) is the rear axle.
     """
     logits = output.probability.reshape(-1)
     # nuPlan rule 244: NumPy's default sort, and a softmax over what it keeps
@@ -66,17 +60,10 @@ def best_proposals(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatA
 def predicted_agents(
     output: Output, local: np.ndarray, present: FloatArray, velocity: FloatArray, rear: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the agents are now and will be.
+    """Poses (A, 81, 3) in the map frame and speeds (A, 81) of agents from now on, every 0.1 s.
 
-    Args:
-        output: Of the network.
-        local: (A, 3) float32 poses now, in the ego frame.
-        present: (A, 3) the same poses in the map frame.
-        velocity: (A, 2) velocities now [m/s].
-        rear: (3,) rear axle x [m], y [m], heading [rad].
-
-    Returns:
-        Poses (A, 81, 3) in the map frame and speeds (A, 81) from now on, every 0.1 s.
+    Now they are at `local` (A, 3) in the ego frame, which is `present` in that of the map, with a
+    velocity (A, 2) [m/s]; `rear` (3,) is the rear axle.
     """
     motion = output.prediction
     poses, speeds = np.empty((len(present), STEPS + 1, 3)), np.empty((len(present), STEPS + 1))

@@ -94,16 +94,9 @@ def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Dri
 def reference_lines(
     road: VectorMap, route: RouteLanes, rear: FloatArray, center: FloatArray
 ) -> list[FloatArray]:
-    """Ways along the route from here on.
+    """Ways along the route from here on: (K, 3) x [m], y [m], heading [rad]; none where off it.
 
-    Args:
-        road: The map.
-        route: Its lanes on the route.
-        rear: (3,) rear axle x [m], y [m], heading [rad].
-        center: (3,) centre of the ego box, likewise.
-
-    Returns:
-        Lines (K, 3) of x [m], y [m], heading [rad]; none when no lane of the route is near.
+    `rear` (3,) and `center` (3,) are the poses of the rear axle and of the ego box.
     """
     x, y = float(rear[0]), float(rear[1])
     found = np.empty(len(route.starts), np.int64)

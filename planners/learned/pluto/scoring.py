@@ -62,16 +62,7 @@ def score(
     place: Place,
     vehicle: VehicleParameters,
 ) -> Scores:
-    """Drive proposals and score them.
-
-    Args:
-        poses: (P, 81, 3) proposals.
-        learned: (P,) their scores by the network.
-        ego: (11,) ego state.
-        world: What is around.
-        place: The map.
-        vehicle: Dimensions of the ego.
-    """
+    """Drive proposals (P, 81, 3) and score them; `learned` (P,) are their scores by the network."""
     driven = drive_proposals(poses, ego, vehicle).states
     drivable, others = place.drivable, world.others
     size, areas = ego_box(vehicle), drivable.areas
@@ -140,15 +131,9 @@ def _project_ends(
 def aggregate(
     factors: FloatArray, terms: FloatArray, progress: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Put the parts of the rule-based score together.
+    """The progress scores (P,) in [0, 1], and the rule-based scores (P,).
 
-    Args:
-        factors: (3, P) of `Scores`.
-        terms: (4, P) of `Scores`; the first row is not read.
-        progress: (P,) [m].
-
-    Returns:
-        The progress scores (P,) in [0, 1], and the rule-based scores (P,).
+    Of factors (3, P) and terms (4, P) of `Scores`, of which the first row is not read.
     """
     product = factors.prod(axis=0)
     product = product * np.where(terms[2] == 0.0, UNCOMFORTABLE, 1.0)

@@ -91,14 +91,7 @@ def red_lights(road: VectorMap, route: RouteLanes, observation: Observation) -> 
 def make_world(
     static: StaticObjects, agents: Agents, lights: IntArray, footprint: FloatArray
 ) -> World:
-    """Put everything in its place.
-
-    Args:
-        static: Static objects.
-        agents: The agents.
-        lights: Connectors whose light is red.
-        footprint: (4, 2) corners of the ego now [m].
-    """
+    """Everything in its place; `footprint` (4, 2) has the corners of the ego now [m]."""
     near, rows = static.distances <= SCORED_RADIUS, SCORED + 1
     standing, count = static.poses[near], int(near.sum())
     still = np.zeros((rows, count))

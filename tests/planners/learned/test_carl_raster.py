@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from shiftsim.planners.learned.carl.raster import (
     draw_line,
-    fill_area,
-    fill_box,
+    fill,
     make_crossings,
 )
 
@@ -32,9 +31,9 @@ def draw(kind, points):
         for (x0, y0), (x1, y1) in pairwise(xy.tolist()):
             draw_line(picture, x0, y0, x1, y1, 1)
     elif kind == AREA:
-        fill_area(picture, xy, 1, CROSSINGS)
+        fill(picture, xy, 1, CROSSINGS, False)
     else:
-        fill_box(picture, xy, 1, CROSSINGS)
+        fill(picture, xy, 1, CROSSINGS, True)
     return picture
 
 
@@ -142,7 +141,7 @@ def test_a_square_of_three_pixels_is_filled_to_its_borders():
 
 def test_later_shapes_are_drawn_over_earlier_ones():
     picture = np.zeros((SIZE, SIZE), np.uint8)
-    fill_area(picture, np.array([[1, 1], [9, 1], [9, 9], [1, 9]]), 7, CROSSINGS)
+    fill(picture, np.array([[1, 1], [9, 1], [9, 9], [1, 9]]), 7, CROSSINGS, False)
     draw_line(picture, 0, 4, 12, 4, 9)
     assert picture[4, :13].tolist() == [9] * 13
     assert picture[5, 5] == 7

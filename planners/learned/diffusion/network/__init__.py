@@ -108,14 +108,13 @@ class DiffusionNetwork(nn.Module):
 
     def encode(self, scene: Mapping[str, Tensor]) -> Tensor:
         """(B, N, hidden) tokens of normalised inputs."""
-        out: Tensor = self.encoder["encoder"](
+        return self.encoder["encoder"](
             scene["neighbor_agents_past"],
             scene["static_objects"],
             scene["lanes"],
             scene["lanes_speed_limit"],
             scene["lanes_has_speed_limit"],
         )
-        return out
 
     def present(self, scene: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Present states (B, A, 4) of the ego and its neighbours, and who is absent (B, A)."""
@@ -135,14 +134,9 @@ class DiffusionNetwork(nn.Module):
         )
 
     def forward(self, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """Trajectories of the ego and its neighbours.
+        """Trajectories (B, A, T, 4), ego first: x, y [m], cos, sin in the ego frame.
 
-        Args:
-            inputs: Features of a batch by name.
-            noise: (B, A, T, 4) standard normal start noise.
-
-        Returns:
-            (B, A, T, 4) x, y [m], cos, sin in the ego frame, from the next step on.
+        They begin at the next step; `noise`, of the same shape, is standard normal.
         """
         scene = self.normalise(inputs)
         current, absent = self.present(scene)
@@ -176,10 +170,7 @@ def _padded(x: Tensor) -> Tensor:
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
-    """The network without its weights.
-
-    Args:
-        args: Content of the checkpoint's args.json; None for the official dimensions.
+    """The network without its weights, by an args.json or of the official dimensions.
 
     Raises:
         CheckpointError: The settings lack something, or are of a network that reads other features.

@@ -129,14 +129,9 @@ class Prepared:
     modulation: list[tuple[Tensor, ...]]
 
     def __call__(self, x: Tensor, call: int) -> Tensor:
-        """One call of the network.
+        """Clean trajectories of noisy ones (B, A, 4 * steps), ego first, at a prepared time.
 
-        Args:
-            x: (B, A, 4 * steps) noisy trajectories, ego first; on a CPU at least `rows.ROWS`.
-            call: Which of the prepared times.
-
-        Returns:
-            (B, A, 4 * steps) clean ones.
+        On a CPU, A is at least `rows.ROWS`.
         """
         shape = x.shape
         first, second = self.entry
@@ -180,8 +175,7 @@ class TimeEmbedder(nn.Module):
         """(S,) times in [0, 1] to (S, hidden)."""
         steps = torch.arange(FREQUENCIES, dtype=torch.float32, device=times.device)
         phase = times[:, None] * torch.exp(-math.log(LONGEST) * steps / FREQUENCIES)
-        out: Tensor = self.mlp(torch.cat([torch.cos(phase), torch.sin(phase)], dim=-1))
-        return out
+        return self.mlp(torch.cat([torch.cos(phase), torch.sin(phase)], dim=-1))
 
 
 class DiTBlock(nn.Module):
@@ -202,18 +196,14 @@ class DiTBlock(nn.Module):
     def at_hand(self, context: Tensor, modulation: list[tuple[Tensor, ...]], mask: Tensor) -> Block:
         """The block for one plan: tokens of the scene (B, N, hidden), the rest as in `Block`."""
         attend = self.cross_attn
-        first, weight, bias = (
-            attend.out_proj.in_features,
-            attend.in_proj_weight,
-            attend.in_proj_bias,
-        )
+        first, weight = attend.out_proj.in_features, attend.in_proj_weight
         keys, values = (attend.heads(part) for part in attend.keys_values(context))
         return Block(
             norms=tuple(norm(getattr(self, f"norm{number}")) for number in (1, 2, 3, 4)),
             packed=Product(self.attn.in_proj_weight.t(), self.attn.in_proj_bias),
             joined=product(self.attn.out_proj),
             mlp1=(product(self.mlp1.fc1), product(self.mlp1.fc2)),
-            query=Product(weight[:first].t(), bias[:first]),
+            query=Product(weight[:first].t(), attend.in_proj_bias[:first]),
             looked=product(attend.out_proj),
             mlp2=(product(self.mlp2.fc1), product(self.mlp2.fc2)),
             modulation=modulation,
@@ -253,13 +243,10 @@ class DiT(nn.Module):
         self.final_layer = FinalLayer(hidden, 4 * POSES)
 
     def prepare(self, context: Tensor, route: Tensor, absent: Tensor, times: Tensor) -> Prepared:
-        """What the calls at all `times` share.
+        """What the calls at all `times` (S,) share.
 
-        Args:
-            context: (B, N, hidden) tokens of the scene.
-            route: (B, hidden) of `route_encoder`.
-            absent: (B, A) agents that are not there; the ego always is.
-            times: (S,) at which the network will be called.
+        `context` (B, N, hidden) are tokens of the scene, `route` (B, hidden) that of the route,
+        `absent` (B, A) agents that are not there; the ego always is.
         """
         condition = functional.silu(route + self.t_embedder(times)[:, None])[:, :, None]
         one = torch.ones((), device=context.device)

@@ -42,8 +42,7 @@ class Mixer(nn.Module):
         """
         self.tokens_mlp.add_over_rows_to(x, self.norm1(x))
         hidden = self.channels_mlp.hidden(self.norm2(x)).mean(dim=1)
-        out: Tensor = x.mean(dim=1) + self.channels_mlp.fc2(hidden)
-        return out
+        return x.mean(dim=1) + self.channels_mlp.fc2(hidden)
 
 
 class MixerEncoder(nn.Module):
@@ -73,8 +72,7 @@ class MixerEncoder(nn.Module):
 
     def token(self, x: Tensor) -> Tensor:
         """(N, CHANNELS) to (N, hidden)."""
-        out: Tensor = self.emb_project(self.norm(x))
-        return out
+        return self.emb_project(self.norm(x))
 
 
 class AgentEncoder(MixerEncoder):
@@ -101,8 +99,7 @@ class StaticEncoder(nn.Module):
 
     def forward(self, objects: Tensor) -> Tensor:
         """(N, 10) to (N, hidden)."""
-        out: Tensor = self.projection(objects)
-        return out
+        return self.projection(objects)
 
 
 class LaneEncoder(MixerEncoder):
@@ -151,8 +148,7 @@ class Fusion(nn.Module):
         """(B, N, hidden) to the same; `mask` is added to the logits."""
         for block in self.blocks:
             x = block(x, mask)
-        out: Tensor = self.norm(x)
-        return out
+        return self.norm(x)
 
 
 class SceneEncoder(nn.Module):
@@ -169,17 +165,10 @@ class SceneEncoder(nn.Module):
     def forward(
         self, agents: Tensor, objects: Tensor, lanes: Tensor, limit: Tensor, has_limit: Tensor
     ) -> Tensor:
-        """Tokens of a scene: agents, static objects, lanes.
+        """Tokens (B, A + O + L, hidden) of normalised agents, static objects and lanes.
 
-        Args:
-            agents: (B, A, samples, 11) normalised histories.
-            objects: (B, O, 10) normalised static objects.
-            lanes: (B, L, points, 12) normalised lanes.
-            limit: (B, L, 1) normalised speed limits.
-            has_limit: (B, L, 1) whether they are known.
-
-        Returns:
-            (B, A + O + L, hidden).
+        Agents are (B, A, samples, 11), objects (B, O, 10), lanes (B, L, points, 12), limits and
+        whether they are known (B, L, 1).
         """
         used = [
             (agents[..., :AGENT_COLUMNS] != 0.0).any(dim=-1).any(dim=-1),
@@ -189,23 +178,18 @@ class SceneEncoder(nn.Module):
         valid = torch.cat(used, dim=1)
         tokens = agents.new_zeros(*valid.shape, self.pos_emb.out_features)
         split = [part.shape[1] for part in used]
-        rows = [agents[used[0]], objects[used[1]], lanes[used[2]]]
-        for out, where, token in zip(
-            torch.split(tokens, split, dim=1),
-            used,
-            (
-                self.neighbor_encoder(rows[0]) + self.pos_emb(_positions(rows[0][:, -1], 0)),
-                self.static_encoder(rows[1]) + self.pos_emb(_positions(rows[1], 1)),
-                self.lane_encoder(rows[2], limit[used[2]], has_limit[used[2]])
-                + self.pos_emb(_lane_positions(rows[2][:, MIDDLE])),
-            ),
-            strict=True,
-        ):
+        agent, static, lane = agents[used[0]], objects[used[1]], lanes[used[2]]
+        made = (
+            self.neighbor_encoder(agent) + self.pos_emb(_positions(agent[:, -1], 0)),
+            self.static_encoder(static) + self.pos_emb(_positions(static, 1)),
+            self.lane_encoder(lane, limit[used[2]], has_limit[used[2]])
+            + self.pos_emb(_lane_positions(lane[:, MIDDLE])),
+        )
+        for out, where, token in zip(torch.split(tokens, split, dim=1), used, made, strict=True):
             out[where] = token
         valid[:, 0] = True  # an empty scene still has one key: a zero token
         mask = torch.zeros_like(valid, dtype=tokens.dtype).masked_fill(~valid, NO_KEY)
-        fused: Tensor = self.fusion(tokens, mask[:, None, None, :])
-        return fused
+        return self.fusion(tokens, mask[:, None, None, :])
 
 
 def _positions(rows: Tensor, kind: int) -> Tensor:

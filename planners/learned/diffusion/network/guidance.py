@@ -32,11 +32,7 @@ def with_guidance(
 ) -> Network:
     """The network for `sample` with the push added to the clean trajectories.
 
-    Args:
-        call: The network without it.
-        network: Whose units the trajectories have.
-        agents: (B, N, samples, 11) histories, not normalised, of at least the predicted ones.
-        absent: (B, A) predicted agents that are not there.
+    `agents` (B, N, samples, 11) are not normalised; `absent` (B, A) are predicted, but not there.
     """
     count = absent.shape[1] - 1
     sizes = agents[:, :count, -1, [7, 6]]  # length, width
@@ -60,10 +56,7 @@ def with_guidance(
 def _push(states: Tensor, sizes: Tensor, present: Tensor) -> Tensor:
     """(B, T, 2) gradient of the energy by the ego's positions, sideways and smoothed.
 
-    Args:
-        states: (B, A, T, 4) trajectories, ego first.
-        sizes: (B, A - 1, 2) length, width of the neighbours [m].
-        present: (B, A - 1) which of them are there.
+    Of trajectories (B, A, T, 4), ego first, neighbours' sizes (B, A - 1, 2) [m] and their presence.
     """
     heading = functional.normalize(states[..., 2:], dim=-1)
     ego = states[:, :1, 1:, :2] + REAR_TO_CENTER * heading[:, :1, 1:]
@@ -101,14 +94,8 @@ def _distances(
     """Signed distances of boxes along their own axes, and which way the first gets away.
 
     Separated boxes have the smallest gap over the axes that separate them (which is not their
-    distance), others minus the least overlap.
-
-    Args:
-        offset: (B, N, T, 2) centre of the first box minus that of the second.
-        first: Heading of the first box, as a unit vector.
-        second: Heading of the second one.
-        size: Length, width of the first one.
-        other: Length, width of the second one.
+    distance), others minus the least overlap. `offset` (B, N, T, 2) leads from the second centre to
+    the first; headings are unit vectors, sizes length and width.
     """
     gaps, axes = [], []
     for heading in (first, second):

@@ -54,17 +54,8 @@ def make_schedule() -> Schedule:
     sigma = torch.sqrt(1.0 - torch.exp(2.0 * log_alpha))
     half_snr = _half_snr(log_alpha)
     h = half_snr.diff()
-    return Schedule(
-        times=times,
-        log_alpha=log_alpha,
-        alpha=alpha,
-        sigma=sigma,
-        half_snr=half_snr,
-        h=h,
-        c_x=sigma[1:] / sigma[:-1],
-        c_x0=-alpha[1:] * torch.expm1(-h),
-        r0=h[:-1] / h[1:],
-    )
+    c_x, c_x0, r0 = sigma[1:] / sigma[:-1], -alpha[1:] * torch.expm1(-h), h[:-1] / h[1:]
+    return Schedule(times, log_alpha, alpha, sigma, half_snr, h, c_x, c_x0, r0)
 
 
 def _log_alpha(time: Tensor) -> Tensor:
@@ -79,15 +70,9 @@ SCHEDULE = make_schedule()
 
 
 def sample(network: Callable[[Tensor, int], Tensor], current: Tensor, noise: Tensor) -> Tensor:
-    """Trajectories from noise.
+    """(B, A, T, 4) normalised states from noise (B, A, T - 1, 4), the present ones (B, A, 4) first.
 
-    Args:
-        network: Clean trajectories of noisy ones (B, A, 4 * T) and the number of the call.
-        current: (B, A, 4) present states, which stay as they are.
-        noise: (B, A, T - 1, 4) standard normal.
-
-    Returns:
-        (B, A, T, 4) normalised states, the present ones first.
+    `network` gives clean trajectories of noisy ones (B, A, 4 * T) and the number of the call.
     """
     x = torch.cat([current[:, :, None], TEMPERATURE * noise], dim=2).flatten(2)
     before = x
