@@ -347,11 +347,7 @@ _SORTS = {
 
 
 def _agents(
-    count: int,
-    rng: np.random.Generator,
-    ego: FloatArray,
-    start: int,
-    lines: list[FloatArray],
+    count: int, rng: np.random.Generator, ego: FloatArray, start: int, lines: list[FloatArray]
 ) -> Tracks:
     """Agents that start near the ego and keep clear of its recorded way."""
     here = ego[start, :2]

@@ -12,14 +12,7 @@ from math import cos, inf, sin, sqrt
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.demo.agents import (
-    WALKING,
-    Driver,
-    Walker,
-    goes_first,
-    has_room,
-    must_queue,
-)
+from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
 from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.paths import STEP, Zone, arc_at
 

@@ -16,14 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.dsc3d.files import (
-    DIMENSION,
-    POSITION,
-    ROTATION,
-    VELOCITY,
-    numbers,
-    read_table,
-)
+from shiftsim.data.dsc3d.files import DIMENSION, POSITION, ROTATION, VELOCITY, numbers, read_table
 from shiftsim.data.dsc3d.motion import (
     believed_velocities,
     held_headings,

@@ -242,9 +242,7 @@ class _Builder:
             block += 1
 
     def _continuation(
-        self,
-        keys: list[LaneKey],
-        groups: dict[tuple[str, int, bool], list[LaneKey]],
+        self, keys: list[LaneKey], groups: dict[tuple[str, int, bool], list[LaneKey]]
     ) -> tuple[str, int, bool] | None:
         """The group that continues a group lane by lane, or None."""
         if any(len(self.after[key]) != 1 for key in keys):

@@ -21,12 +21,7 @@ from shiftsim.data.opendrive.control import (
 )
 from shiftsim.data.opendrive.graph import LaneGraph, Piece, build_lane_graph
 from shiftsim.data.opendrive.lanes import LaneKey
-from shiftsim.data.opendrive.overlaps import (
-    Levels,
-    cut_crossings,
-    overlapping,
-    subtract_overlaps,
-)
+from shiftsim.data.opendrive.overlaps import Levels, cut_crossings, overlapping, subtract_overlaps
 from shiftsim.data.opendrive.preparation import prepare
 from shiftsim.data.opendrive.records import OpenDrive
 from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
