@@ -68,10 +68,8 @@ class Driver:
 
     def next_zone(self) -> Zone | None:
         """The first zone ahead that it has not been admitted to."""
-        for zone in self.path.zones:
-            if zone.id not in self.held and self.is_before(zone):
-                return zone
-        return None
+        ahead = (z for z in self.path.zones if z.id not in self.held and self.is_before(z))
+        return next(ahead, None)
 
     def rank(self, zone: Zone) -> int:
         """Order of priority at a zone now, smallest first."""

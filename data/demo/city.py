@@ -86,9 +86,8 @@ class _City:
 def bench_scene(num_agents: int, seed: int) -> Scenario:
     """A 15 s scenario in a city of 5200 lanes, with 3 s of history and 8 s of future.
 
-    Args:
-        num_agents: Vehicles, pedestrians, bicycles and objects that start within 50 m of the ego.
-        seed: Of the agents; the city and the ego are always the same.
+    Vehicles, pedestrians, bicycles and objects start within 50 m of the ego, as the seed wants; the
+    city and the ego are always the same.
     """
     city = _city()
     road = _map(city)

@@ -20,11 +20,7 @@ _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleratio
 
 
 def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
-
-    Args:
-        folder: Where the folders of the towns go; made if needed.
-    """
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes."""
     for site in demo_sites():
         _write_site(folder / site.name, site)
 
@@ -60,12 +56,7 @@ def _write_site(folder: Path, site: DemoSite) -> None:
 
 
 def _annotations(boxes: list[Box], parked: FloatArray) -> pa.Table:
-    """Rows of `annotations.parquet`, by frame and track.
-
-    Args:
-        boxes: Everybody who moves.
-        parked: (n, 3) poses of parked cars, which are there at every frame.
-    """
+    """Rows of `annotations.parquet`, by frame and track; cars parked at (n, 3) stay throughout."""
     names = sorted({*(box[2] for box in boxes), *(("car", "van") if len(parked) else ())})
     moving = np.array([(*box[:2], names.index(box[2]), *box[3:]) for box in boxes])
     rows = np.concatenate([moving, _parked_rows(moving, parked, names)])

@@ -44,10 +44,8 @@ class Traffic:
 
     def record(self, duration: float) -> list[Box]:
         """Simulate from time 0 and return the boxes of all frames."""
-        for number, driver in enumerate(self.drivers, start=1):
-            driver.token = number
-        for number, walker in enumerate(self.walkers, start=len(self.drivers) + 1):
-            walker.token = number
+        for number, agent in enumerate((*self.drivers, *self.walkers), start=1):
+            agent.token = number
         waiting = list(self.drivers)
         active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):
@@ -115,12 +113,11 @@ class Traffic:
                 refused.append(zone)
 
     def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
-        for zone in other.path.zones:
-            if self._conflict(wanted, zone) and (
-                zone.id in other.held or goes_first(other, zone, driver, wanted)
-            ):
-                return True
-        return False
+        return any(
+            zone.id in other.held or goes_first(other, zone, driver, wanted)
+            for zone in other.path.zones
+            if self._conflict(wanted, zone)
+        )
 
     def _conflict(self, a: Zone, b: Zone) -> bool:
         return (a.id, b.id) in self.town.conflicts

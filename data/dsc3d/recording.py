@@ -186,12 +186,7 @@ def find_map(site: Site, given: Path | None = None) -> Path:
 def read_recording(
     site: Site, name: str, category_map: dict[str, str] | None = None
 ) -> Annotations:
-    """One recording, checked.
-
-    Args:
-        site: Its site.
-        name: Its name.
-        category_map: Known category by category of the data set, for other names.
+    """One recording, checked; `category_map` gives the known category for names of the data set.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.

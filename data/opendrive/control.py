@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive.areas import is_stop_line, object_rings
-from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, Piece
-from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal, Speed
+from shiftsim.data.opendrive.areas import is_stop_line, rings_of
+from shiftsim.data.opendrive.graph import LaneGraph, Piece
+from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal
 from shiftsim.data.opendrive.shapes import Shapes
 from shiftsim.data.polygons import largest_part
 
@@ -61,12 +61,11 @@ def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
     }
     controls = []
     for connector in graph.connectors:
-        found: set[str | None] = set()
-        if connector.junctions:
-            for piece in connector.pieces:
-                found |= _controls_on(od.roads[piece.key.road], piece, known, reach=np.inf)
-            last = graph.lanes[connector.source].pieces[-1]
-            found |= _controls_on(od.roads[last.key.road], last, known, reach=_APPROACH)
+        last = graph.lanes[connector.source].pieces[-1]
+        places = [*((piece, np.inf) for piece in connector.pieces), (last, _APPROACH)]
+        found = set[str | None]()
+        for piece, reach in places if connector.junctions else ():
+            found |= _controls_on(od.roads[piece.key.road], piece, known, reach)
         controls.append(frozenset(control for control in found if control))
     return controls
 
@@ -88,18 +87,10 @@ def stop_lines(
     od: OpenDrive,
     graph: LaneGraph,
     shapes: Shapes,
-    controls: Sequence[frozenset[str]],
-    polygons: Sequence[shapely.Polygon],
+    controls: Sequence[frozenset[str]],  # what governs each connector
+    polygons: Sequence[shapely.Polygon],  # of the lanes
 ) -> list[StopLine]:
-    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506).
-
-    Args:
-        od: The file.
-        graph: Lanes and connectors.
-        shapes: Their geometry.
-        controls: What governs each connector.
-        polygons: Areas of the lanes.
-    """
+    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506)."""
     by_lane: dict[int, set[str]] = {}
     for connector, governed in zip(graph.connectors, controls, strict=True):
         if connector.junctions:
@@ -107,11 +98,12 @@ def stop_lines(
     drawn = _drawn_lines(od, shapes)
     tree = shapely.STRtree(np.array(drawn, dtype=object))
     lines = []
-    for lane, found in sorted(by_lane.items(), key=lambda item: item[0]):
+    for lane, found in sorted(by_lane.items()):
         left, right = shapes.borders(graph.lanes[lane].pieces[-1])
         box = _end_box(left, right)
         near = tree.query(box.buffer(_NEAR_END), predicate="intersects").tolist()
-        near = [i for i in near if _lies_across(drawn[i], polygons[lane], box)]
+        near = [i for i in near if polygons[lane].intersects(drawn[i])]
+        near = [i for i in near if drawn[i].distance(box) < _NEAR_END]
         if near:
             nearest = min(near, key=lambda i: drawn[i].distance(box))
             box = shapely.intersection(_deepened(drawn[nearest]), polygons[lane])
@@ -122,24 +114,15 @@ def stop_lines(
 
 
 def _drawn_lines(od: OpenDrive, shapes: Shapes) -> list[shapely.Geometry]:
-    drawn = []
+    drawn: list[shapely.Geometry] = []
     for road in od.roads.values():
-        line = shapes.line(road.id)
-        for thing in road.objects:
-            if is_stop_line(thing):
-                drawn += [
-                    shapely.MultiPoint(ring).convex_hull
-                    for ring in object_rings(line, thing)
-                    if len(ring) > 1 and np.isfinite(ring).all()
-                ]
+        rings = rings_of([road], shapes, is_stop_line, least=2)
+        drawn += [shapely.MultiPoint(ring).convex_hull for ring in rings]
         for signal in road.signals:
-            if (
-                signal.type == "294"
-                and not signal.reference
-                and np.isfinite([signal.s, signal.t]).all()
-            ):
+            is_finite = np.isfinite([signal.s, signal.t]).all()
+            if signal.type == "294" and not signal.reference and is_finite:
                 half = (signal.width or 3.0) / 2
-                ends = line.evaluate(np.full(2, signal.s))
+                ends = shapes.line(road.id).evaluate(np.full(2, signal.s))
                 drawn.append(shapely.LineString(ends.offset(signal.t + np.array([-half, half]))))
     return drawn
 
@@ -161,15 +144,6 @@ def _deepened(line: shapely.Geometry) -> shapely.Geometry:
     if line.area > 0.1:
         return line
     return line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
-
-
-def _lies_across(line: shapely.Geometry, lane: shapely.Polygon, box: shapely.Polygon) -> bool:
-    return bool(lane.intersects(line)) and line.distance(box) < _NEAR_END
-
-
-def is_lit(connector: ConnectorRun, found: frozenset[str]) -> bool:
-    """Whether lights govern a connector."""
-    return bool(connector.junctions) and LIGHT in found
 
 
 def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:
@@ -194,9 +168,9 @@ def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float |
 
 def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
     section = road.sections[piece.key.section]
-    own = _last(section.lanes[piece.key.lane].speeds, s - section.s)
-    if own is not None:
-        return own.limit
+    own = [speed for speed in section.lanes[piece.key.lane].speeds if speed.s <= s - section.s]
+    if own:
+        return own[-1].limit
     kinds = [kind for kind in road.types if kind.s <= s] or list(road.types[:1])
     if kinds and kinds[-1].speed is not None:
         return kinds[-1].speed.limit
@@ -206,11 +180,6 @@ def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
     land = (kinds[-1].country if kinds else "") or country
     table = _DEFAULTS_US if land.upper() in ("US", "USA") else _DEFAULTS_DE
     return table.get(kinds[-1].type if kinds else "town", table["town"])
-
-
-def _last(records: Sequence[Speed], s: float) -> Speed | None:
-    before = [record for record in records if record.s <= s]
-    return before[-1] if before else None
 
 
 def _signal_limit(road: Road, piece: Piece, s: float) -> float | None:

@@ -89,12 +89,7 @@ def road_order(road: str) -> tuple[int, int, str]:
 
 
 def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> LaneGraph:
-    """Lanes, roadblocks and connectors of a file.
-
-    Args:
-        od: The file.
-        warnings: Takes a count per kind of what was inferred or dropped.
-    """
+    """Lanes, roadblocks and connectors of a file; counts what was inferred or dropped."""
     return _Builder(od, warnings).build()
 
 

@@ -3,22 +3,15 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive import areas
+from shiftsim.data.opendrive import areas, control
 from shiftsim.data.opendrive.check import check_map
-from shiftsim.data.opendrive.control import (
-    LIGHT,
-    STOP,
-    YIELD,
-    connector_controls,
-    is_lit,
-    speed_limit,
-    stop_lines,
-)
+from shiftsim.data.opendrive.control import LIGHT, STOP, YIELD
 from shiftsim.data.opendrive.graph import LaneGraph, Piece, build_lane_graph
 from shiftsim.data.opendrive.lanes import LaneKey
 from shiftsim.data.opendrive.overlaps import Levels, cut_crossings, overlapping, subtract_overlaps
@@ -83,9 +76,12 @@ def build_road_map(
     return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
 
 
+def _chains(graph: LaneGraph) -> list[list[Piece]]:
+    return [run.pieces for run in (*graph.lanes, *graph.connectors)]
+
+
 def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
-    chains = [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
-    return Shapes(od, [*(piece for chain in chains for piece in chain), *graph.dropped])
+    return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
 
 
 class _Maker:
@@ -103,7 +99,7 @@ class _Maker:
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
         self._shape_lanes()
         self._shape_connectors()
-        self.controls = connector_controls(self.od, self.graph)
+        self.controls = control.connector_controls(self.od, self.graph)
         self._number()
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblock_specs(), *self._block_connector_specs()]
@@ -125,10 +121,13 @@ class _Maker:
 
     def _stacked_ids(self) -> set[tuple[str, str]]:
         """Pairs of lanes, and of roadblocks, that lie on different levels."""
-        lanes = self.graph.lanes
         pairs = {(self.lane_ids[i], self.lane_ids[j]) for i, j in self.stacked}
-        blocks = [(lanes[i].block, lanes[j].block) for i, j in self.stacked]
-        return pairs | {(self.block_ids[min(b)], self.block_ids[max(b)]) for b in blocks}
+        blocks = self._stacked_blocks()
+        return pairs | {(self.block_ids[a], self.block_ids[b]) for a, b in blocks}
+
+    def _stacked_blocks(self) -> set[tuple[int, int]]:
+        blocks = [lane.block for lane in self.graph.lanes]
+        return {(min(blocks[i], blocks[j]), max(blocks[i], blocks[j])) for i, j in self.stacked}
 
     def _new_ids(self, count: int) -> list[str]:
         first = self._next_id
@@ -174,7 +173,7 @@ class _Maker:
             connectors, self.connector_polygons, self.pairs, levels.are_stacked
         )
         self.group_ids = self._new_ids(int(self.groups.max(initial=-1)) + 1)
-        self.stop_lines = stop_lines(
+        self.stop_lines = control.stop_lines(
             self.od, self.graph, self.shapes, self.controls, self.lane_polygons
         )
         self.stop_ids = self._new_ids(len(self.stop_lines))
@@ -206,7 +205,7 @@ class _Maker:
                 right=right,
                 left_id=self._boundary(lane.block, lane.index),
                 right_id=self._boundary(lane.block, lane.index + 1),
-                speed_limit=speed_limit(self.od, lane.pieces, self.country),
+                speed_limit=control.speed_limit(self.od, lane.pieces, self.country),
                 lane_index=lane.index,
                 left_lane=self._neighbor(number, -1),
                 right_lane=self._neighbor(number, 1),
@@ -237,9 +236,9 @@ class _Maker:
                 right=right,
                 left_id=left_id,
                 right_id=right_id,
-                speed_limit=speed_limit(self.od, connector.pieces, self.country),
+                speed_limit=control.speed_limit(self.od, connector.pieces, self.country),
                 intersection_id=self.group_ids[self.groups[number]],
-                has_traffic_lights=is_lit(connector, self.controls[number]),
+                has_traffic_lights=bool(connector.junctions) and LIGHT in self.controls[number],
                 stop_lines=[
                     stop_id
                     for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
@@ -254,12 +253,7 @@ class _Maker:
             members[lane.block].append(number)
         order = sorted(members)
         polygons = [self._roadblock_polygon(members[block]) for block in order]
-        stacked = {
-            (min(pair), max(pair))
-            for pair in (
-                (self.graph.lanes[i].block, self.graph.lanes[j].block) for i, j in self.stacked
-            )
-        }
+        stacked = self._stacked_blocks()
         polygons, _ = subtract_overlaps(polygons, [p.area for p in polygons], stacked)
         for block, polygon in zip(order, polygons, strict=True):
             yield BlockSpec(
@@ -298,7 +292,7 @@ class _Maker:
         for group, group_id in enumerate(self.group_ids):
             numbers = np.flatnonzero(self.groups == group).tolist()
             polygon = areas.merge_closed([self.connector_polygons[i] for i in numbers], 0.5)
-            specs.append(AreaSpec(group_id, areas.without_holes(polygon), self._kind(numbers)))
+            specs.append(AreaSpec(group_id, shapely.Polygon(polygon.exterior), self._kind(numbers)))
         return specs
 
     def _kind(self, numbers: Sequence[int]) -> int:
@@ -307,12 +301,6 @@ class _Maker:
         if not any(self.graph.connectors[i].junctions for i in numbers):
             return PASS_THROUGH
         return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
-
-    def _stop_specs(self) -> list[AreaSpec]:
-        return [
-            AreaSpec(stop_id, line.polygon, STOP_KINDS[line.control])
-            for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
-        ]
 
     def _areas(self) -> dict[str, list[AreaSpec]]:
         intersections = self._intersections()
@@ -335,7 +323,10 @@ class _Maker:
         )
         return {
             "intersections": intersections,
-            "stop_polygons": self._stop_specs(),
+            "stop_polygons": [
+                AreaSpec(stop_id, line.polygon, STOP_KINDS[line.control])
+                for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
+            ],
             "crosswalks": self._specs(areas.crosswalk_polygons(self.od, self.shapes)),
             "walkways": self._specs(areas.merge_areas(other.walked, 0.05)),
             "car_parks": self._specs(car_parks),
@@ -347,14 +338,8 @@ class _Maker:
         return [AreaSpec(i, polygon) for i, polygon in zip(ids, polygons, strict=True)]
 
     def _origins(self) -> Iterator[Origin]:
-        runs: list[tuple[str, list[Piece]]] = [
-            *((i, lane.pieces) for i, lane in zip(self.lane_ids, self.graph.lanes, strict=True)),
-            *(
-                (i, c.pieces)
-                for i, c in zip(self.connector_ids, self.graph.connectors, strict=True)
-            ),
-        ]
-        for edge_id, pieces in runs:
+        ids, runs = [*self.lane_ids, *self.connector_ids], _chains(self.graph)
+        for edge_id, pieces in zip(ids, runs, strict=True):
             for piece in pieces:
                 yield Origin(edge_id, piece.key, piece.begin, piece.end)
 

@@ -104,11 +104,7 @@ def are_stacked(first: Trace, second: Trace, region: shapely.Geometry) -> bool:
 
 
 def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[LaneGraph, int]:
-    """Make intersections where lanes cross on one level without a junction.
-
-    Returns:
-        The graph, new where something was cut, and how many pairs of lanes cross.
-    """
+    """The graph with intersections where lanes cross on one level, and how many pairs cross."""
     polygons = [lane_polygon(*shapes.joined_borders(lane.pieces)) for lane in graph.lanes]
     levels = Levels(od, shapes, [lane.pieces for lane in graph.lanes], polygons)
     intervals: dict[int, list[tuple[float, float]]] = defaultdict(list)
@@ -261,10 +257,7 @@ def subtract_overlaps(
 ) -> tuple[list[shapely.Polygon], int]:
     """Polygons without the overlaps, which go to the shorter of two; and how many there were.
 
-    Args:
-        polygons: Areas.
-        lengths: How long each is [m].
-        stacked: Pairs (i, j), i < j, that may overlap.
+    Pairs (i, j), i < j, in `stacked` may overlap.
     """
     out = list(polygons)
     pairs = [pair for pair in overlapping(polygons) if pair not in stacked]

@@ -98,17 +98,11 @@ class Shapes:
 
     def baseline(
         self,
-        pieces: Sequence[Piece],
-        start: FloatArray | None = None,
-        end: FloatArray | None = None,
+        pieces: Sequence[Piece],  # in the direction of travel
+        start: FloatArray | None = None,  # (2,) where it must begin, near its own start [m]
+        end: FloatArray | None = None,  # (2,) where it must end [m]
     ) -> FloatArray:
-        """Centre line of a chain of pieces with a vertex about every 0.25 m.
-
-        Args:
-            pieces: In the direction of travel.
-            start: (2,) point it must begin at, near its own; None for its own [m].
-            end: (2,) point it must end at [m].
-        """
+        """Centre line of a chain of pieces with a vertex about every 0.25 m."""
         pieces = [part for piece in pieces for part in self._without_steps(piece)]
         firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
         jumps = np.zeros((len(pieces) + 1, 2))
@@ -189,14 +183,9 @@ def _divide(dense: FloatArray) -> FloatArray:
 
 
 def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """A line (K, 2) whose ends leave and arrive in the directions of its neighbours.
+    """A line (K, 2) whose ends leave and arrive in the directions of the lines before and after.
 
     Only where they differ enough to be a kink; the line moves aside by some centimetres.
-
-    Args:
-        line: The line [m].
-        before: (K, 2) line that ends where it begins [m].
-        after: (K, 2) line that begins where it ends [m].
     """
     bent = _bend_start(line, before[-1] - before[-2])
     return _bend_start(bent[::-1], after[0] - after[1])[::-1]
