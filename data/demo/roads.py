@@ -272,8 +272,7 @@ def _lane_xml(lane: LaneSpec, road: RoadSpec) -> str:
     slope = (lane.end_width - lane.width) / road.length
     return (
         f'<lane id="{lane.id}" type="{lane.type}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{lane.width!r}" b="{slope!r}" '
-        'c="0" d="0"/></lane>'
+        f'<width sOffset="0" a="{lane.width!r}" b="{slope!r}" c="0" d="0"/></lane>'
     )
 
 

@@ -34,9 +34,8 @@ def check_map(
     block_overlap = _largest_overlap(blocks[: road.num_roadblocks], road.blocks.ids, stacked)
     lanes = polygons[: road.num_lanes]
     lane_area = float(shapely.union_all(lanes).area if stacked else sum(p.area for p in lanes))
-    drivable = shapely.union_all(
-        [road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))]
-    ).area
+    tiles = [road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))]
+    drivable = shapely.union_all(tiles).area
     layers: list[Layer] = [road.edges, road.blocks, road.intersections, road.stop_polygons]
     layers += [road.crosswalks, road.walkways, road.car_parks, road.drivable_areas]
     ids = [i for layer in layers for i in layer.ids]

@@ -19,8 +19,7 @@ LIGHT, STOP, YIELD = "light", "stop", "yield"
 STOP_LINE_DEPTH = 1.0  # m
 _APPROACH = 100.0  # m before a junction within which a signal governs it
 _NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
-_STOP_TYPES = frozenset(("206", "R1-1"))
-_YIELD_TYPES = frozenset(("205", "R1-2"))
+_SIGNS = {"206": STOP, "R1-1": STOP, "205": YIELD, "R1-2": YIELD}  # by type
 _KMH, _MPH = SPEED_UNITS["km/h"], SPEED_UNITS["mph"]
 _TOWN = ("town", "townCollector", "townArterial", "townLocal", "townPrivate")
 _DEFAULTS_DE: dict[str, float | None] = {
@@ -44,11 +43,8 @@ class StopLine:
 
 def signal_control(signal: Signal) -> str | None:
     """What a signal asks of traffic: LIGHT, STOP, YIELD, or None."""
-    if signal.dynamic and signal.type.startswith("1000"):
-        return LIGHT
-    if signal.type in _STOP_TYPES:
-        return STOP
-    return YIELD if signal.type in _YIELD_TYPES else None
+    is_light = signal.dynamic and signal.type.startswith("1000")
+    return LIGHT if is_light else _SIGNS.get(signal.type)
 
 
 def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
@@ -65,22 +61,16 @@ def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
         places = [*((piece, np.inf) for piece in connector.pieces), (last, _APPROACH)]
         found = set[str | None]()
         for piece, reach in places if connector.junctions else ():
-            found |= _controls_on(od.roads[piece.key.road], piece, known, reach)
+            side = "+" if piece.end >= piece.begin else "-"
+            found |= {
+                signal_control(known.get(signal.id, signal))
+                for signal in od.roads[piece.key.road].signals
+                if signal.orientation in ("none", side)
+                and applies_to(signal, piece.key.lane)
+                and abs(signal.s - piece.end) <= reach
+            }
         controls.append(frozenset(control for control in found if control))
     return controls
-
-
-def _controls_on(
-    road: Road, piece: Piece, known: dict[str, Signal], reach: float
-) -> set[str | None]:
-    forward = piece.end >= piece.begin
-    return {
-        signal_control(known.get(signal.id, signal))
-        for signal in road.signals
-        if signal.orientation in ("none", "+" if forward else "-")
-        and applies_to(signal, piece.key.lane)
-        and abs(signal.s - piece.end) <= reach
-    }
 
 
 def stop_lines(

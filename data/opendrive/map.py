@@ -1,9 +1,10 @@
 """OpenDRIVE to the semantic map of nuPlan's kind."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -23,6 +24,7 @@ from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_m
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
+_Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -104,16 +106,12 @@ class _Maker:
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblock_specs(), *self._block_connector_specs()]
         layers = self._areas()
-        shift = _Shift(offset)
         vector_map = build_map(
             name,
-            edges=[shift.edge(spec) for spec in edges],
-            blocks=[replace(spec, polygon=shift.polygon(spec.polygon)) for spec in blocks],
+            edges=_moved(edges, offset),
+            blocks=_moved(blocks, offset),
             epsg=epsg,
-            **{
-                layer: [replace(spec, polygon=shift.polygon(spec.polygon)) for spec in specs]
-                for layer, specs in layers.items()
-            },
+            **{layer: _moved(specs, offset) for layer, specs in layers.items()},
         )
         checks, figures = check_map(vector_map, self._stacked_ids())
         report = MapReport(dict(self.warnings), tuple(self._origins()), checks, figures)
@@ -344,25 +342,15 @@ class _Maker:
                 yield Origin(edge_id, piece.key, piece.begin, piece.end)
 
 
-@dataclass(frozen=True)
-class _Shift:
-    """Moves shapes to their place in the world."""
-
-    offset: FloatArray
-
-    def polygon(self, polygon: shapely.Polygon) -> shapely.Polygon:
-        """A polygon moved."""
-        return shapely.transform(polygon, lambda xy: xy + self.offset)
-
-    def edge(self, spec: EdgeSpec) -> EdgeSpec:
-        """An edge moved."""
-        return replace(
-            spec,
-            polygon=self.polygon(spec.polygon),
-            baseline=spec.baseline + self.offset,
-            left=None if spec.left is None else spec.left + self.offset,
-            right=None if spec.right is None else spec.right + self.offset,
-        )
+def _moved(specs: Iterable[_Spec], offset: FloatArray) -> list[_Spec]:
+    """Edges, blocks or areas at their place in the world."""
+    out = []
+    for spec in specs:
+        lines = {name: getattr(spec, name, None) for name in ("baseline", "left", "right")}
+        shapes = {name: line + offset for name, line in lines.items() if line is not None}
+        polygon = shapely.transform(spec.polygon, lambda xy: xy + offset)
+        out.append(replace(spec, polygon=polygon, **shapes))
+    return out
 
 
 def turn_type(line: FloatArray) -> int:

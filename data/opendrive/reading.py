@@ -50,7 +50,7 @@ def read_opendrive(path: Path) -> OpenDrive:
 def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     """Like `read_opendrive`, from the bytes of a file."""
     reader = Reader(source)
-    header: Any = None
+    header: Any = ("", ""), None, None  # revision, geoReference, offset
     roads: dict[str, Road] = {}
     seen: set[tuple[str, str]] = set()
     junctions: dict[str, records.Junction] = {}
@@ -70,17 +70,7 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
                 roads[name] = road
         else:
             junctions[name] = _read_junction(element, name, reader)
-    revision, geo_reference, offset = header or (("", ""), None, None)
-    return OpenDrive(
-        source=source,
-        revision=revision,
-        geo_reference=geo_reference,
-        offset=offset,
-        roads=roads,
-        junctions=junctions,
-        counts=dict(reader.counts),
-        warnings=dict(reader.warnings),
-    )
+    return OpenDrive(source, *header, roads, junctions, dict(reader.counts), dict(reader.warnings))
 
 
 def _strip_junk(data: bytes, reader: Reader) -> bytes:
@@ -354,16 +344,12 @@ def _read_junction(element: Any, name: str, reader: Reader) -> records.Junction:
     reader.counts[f"junction type {kind}"] += 1
     connections = []
     for child in element.findall("connection"):
-        links = []
-        for link in child.findall("laneLink"):
-            pair = reader.integer(link, "from"), reader.integer(link, "to")
-            if pair[0] is not None and pair[1] is not None:
-                links.append((pair[0], pair[1]))
+        links = reader.pairs(child, "laneLink", ("from", "to"))
         reader.counts["connection"] += 1
         reader.counts["lane link in a junction"] += len(links)
         into = child.get("connectingRoad") or child.get("linkedRoad") or ""
         connections.append(
-            records.Connection(child.get("incomingRoad", ""), into, _contact(child), tuple(links))
+            records.Connection(child.get("incomingRoad", ""), into, _contact(child), links)
         )
     if not connections:
         reader.warn("junction without connections")

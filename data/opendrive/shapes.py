@@ -62,10 +62,8 @@ class Shapes:
         """Borders of all lanes of a section."""
         key = road, section
         if key not in self._sections:
-            stops = self._stops.get(key, set())
-            self._sections[key] = _sample_section(
-                self._od.roads[road], section, self._lines[road], stops
-            )
+            place = self._od.roads[road], section, self._lines[road]
+            self._sections[key] = _sample_section(*place, self._stops.get(key, set()))
         return self._sections[key]
 
     def borders(self, piece: Piece) -> tuple[FloatArray, FloatArray]:
@@ -81,10 +79,8 @@ class Shapes:
 
     def joined_borders(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
         """Borders of a chain of pieces; ends that nearly meet become one vertex."""
-        parts = [self.borders(piece) for piece in pieces]
-        left = _join([part[0] for part in parts])
-        right = _join([part[1] for part in parts])
-        return left, right
+        left, right = zip(*map(self.borders, pieces), strict=True)
+        return _join(left), _join(right)
 
     def centers(self, piece: Piece, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
@@ -106,24 +102,14 @@ class Shapes:
         pieces = [part for piece in pieces for part in self._without_steps(piece)]
         firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
         jumps = np.zeros((len(pieces) + 1, 2))
-        for number in range(1, len(pieces)):
-            jumps[number] = firsts[number][0] - firsts[number - 1][1]
+        for number, (before, after) in enumerate(pairwise(firsts), start=1):
+            jumps[number] = after[0] - before[1]
         shifts = [(-0.5 * jumps[i], 0.5 * jumps[i + 1]) for i in range(len(pieces))]
         if start is not None:
             shifts[0] = (start - firsts[0][0], shifts[0][1])
         if end is not None:
             shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
-        grids = []
-        for piece in pieces:
-            count = max(int(np.ceil(piece.length / _DENSE_STEP)), 2)
-            grids.append(np.linspace(0.0, 1.0, count + 1))
-        dense = np.concatenate(
-            [
-                self._shifted(piece, share, shift)
-                for piece, share, shift in zip(pieces, grids, shifts, strict=True)
-            ]
-        )
-        return _divide(dense)
+        return _divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
 
     def _without_steps(self, piece: Piece) -> list[Piece]:
         """The piece, cut where the middle of the lane jumps."""
@@ -139,10 +125,9 @@ class Shapes:
             stops.reverse()
         return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
 
-    def _shifted(
-        self, piece: Piece, share: FloatArray, shift: tuple[FloatArray, FloatArray]
-    ) -> FloatArray:
-        """Centre points at shares of a piece, its two ends moved by `shift` (2,), (2,)."""
+    def _shifted(self, piece: Piece, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Dense centre points of a piece, its two ends moved by `shift` (2,), (2,)."""
+        share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _DENSE_STEP)), 2) + 1)
         points = self.centers(piece, piece.begin + share * (piece.end - piece.begin))
         room = 0.5 if shift[0].any() and shift[1].any() else 1.0
         reach = min(_BLEND / piece.length, room) if piece.length > 0 else room
