@@ -35,8 +35,7 @@ class Driver:
     waiting: set[str] = field(default_factory=set)  # places it has begun to brake for
     patience: float = 6.0  # how long it will stand before others let it in [s]
     token: int = 0  # number of its track
-    # x [m], y [m], heading [rad] of its box centre
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y [m], heading [rad] of its centre
 
     def __post_init__(self) -> None:
         self.length, self.width, _ = SIZES[self.category]

@@ -81,10 +81,6 @@ class _City:
     turns: list[tuple[_Street, str]]
     lines: dict[str, FloatArray] = field(default_factory=dict)
 
-    def block_between(self, source: _Street, turn: str) -> str:
-        """The roadblock connector of a turn."""
-        return str(20_000 + self.turns.index((source, turn)))
-
 
 def bench_scene(num_agents: int, seed: int) -> Scenario:
     """A 15 s scenario in a city of 5200 lanes, with 3 s of history and 8 s of future.
@@ -132,7 +128,8 @@ def _city() -> _City:
 
 def _map(city: _City) -> VectorMap:
     """The map; fills the baselines of the city."""
-    into, out_of = defaultdict(list), defaultdict(list)  # ids of connectors by edge or block
+    into: dict[str, list[str]] = defaultdict(list)  # connectors by the lane or block they lead to
+    out_of: dict[str, list[str]] = defaultdict(list)
     edges: list[EdgeSpec] = []
     blocks: list[BlockSpec] = []
     for street in city.streets.values():
@@ -272,7 +269,7 @@ def _ego_path(city: _City) -> tuple[FloatArray, tuple[str, ...]]:
         following = city.streets[street.after(turn)]
         shape = _turn_shape(street.direction, turn, index)
         parts += [shape.line + _middle(street.end), city.lines[following.lanes[index]]]
-        route += [city.block_between(street, turn), following.block]
+        route += [str(20_000 + city.turns.index((street, turn))), following.block]
         street = following
     return np.concatenate(parts), tuple(route)
 

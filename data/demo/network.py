@@ -36,17 +36,14 @@ class Street:
     is_main: bool = True  # whether it has priority
     junctions: tuple[int, int] = (0, 0)  # at its begin and its end, 0 for none
     stop: float = 9.0  # how far before a junction vehicles wait [m]
-    # first and last s of the places where pedestrians cross [m]
-    crossings: tuple[tuple[float, float], ...] = ()
+    crossings: tuple[tuple[float, float], ...] = ()  # first and last s of places to cross [m]
     is_marked: bool = True  # whether these are crosswalks of the map
     parking: float = 0.0  # width of the strip for parking on both sides, diagonal above 3 m [m]
-    # first and last s of stretches with parked cars [m]
-    stalls: tuple[tuple[float, float], ...] = ()
+    stalls: tuple[tuple[float, float], ...] = ()  # first and last s of parked cars [m]
     empty: tuple[int, ...] = ()  # numbers of the parking spaces that are free
     sidewalk: float = 3.0  # width, 0 for none [m]
     has_stop_sign: bool = False  # at its begin
-    # first and last s of a place where vehicles cannot meet [m]
-    narrow: tuple[float, float] | None = None
+    narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
 
     @property
     def half(self) -> float:
@@ -59,29 +56,22 @@ class Street:
 
     def road(self) -> RoadSpec:
         """The same as a road of the map."""
-        lanes = [("driving", self.width)] * self.lanes
-        lanes += [("parking", self.parking)] if self.parking > 0.0 else []
-        lanes += [("sidewalk", self.sidewalk)] if self.sidewalk > 0.0 else []
-        ends = [("junction", x, "") if x else None for x in self.junctions]
-        return RoadSpec(
-            self.id,
-            self.start,
-            self.pieces,
-            tuple(
-                LaneSpec(sign * number, kind, width, width)
-                for sign in ((-1,) if self.is_one_way else (1, -1))
-                for number, (kind, width) in enumerate(lanes, start=1)
-            ),
-            self.limit,
-            predecessor=ends[0],
-            successor=ends[1],
-            crosswalks=tuple(
-                CrosswalkSpec(self.crossing_name(number), *ends, self.half)
-                for number, ends in enumerate(self.crossings)
-                if self.is_marked
-            ),
-            stop_sign=self.stop if self.has_stop_sign else None,
+        strips = [("driving", self.width)] * self.lanes
+        strips += [("parking", self.parking)] if self.parking > 0.0 else []
+        strips += [("sidewalk", self.sidewalk)] if self.sidewalk > 0.0 else []
+        lanes = tuple(
+            LaneSpec(sign * number, kind, width, width)
+            for sign in ((-1,) if self.is_one_way else (1, -1))
+            for number, (kind, width) in enumerate(strips, start=1)
         )
+        before, after = (("junction", x, "") if x else None for x in self.junctions)
+        road = RoadSpec(self.id, self.start, self.pieces, lanes, self.limit, -1, before, after)
+        walks = [
+            CrosswalkSpec(self.crossing_name(number), *ends, self.half)
+            for number, ends in enumerate(self.crossings if self.is_marked else ())
+        ]
+        sign = self.stop if self.has_stop_sign else None
+        return replace(road, crosswalks=tuple(walks), stop_sign=sign)
 
 
 @dataclass(frozen=True)
@@ -128,8 +118,7 @@ class Town:
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
     walks: dict[str, paths.Walk] = field(default_factory=dict)  # by name
-    # (n, 3) poses of parking spaces by street
-    bays: dict[str, FloatArray] = field(default_factory=dict)
+    bays: dict[str, FloatArray] = field(default_factory=dict)  # (n, 3) parking spaces by street
     _paths: dict[str, paths.Path] = field(default_factory=dict)
 
     def parked(self) -> FloatArray:

@@ -21,8 +21,7 @@ class Piece:
     length: float  # [m]
     start: float = 0.0  # curvature at the start [1/m]
     end: float = 0.0  # curvature at the end [1/m]
-    # (8,) aU bU cU dU aV bV cV dV over p in [0, 1]; empty for the others
-    cubic: tuple[float, ...] = ()
+    cubic: tuple[float, ...] = ()  # (8,) aU bU cU dU aV bV cV dV over p in [0, 1], or empty
 
     def xml(self) -> str:
         """The shape element."""
@@ -85,8 +84,7 @@ class RoadSpec:
     lanes: tuple[LaneSpec, ...]  # all lanes except the centre one
     limit_kmh: float  # speed limit [km/h]
     junction: int = -1  # junction id, -1 for none
-    # element type and id, contact point; None for none
-    predecessor: tuple[str, int, str] | None = None
+    predecessor: tuple[str, int, str] | None = None  # element type and id, contact point
     successor: tuple[str, int, str] | None = None  # likewise
     crosswalks: tuple[CrosswalkSpec, ...] = ()  # on this road
     stop_sign: float | None = None  # s of a stop sign for traffic against s; None for none [m]

@@ -44,7 +44,8 @@ class Traffic:
 
     def record(self, duration: float) -> list[Box]:
         """Simulate from time 0 and return the boxes of all frames."""
-        for number, agent in enumerate((*self.drivers, *self.walkers), start=1):
+        everybody: list[Driver | Walker] = [*self.drivers, *self.walkers]
+        for number, agent in enumerate(everybody, start=1):
             agent.token = number
         waiting = list(self.drivers)
         active: list[Driver] = []
@@ -98,13 +99,10 @@ class Traffic:
         for driver, zone in asking:
             if driver.v < 0.3 and _place_of(zone) in driver.waiting:
                 driver.patience -= DT
-            if (
-                driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
-                or driver.is_yielding(zone)
-                or driver.is_held_up(zone)
-                or any(self._conflict(zone, other) for other in refused)
-                or must_queue(driver, zone, drivers)
-            ):
+            is_far = driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
+            waits = driver.is_yielding(zone) or driver.is_held_up(zone)
+            refuses = any(self._conflict(zone, other) for other in refused)
+            if is_far or waits or refuses or must_queue(driver, zone, drivers):
                 continue
             if not any(self._is_in_the_way(d, driver, zone) for d in drivers if d is not driver):
                 driver.held.add(zone.id)

@@ -202,7 +202,12 @@ def read_recording(
     most = int(np.bincount(frame).max())
     if most > _MAX_AT_ONCE:
         raise ConversionError(f"{path}: {most} boxes in one frame, more than {_MAX_AT_ONCE}")
-    _refuse_duplicates(track_ids, frame_ids, track, frame, path)
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(frame) == 0))
+    if len(twice):
+        one = f"track_id {track_ids[track[twice[0]]]} occurs twice"
+        where = f"at frame_id {frame_ids[frame[twice[0]]]} ({len(twice)} such rows)"
+        hint = "one of the boxes belongs to another track; renumber it"
+        raise ConversionError(f"{path}: {one} {where}", hint)
 
     def matrix(keys: tuple[str, ...]) -> FloatArray:
         return np.stack([columns[key][order] for key in keys], axis=1)
@@ -305,19 +310,6 @@ def _frame_index(frame_ids: IntArray, wanted: IntArray, path: Path) -> IntArray:
         what = f"frame_id {int(wanted[~found][0])} is not listed in frames.parquet"
         raise ConversionError(f"{path}: {what} ({int((~found).sum())} such rows)")
     return index.astype(np.int64)
-
-
-def _refuse_duplicates(
-    track_ids: IntArray, frame_ids: IntArray, track: IntArray, frame: IntArray, path: Path
-) -> None:
-    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(frame) == 0))
-    if len(twice):
-        at = twice[0]
-        raise ConversionError(
-            f"{path}: track_id {track_ids[track[at]]} occurs twice at frame_id"
-            f" {frame_ids[frame[at]]} ({len(twice)} such rows)",
-            "one of the boxes belongs to another track; renumber it",
-        )
 
 
 def _track_sizes(

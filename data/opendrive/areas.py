@@ -130,13 +130,12 @@ def drivable_tiles(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]
             tiles.append(part)
             continue
         x, y, lap = 0.5 * (left + right), 0.5 * (bottom + top), 0.5 * _TILE_OVERLAP
-        halves = (
-            (shapely.box(left, bottom, x + lap, top), shapely.box(x - lap, bottom, right, top))
-            if right - left > top - bottom
-            else (shapely.box(left, bottom, right, y + lap), shapely.box(left, y - lap, right, top))
-        )
+        if right - left > top - bottom:
+            halves = (left, bottom, x + lap, top), (x - lap, bottom, right, top)
+        else:
+            halves = (left, bottom, right, y + lap), (left, y - lap, right, top)
         for half in halves:
-            waiting += _parts(shapely.intersection(part, half))
+            waiting += _parts(shapely.intersection(part, shapely.box(*half)))
     return sorted(tiles, key=lambda tile: tile.bounds)
 
 

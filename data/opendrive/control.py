@@ -95,8 +95,10 @@ def stop_lines(
         near = [i for i in near if polygons[lane].intersects(drawn[i])]
         near = [i for i in near if drawn[i].distance(box) < _NEAR_END]
         if near:
-            nearest = min(near, key=lambda i: drawn[i].distance(box))
-            box = shapely.intersection(_deepened(drawn[nearest]), polygons[lane])
+            line = drawn[min(near, key=lambda i: drawn[i].distance(box))]
+            if line.area <= 0.1:  # drawn without a depth
+                line = line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
+            box = shapely.intersection(line, polygons[lane])
         if (found or near) and (polygon := largest_part(box)).area > 0.01:
             control = next((c for c in (LIGHT, STOP, YIELD) if c in found), STOP)
             lines.append(StopLine(polygon, control, lane))
@@ -127,13 +129,6 @@ def _end_box(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     if back @ (left[-2] - left[-1]) < 0:
         back = -back
     return shapely.Polygon([left[-1], right[-1], right[-1] + back, left[-1] + back])
-
-
-def _deepened(line: shapely.Geometry) -> shapely.Geometry:
-    """A drawn line as an area: itself where it has one, else widened to the depth of a line."""
-    if line.area > 0.1:
-        return line
-    return line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
 
 
 def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:

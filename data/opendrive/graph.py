@@ -70,9 +70,8 @@ class ConnectorRun:
 class LaneGraph:
     """Lanes and connectors of the map."""
 
-    # lanes; those of one roadblock follow each other
-    lanes: list[LaneRun] = field(default_factory=list)
-    connectors: list[ConnectorRun] = field(default_factory=list)  # lane connectors
+    lanes: list[LaneRun] = field(default_factory=list)  # those of a roadblock follow each other
+    connectors: list[ConnectorRun] = field(default_factory=list)
     # drivable lanes that are part of neither: short, narrow, or dead ends in junctions
     dropped: list[Piece] = field(default_factory=list)
 

@@ -166,11 +166,8 @@ class _Linker:
             return
         if not incoming.sections or not connecting.sections:
             return
-        ends = [
-            end
-            for end, link in ((START, incoming.predecessor), (END, incoming.successor))
-            if link is not None and link.kind == "junction" and link.id == junction
-        ]
+        links = ((START, incoming.predecessor), (END, incoming.successor))
+        ends = [e for e, x in links if x and (x.kind, x.id) == ("junction", junction)]
         contact = connection.contact or nearer_end(incoming, (ends or [END])[0], connecting)
         end = ends[0] if len(ends) == 1 else nearer_end(connecting, contact, incoming)
         here, there = _end_section(incoming, end), _end_section(connecting, contact)

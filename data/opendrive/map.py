@@ -44,8 +44,7 @@ class MapReport:
 
     warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
     origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
-    # self-checks: name and whether the map passes
-    checks: dict[str, bool] = field(default_factory=dict)
+    checks: dict[str, bool] = field(default_factory=dict)  # self-checks: whether the map passes
     figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
 
 
@@ -79,7 +78,7 @@ def build_road_map(
 
 
 def _chains(graph: LaneGraph) -> list[list[Piece]]:
-    return [run.pieces for run in (*graph.lanes, *graph.connectors)]
+    return [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
 
 
 def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
@@ -303,22 +302,13 @@ class _Maker:
     def _areas(self) -> dict[str, list[AreaSpec]]:
         intersections = self._intersections()
         other = areas.lane_areas(self.od, self.shapes)
-        car_parks = areas.merge_areas(
-            [*other.parking, *areas.parking_spaces(self.od, self.shapes)], 0.5
-        )
-        dropped = [
-            lane_polygon(*self.shapes.borders(p)) for p in self.graph.dropped if p.length > 0.01
-        ]
-        drivable = areas.drivable_tiles(
-            [
-                *self.lane_polygons,
-                *self.connector_polygons,
-                *(spec.polygon for spec in intersections if spec.kind != PASS_THROUGH),
-                *other.paved,
-                *car_parks,
-                *dropped,
-            ]
-        )
+        spaces = areas.parking_spaces(self.od, self.shapes)
+        car_parks = areas.merge_areas([*other.parking, *spaces], 0.5)
+        pieces = [piece for piece in self.graph.dropped if piece.length > 0.01]
+        dropped = [lane_polygon(*self.shapes.borders(piece)) for piece in pieces]
+        edges = [*self.lane_polygons, *self.connector_polygons]
+        inner = [spec.polygon for spec in intersections if spec.kind != PASS_THROUGH]
+        drivable = areas.drivable_tiles([*edges, *inner, *other.paved, *car_parks, *dropped])
         return {
             "intersections": intersections,
             "stop_polygons": [

@@ -50,7 +50,7 @@ def read_opendrive(path: Path) -> OpenDrive:
 def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     """Like `read_opendrive`, from the bytes of a file."""
     reader = Reader(source)
-    header: Any = ("", ""), None, None  # revision, geoReference, offset
+    header: tuple[Any, str | None, Any] = (("", ""), None, None)  # revision, geoReference, offset
     roads: dict[str, Road] = {}
     seen: set[tuple[str, str]] = set()
     junctions: dict[str, records.Junction] = {}

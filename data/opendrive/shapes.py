@@ -254,12 +254,9 @@ def _sample_section(
 
 def _evaluate_section(road: Road, section: int, line: ReferenceLine, s: FloatArray) -> SectionShape:
     borders, poses = section_borders(road, section, s, repair=True), line.evaluate(s)
-    points = {id(t): poses.offset(t) for t in borders.inner.values()}
-    outer = {}
-    for number, t in borders.outer.items():
-        points.setdefault(id(t), poses.offset(t))
-        outer[number] = points[id(t)]
-    return SectionShape(s, {n: points[id(t)] for n, t in borders.inner.items()}, outer)
+    sides = borders.inner, borders.outer
+    points = {id(t): poses.offset(t) for side in sides for t in side.values()}
+    return SectionShape(s, *({n: points[id(t)] for n, t in side.items()} for side in sides))
 
 
 def _breakpoints(road: Road, section: int, begin: float, end: float) -> list[float]:
