@@ -88,12 +88,7 @@ def scenario(
 ) -> Scenario:
     """The scenario that a window shows. Its arrays are read-only.
 
-    Args:
-        recording: The recording, or a span of it that holds the window.
-        ego: States of the window's ego over (at least) the window.
-        window: The window.
-        road: Map of the recording.
-        offset: Row of the recording that is the first one of the span.
+    `recording` may be a span that holds the window and begins at row `offset` of the whole.
     """
     rows = slice(window.first_row - offset, window.last_row - offset)
     start = window.first_row - ego.first_row - offset
@@ -155,21 +150,11 @@ def listed_lights(lights: TrafficLights) -> TrafficLights:
 
 def freeze(scene: Scenario) -> None:
     """Make the arrays of a scenario read-only."""
-    tracks, lights = scene.tracks, scene.traffic_lights
-    for array in (
-        scene.time_us,
-        scene.ego,
-        scene.iteration_rows,
-        tracks.valid,
-        tracks.poses,
-        tracks.velocities,
-        tracks.sizes,
-        tracks.kinds,
-        lights.status,
-    ):
+    tracks, goal = scene.tracks, scene.mission_goal
+    arrays = [scene.time_us, scene.ego, scene.iteration_rows, scene.traffic_lights.status]
+    arrays += [tracks.valid, tracks.poses, tracks.velocities, tracks.sizes, tracks.kinds]
+    for array in arrays if goal is None else [*arrays, goal]:
         array.flags.writeable = False
-    if scene.mission_goal is not None:
-        scene.mission_goal.flags.writeable = False
 
 
 def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
@@ -228,16 +213,10 @@ def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: I
 
 @kernel
 def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
-    """Order tracks by kind, then as the frames list them, then by first appearance.
+    """(N,) indices of tracks by kind, then as the frames list them, then by first appearance.
 
-    Args:
-        before: (N, N) whether the first directly precedes the second in a frame.
-        kinds: (N,) type of each track.
-        first: (N,) frame in which each appears first.
-
-    Returns:
-        (N,) indices of the tracks in their new order. Where frames contradict each other, the
-        track that appears first comes first.
+    `before` (N, N) tells whether one directly precedes another in a frame, `first` (N,) the frame
+    in which each appears first, which decides where frames contradict each other.
     """
     num = len(kinds)
     waiting = np.zeros(num, np.int64)

@@ -35,8 +35,7 @@ class Driver:
     waiting: set[str] = field(default_factory=set)  # places it has begun to brake for
     patience: float = 6.0  # how long it will stand before others let it in [s]
     token: int = 0  # number of its track
-    # x [m], y [m], heading [rad] of its box centre
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y [m], heading [rad] of its centre
 
     def __post_init__(self) -> None:
         self.length, self.width, _ = SIZES[self.category]
@@ -68,10 +67,8 @@ class Driver:
 
     def next_zone(self) -> Zone | None:
         """The first zone ahead that it has not been admitted to."""
-        for zone in self.path.zones:
-            if zone.id not in self.held and self.is_before(zone):
-                return zone
-        return None
+        ahead = (z for z in self.path.zones if z.id not in self.held and self.is_before(z))
+        return next(ahead, None)
 
     def rank(self, zone: Zone) -> int:
         """Order of priority at a zone now, smallest first."""

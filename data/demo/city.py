@@ -33,6 +33,9 @@ _ROUTE = ("right", "straight", "left", "right", "straight")
 _TURNS = {"right": -1, "straight": 0, "left": 1}
 _LANES_OF = {"straight": (0, 1), "left": (0,), "right": (1,)}  # lanes that turn, left first
 
+# middle of all lanes that turn, to the right of a street, and half their width, in lanes
+_BLOCK_TURNS = {"straight": (1.0, 1.0), "left": (0.5, 0.5), "right": (1.5, 0.5)}
+
 
 @dataclass(frozen=True)
 class _Shape:
@@ -78,17 +81,12 @@ class _City:
     turns: list[tuple[_Street, str]]
     lines: dict[str, FloatArray] = field(default_factory=dict)
 
-    def block_between(self, source: _Street, turn: str) -> str:
-        """The roadblock connector of a turn."""
-        return str(20_000 + self.turns.index((source, turn)))
-
 
 def bench_scene(num_agents: int, seed: int) -> Scenario:
     """A 15 s scenario in a city of 5200 lanes, with 3 s of history and 8 s of future.
 
-    Args:
-        num_agents: Vehicles, pedestrians, bicycles and objects that start within 50 m of the ego.
-        seed: Of the agents; the city and the ego are always the same.
+    Vehicles, pedestrians, bicycles and objects start within 50 m of the ego, as the seed wants; the
+    city and the ego are always the same.
     """
     city = _city()
     road = _map(city)
@@ -130,7 +128,8 @@ def _city() -> _City:
 
 def _map(city: _City) -> VectorMap:
     """The map; fills the baselines of the city."""
-    links = _Links(defaultdict(list), defaultdict(list))
+    into: dict[str, list[str]] = defaultdict(list)  # connectors by the lane or block they lead to
+    out_of: dict[str, list[str]] = defaultdict(list)
     edges: list[EdgeSpec] = []
     blocks: list[BlockSpec] = []
     for street in city.streets.values():
@@ -144,7 +143,8 @@ def _map(city: _City) -> VectorMap:
             source, goal = street.lanes[index], target.lanes[index]
             shape = _turn_shape(street.direction, turn, index)
             city.lines[name] = shape.line + middle
-            links.add(source, name, goal)
+            into[goal].append(name)
+            out_of[source].append(name)
             edges.append(
                 _edge(
                     name,
@@ -159,9 +159,10 @@ def _map(city: _City) -> VectorMap:
                     turn_type={"straight": 0, "left": 1, "right": 2}[turn],
                 )
             )
-        area = _block_shape(street.direction, turn).area(middle)
+        area = _turn_shape(street.direction, turn, None).area(middle)
         blocks.append(BlockSpec(block, True, area, [street.block], [target.block], junction))
-        links.add(street.block, block, target.block)
+        into[target.block].append(block)
+        out_of[street.block].append(block)
     for street in city.streets.values():
         name, middle = street.block, _middle(street.node)
         left, right = street.lanes
@@ -173,8 +174,8 @@ def _map(city: _City) -> VectorMap:
                 middle,
                 is_connector=False,
                 baseline=city.lines[lane],
-                incoming=links.into[lane],
-                outgoing=links.out_of[lane],
+                incoming=into[lane],
+                outgoing=out_of[lane],
                 lane_index=index,
                 left_lane=left if index else None,
                 right_lane=None if index else right,
@@ -182,13 +183,13 @@ def _map(city: _City) -> VectorMap:
             for index, lane in enumerate(street.lanes)
         ]
         area = _lane_shape(street.direction, None).area(middle)
-        blocks.append(BlockSpec(name, False, area, links.into[name], links.out_of[name]))
-    junctions = []
+        blocks.append(BlockSpec(name, False, area, into[name], out_of[name]))
+    junctions, crosswalks = [], []
     for node in product(range(_NODES), repeat=2):
-        (cx, cy), half = _middle(node), _HALF
-        junctions.append(
-            AreaSpec(_junction(node), shapely.box(cx - half, cy - half, cx + half, cy + half))
-        )
+        (left, low), (right, high) = _middle(node) - _HALF, _middle(node) + _HALF
+        junctions.append(AreaSpec(_junction(node), shapely.box(left, low, right, high)))
+        box = shapely.box(left, low, left + 3.0, high)
+        crosswalks.append(AreaSpec(f"c{_junction(node)}", box))
     areas = [AreaSpec(f"d{b.id}", b.polygon) for b in blocks if not b.is_connector]
     return build_map(
         "bench-city",
@@ -196,21 +197,9 @@ def _map(city: _City) -> VectorMap:
         blocks=blocks,
         epsg=32_619,
         intersections=junctions,
-        crosswalks=[AreaSpec(f"c{j.id}", _crosswalk(j.polygon)) for j in junctions],
+        crosswalks=crosswalks,
         drivable_areas=[*areas, *(AreaSpec(f"d{j.id}", j.polygon) for j in junctions)],
     )
-
-
-class _Links(NamedTuple):
-    """What leads into an edge or block, and out of it, by its id."""
-
-    into: dict[str, list[str]]
-    out_of: dict[str, list[str]]
-
-    def add(self, source: str, name: str, goal: str) -> None:
-        """A connector from one to another."""
-        self.into[goal].append(name)
-        self.out_of[source].append(name)
 
 
 def _edge(name: str, block: str, shape: _Shape, middle: FloatArray, **rest: Any) -> EdgeSpec:
@@ -250,20 +239,13 @@ def _lane_shape(direction: int, index: int | None) -> _Shape:
 
 
 @cache
-def _turn_shape(direction: int, turn: str, index: int) -> _Shape:
-    """A connector through a junction from a street of some direction."""
-    return _between(direction, turn, (index + 0.5) * _WIDTH, 0.5 * _WIDTH)
+def _turn_shape(direction: int, turn: str, index: int | None) -> _Shape:
+    """A connector from a street of some direction; without an index, the whole roadblock.
 
-
-@cache
-def _block_shape(direction: int, turn: str) -> _Shape:
-    """All connectors of one turn from a street of some direction."""
-    center, half = {"straight": (1.0, 1.0), "left": (0.5, 0.5), "right": (1.5, 0.5)}[turn]
-    return _between(direction, turn, center * _WIDTH, half * _WIDTH)
-
-
-def _between(direction: int, turn: str, offset: float, half: float) -> _Shape:
-    """A quadratic Bezier curve through a junction, `offset` to the right of both streets."""
+    A quadratic Bezier curve through a junction, `offset` to the right of both streets.
+    """
+    center, share = _BLOCK_TURNS[turn] if index is None else (index + 0.5, 0.5)
+    offset, half = center * _WIDTH, share * _WIDTH
     target = (direction + _TURNS[turn]) % 4
     u, v = _HEADINGS[direction].astype(np.float64), _HEADINGS[target].astype(np.float64)
     a = -_HALF * u + offset * _to_right(direction)
@@ -278,11 +260,6 @@ def _between(direction: int, turn: str, offset: float, half: float) -> _Shape:
     return _Shape(line, (line + half * normal)[every], (line - half * normal)[every])
 
 
-def _crosswalk(junction: shapely.Polygon) -> shapely.Polygon:
-    x, y, _, high = junction.bounds
-    return shapely.box(x, y, x + 3.0, high)
-
-
 def _ego_path(city: _City) -> tuple[FloatArray, tuple[str, ...]]:
     """Centre line of the ego's way from the middle of the city, and its route."""
     street = city.streets[(_NODES // 2, _NODES // 2), 0]
@@ -292,7 +269,7 @@ def _ego_path(city: _City) -> tuple[FloatArray, tuple[str, ...]]:
         following = city.streets[street.after(turn)]
         shape = _turn_shape(street.direction, turn, index)
         parts += [shape.line + _middle(street.end), city.lines[following.lanes[index]]]
-        route += [city.block_between(street, turn), following.block]
+        route += [str(20_000 + city.turns.index((street, turn))), following.block]
         street = following
     return np.concatenate(parts), tuple(route)
 
@@ -306,24 +283,20 @@ def _drive(path: FloatArray, rows: int) -> FloatArray:
     weights /= weights.sum()
     ends = np.concatenate([np.repeat(dense[:1], 20, 0), dense, np.repeat(dense[-1:], 20, 0)])
     local = ends - dense[0]
-    smooth = dense[0] + np.column_stack(
-        [np.convolve(local[:, k], weights, "valid") for k in (0, 1)]
-    )
+    smooth = dense[0] + np.column_stack([np.convolve(x, weights, "valid") for x in local.T])
     step = np.gradient(smooth, 0.25, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     bend = np.abs(np.gradient(heading, 0.25))
     speed = np.minimum(9.0, np.sqrt(1.8 / np.maximum(bend, 1e-3)))
-    for order in (range(len(speed) - 2, -1, -1), range(1, len(speed))):
-        towards = 1 if order.step == -1 else -1
+    for order, towards in ((range(len(speed) - 2, -1, -1), 1), (range(1, len(speed)), -1)):
         for index in order:
             speed[index] = min(speed[index], np.sqrt(speed[index + towards] ** 2 + 2 * 1.0 * 0.25))
     time = np.r_[0.0, np.cumsum(0.5 / (speed[1:] + speed[:-1]))]
     clock = np.arange(rows) * ROW_S
     s = np.interp(clock, time, at)
     poses = np.column_stack([np.interp(s, at, column) for column in (*smooth.T, heading)])
-    velocity = np.interp(s, at, speed)[:, None] * np.column_stack(
-        [np.cos(poses[:, 2]), np.sin(poses[:, 2])]
-    )
+    along = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    velocity = np.interp(s, at, speed)[:, None] * along
     poses[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return ego_states(poses, velocity)
 
@@ -347,17 +320,12 @@ _SORTS = {
 
 
 def _agents(
-    count: int,
-    rng: np.random.Generator,
-    ego: FloatArray,
-    start: int,
-    lines: list[FloatArray],
+    count: int, rng: np.random.Generator, ego: FloatArray, start: int, lines: list[FloatArray]
 ) -> Tracks:
     """Agents that start near the ego and keep clear of its recorded way."""
     here = ego[start, :2]
-    near = [
-        line for line in lines if np.abs(line[len(line) // 2] - here).max() < _RADIUS + _SPACING
-    ]
+    reach = _RADIUS + _SPACING
+    near = [line for line in lines if np.abs(line[len(line) // 2] - here).max() < reach]
     shares = [sort.share for sort in _SORTS.values()]
     kinds = rng.choice(np.array([*map(int, _SORTS)]), count, p=shares).astype(np.int64)
     rows = len(ego)

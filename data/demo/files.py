@@ -20,11 +20,7 @@ _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleratio
 
 
 def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
-
-    Args:
-        folder: Where the folders of the towns go; made if needed.
-    """
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes."""
     for site in demo_sites():
         _write_site(folder / site.name, site)
 
@@ -39,6 +35,7 @@ def _write_site(folder: Path, site: DemoSite) -> None:
         table = _annotations(boxes, town.parked())
         categories |= set(table["category"].combine_chunks().dictionary.to_pylist())
         _write_recording(folder / "annotations" / scene.name, scene, table)
+    place = {"latitude": site.latitude, "longitude": site.longitude}
     meta = {
         "dataset_name": f"shiftsim demo {site.name}",
         "dataset_version": "1",
@@ -47,25 +44,13 @@ def _write_site(folder: Path, site: DemoSite) -> None:
         "frame_rate": _FRAME_RATE,
         "frame_distance": _FRAME_DISTANCE,
         "categories": sorted(categories),
-        "locations": [
-            {
-                "id": 1,
-                "latitude": site.latitude,
-                "longitude": site.longitude,
-                "recordings": [scene.name for scene in site.scenes],
-            }
-        ],
+        "locations": [{"id": 1, **place, "recordings": [scene.name for scene in site.scenes]}],
     }
     (folder / "data_meta.json").write_text(json.dumps(meta, indent=2) + "\n", encoding="utf-8")
 
 
 def _annotations(boxes: list[Box], parked: FloatArray) -> pa.Table:
-    """Rows of `annotations.parquet`, by frame and track.
-
-    Args:
-        boxes: Everybody who moves.
-        parked: (n, 3) poses of parked cars, which are there at every frame.
-    """
+    """Rows of `annotations.parquet`, by frame and track; cars parked at (n, 3) stay throughout."""
     names = sorted({*(box[2] for box in boxes), *(("car", "van") if len(parked) else ())})
     moving = np.array([(*box[:2], names.index(box[2]), *box[3:]) for box in boxes])
     rows = np.concatenate([moving, _parked_rows(moving, parked, names)])
@@ -112,13 +97,9 @@ def _write_recording(folder: Path, scene: Scene, table: pa.Table) -> None:
     frames = np.arange(round(scene.duration / DT) + 1)
     start = int(datetime.fromisoformat(scene.start + "+00:00").timestamp()) * 1_000_000
     stamps = start + np.rint(frames * _FRAME_DISTANCE / _FRAME_RATE * 1e6).astype(np.int64)
-    times = pa.table(
-        {
-            "frame_id": pa.array(_FRAME_DISTANCE * frames, pa.uint32()),
-            "time": pa.array(stamps, pa.timestamp("us", "UTC")),
-        }
-    )
-    _write(times, folder / "frames.parquet")
+    ids = pa.array(_FRAME_DISTANCE * frames, pa.uint32())
+    times = pa.array(stamps, pa.timestamp("us", "UTC"))
+    _write(pa.table({"frame_id": ids, "time": times}), folder / "frames.parquet")
 
 
 def _write(table: pa.Table, path: Path) -> None:

@@ -7,20 +7,13 @@ changes lanes on the way, `lot@7` ends in parking space 7 of `lot`, `-bicycle` k
 
 import re
 from dataclasses import dataclass, field, replace
+from itertools import permutations, product
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.demo import paths
-from shiftsim.data.demo.roads import (
-    CrosswalkSpec,
-    LaneSpec,
-    Link,
-    Piece,
-    RoadNetwork,
-    RoadSpec,
-    connect,
-)
+from shiftsim.data.demo.roads import CrosswalkSpec, LaneSpec, Piece, RoadNetwork, RoadSpec, connect
 
 _CLOSE = 2.9  # m between the centres of connecting roads that conflict
 _LANE_CHANGE = 45.0  # m
@@ -43,17 +36,14 @@ class Street:
     is_main: bool = True  # whether it has priority
     junctions: tuple[int, int] = (0, 0)  # at its begin and its end, 0 for none
     stop: float = 9.0  # how far before a junction vehicles wait [m]
-    # first and last s of the places where pedestrians cross [m]
-    crossings: tuple[tuple[float, float], ...] = ()
+    crossings: tuple[tuple[float, float], ...] = ()  # first and last s of places to cross [m]
     is_marked: bool = True  # whether these are crosswalks of the map
     parking: float = 0.0  # width of the strip for parking on both sides, diagonal above 3 m [m]
-    # first and last s of stretches with parked cars [m]
-    stalls: tuple[tuple[float, float], ...] = ()
+    stalls: tuple[tuple[float, float], ...] = ()  # first and last s of parked cars [m]
     empty: tuple[int, ...] = ()  # numbers of the parking spaces that are free
     sidewalk: float = 3.0  # width, 0 for none [m]
     has_stop_sign: bool = False  # at its begin
-    # first and last s of a place where vehicles cannot meet [m]
-    narrow: tuple[float, float] | None = None
+    narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
 
     @property
     def half(self) -> float:
@@ -66,29 +56,22 @@ class Street:
 
     def road(self) -> RoadSpec:
         """The same as a road of the map."""
-        lanes = [("driving", self.width)] * self.lanes
-        lanes += [("parking", self.parking)] if self.parking > 0.0 else []
-        lanes += [("sidewalk", self.sidewalk)] if self.sidewalk > 0.0 else []
-        ends = [("junction", x, "") if x else None for x in self.junctions]
-        return RoadSpec(
-            self.id,
-            self.start,
-            self.pieces,
-            tuple(
-                LaneSpec(sign * number, kind, width)
-                for sign in ((-1,) if self.is_one_way else (1, -1))
-                for number, (kind, width) in enumerate(lanes, start=1)
-            ),
-            self.limit,
-            predecessor=ends[0],
-            successor=ends[1],
-            crosswalks=tuple(
-                CrosswalkSpec(self.crossing_name(number), *ends, self.half)
-                for number, ends in enumerate(self.crossings)
-                if self.is_marked
-            ),
-            stop_sign=self.stop if self.has_stop_sign else None,
+        strips = [("driving", self.width)] * self.lanes
+        strips += [("parking", self.parking)] if self.parking > 0.0 else []
+        strips += [("sidewalk", self.sidewalk)] if self.sidewalk > 0.0 else []
+        lanes = tuple(
+            LaneSpec(sign * number, kind, width, width)
+            for sign in ((-1,) if self.is_one_way else (1, -1))
+            for number, (kind, width) in enumerate(strips, start=1)
         )
+        before, after = (("junction", x, "") if x else None for x in self.junctions)
+        road = RoadSpec(self.id, self.start, self.pieces, lanes, self.limit, -1, before, after)
+        walks = [
+            CrosswalkSpec(self.crossing_name(number), *ends, self.half)
+            for number, ends in enumerate(self.crossings if self.is_marked else ())
+        ]
+        sign = self.stop if self.has_stop_sign else None
+        return replace(road, crosswalks=tuple(walks), stop_sign=sign)
 
 
 @dataclass(frozen=True)
@@ -101,12 +84,12 @@ class Leg:
     @property
     def leaves(self) -> int:
         """Junction it comes from."""
-        return self.street.junctions[0 if self.is_forward else 1]
+        return self.street.junctions[not self.is_forward]
 
     @property
     def enters(self) -> int:
         """Junction it leads to."""
-        return self.street.junctions[1 if self.is_forward else 0]
+        return self.street.junctions[self.is_forward]
 
     def pose(self, road: RoadSpec, lane: int, *, at_end: bool) -> FloatArray:
         """(3,) left border of a lane where the leg begins or ends."""
@@ -135,8 +118,7 @@ class Town:
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
     walks: dict[str, paths.Walk] = field(default_factory=dict)  # by name
-    # (n, 3) poses of parking spaces by street
-    bays: dict[str, FloatArray] = field(default_factory=dict)
+    bays: dict[str, FloatArray] = field(default_factory=dict)  # (n, 3) parking spaces by street
     _paths: dict[str, paths.Path] = field(default_factory=dict)
 
     def parked(self) -> FloatArray:
@@ -162,21 +144,19 @@ def build_town(name: str, streets: tuple[Street, ...]) -> Town:
     for street in streets:
         town.network.roads[street.id] = street.road()
     lines: dict[int, FloatArray] = {}
-    for source in legs:
-        for target in legs:
-            meet = source.enters and source.enters == target.leaves
-            if meet and source.street is not target.street:
-                _connect(town, source, target, lines)
-    starts = {link.connecting: (link.incoming, link.from_lane) for link in town.network.links}
-    for a, line_a in lines.items():
-        for b, line_b in lines.items():
-            same = town.network.roads[a].junction == town.network.roads[b].junction
-            if a != b and same and starts[a] != starts[b] and _closest(line_a, line_b) < _CLOSE:
-                town.conflicts.add((a, b))
+    for source, target in product(legs, legs):
+        meet = source.enters and source.enters == target.leaves
+        if meet and source.street is not target.street:
+            _connect(town, source, target, lines)
+    starts = {number: (street, lane) for street, number, lane in town.network.links}
+    for a, b in permutations(lines, 2):
+        same = town.network.roads[a].junction == town.network.roads[b].junction
+        if same and starts[a] != starts[b] and _closest(lines[a], lines[b]) < _CLOSE:
+            town.conflicts.add((a, b))
     for street in streets:
         if street.narrow:
-            town.conflicts |= {(-2 * street.id, -2 * street.id - 1)}
-            town.conflicts |= {(-2 * street.id - 1, -2 * street.id)}
+            one, other = -2 * street.id, -2 * street.id - 1
+            town.conflicts |= {(one, other), (other, one)}
     return town
 
 
@@ -205,7 +185,7 @@ def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray])
             successor=("road", b.id, "start" if target.is_forward else "end"),
         )
         roads[number] = road
-        town.network.links.append(Link(a.id, number, incoming))
+        town.network.links.append((a.id, number, incoming))
         town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
         lines[number] = road.center_of(-1, np.arange(0.0, road.length, paths.STEP))[:, :2]
 
@@ -248,16 +228,14 @@ def _make_way(town: Town, way: str) -> paths.Path:
         if number < len(steps) - 1:
             following = re.split(r"[\d>@]", names[number + 1])[0]
             connector, to_lane = town.connectors[leg.enters, street.name, lane, following]
-            target = Leg(
-                town.streets[following], leg.enters == town.streets[following].junctions[0]
-            )
+            onward = town.streets[following]
+            target = Leg(onward, leg.enters == onward.junctions[0])
             inner = town.network.roads[connector]
-            rank = 0 if street.is_main else 2
-            if _turn(town, leg, target) > 0.5 and not street.is_one_way:
-                rank += 1
+            is_left = _turn(town, leg, target) > 0.5 and not street.is_one_way
+            rank = (0 if street.is_main else 2) + is_left
             points = inner.center_of(-1, np.arange(0.0, inner.length, paths.STEP))[:, :2]
             parts.append(points)
-            limits.append(min(street.limit, target.street.limit))
+            limits.append(min(street.limit, onward.limit))
             zone = paths.Zone(connector, 0.0, 0.0, 0.0, rank, origin)
             zones.append((zone, points[0], points[-1], street.stop))
             lane, is_forward = to_lane, target.is_forward
@@ -275,11 +253,10 @@ def _with_places(
     """A path with its zones and crossings, narrow places driven past with care."""
     arc = paths.STEP * np.arange(len(path.points))
     aside, speed = np.zeros(len(arc)), path.speed
-    places = []
+    places, made = [], []
     for name, *ends in crossings:
         first, last = sorted(paths.arc_at(path.points, end) for end in ends)
         places.append((name, first, last))
-    made = []
     for zone, begin, end, stop in zones:
         entry, leave = paths.arc_at(path.points, begin), paths.arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
@@ -296,9 +273,9 @@ def _with_places(
 
 
 def _narrow_zone(leg: Leg) -> paths.Zone:
-    number = -2 * leg.street.id - int(leg.is_forward)
+    number = -2 * leg.street.id - leg.is_forward
     name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
-    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - int(leg.is_forward), name)
+    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - leg.is_forward, name)
 
 
 def _ends(

@@ -76,12 +76,7 @@ class Walk(_Line):
 
 
 def make_path(parts: Sequence[FloatArray], limits_kmh: Sequence[float]) -> Path:
-    """A path along lane centres, with comfortable speeds and no zones yet.
-
-    Args:
-        parts: (n, 2) points `STEP` apart, one array per road [m].
-        limits_kmh: Speed limit of every part [km/h].
-    """
+    """A path along lane centres (n, 2) [m], with comfortable speeds and no zones yet."""
     points = resample(np.concatenate(parts), _SMOOTHING)
     arc = STEP * np.arange(len(points))
     edges = np.cumsum([STEP * len(part) for part in parts])
@@ -129,10 +124,9 @@ def resample(xy: FloatArray, smoothing: float) -> FloatArray:
     smooth = np.column_stack([np.convolve(padded[:, k], weights, "valid") for k in (0, 1)])
     arc = np.r_[0.0, np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))]
     at = np.arange(0.0, arc[-1], STEP)
-    out = np.column_stack([np.interp(at, arc, smooth[:, 0]), np.interp(at, arc, smooth[:, 1])])
     tangent = np.gradient(smooth, fine, axis=0)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    return np.column_stack([out, np.interp(at, arc, heading)])
+    return np.column_stack([np.interp(at, arc, column) for column in (*smooth.T, heading)])
 
 
 def arc_at(points: FloatArray, xy: FloatArray) -> float:

@@ -21,8 +21,7 @@ class Piece:
     length: float  # [m]
     start: float = 0.0  # curvature at the start [1/m]
     end: float = 0.0  # curvature at the end [1/m]
-    # (8,) aU bU cU dU aV bV cV dV over p in [0, 1]; empty for the others
-    cubic: tuple[float, ...] = ()
+    cubic: tuple[float, ...] = ()  # (8,) aU bU cU dU aV bV cV dV over p in [0, 1], or empty
 
     def xml(self) -> str:
         """The shape element."""
@@ -47,25 +46,20 @@ def arc(length: float, curvature: float) -> Piece:
     return Piece(length, curvature, curvature)
 
 
-def spiral(length: float, start: float, end: float) -> Piece:
-    """A clothoid."""
-    return Piece(length, start, end)
-
-
 def bend(angle: float, curvature: float, easing: float) -> list[Piece]:
     """Clothoid, arc, clothoid that turn by `angle` (both with a sign) [rad]."""
     rest = abs(angle / curvature) - easing
-    return [spiral(easing, 0.0, curvature), arc(rest, curvature), spiral(easing, curvature, 0.0)]
+    return [Piece(easing, 0.0, curvature), arc(rest, curvature), Piece(easing, curvature, 0.0)]
 
 
 @dataclass(frozen=True)
 class LaneSpec:
-    """One lane of a road: width at both ends and type."""
+    """One lane of a road: type, width at both ends [m], lanes before and after."""
 
     id: int
     type: str
     width: float
-    end_width: float | None = None
+    end_width: float
     predecessor: int | None = None
     successor: int | None = None
 
@@ -90,8 +84,7 @@ class RoadSpec:
     lanes: tuple[LaneSpec, ...]  # all lanes except the centre one
     limit_kmh: float  # speed limit [km/h]
     junction: int = -1  # junction id, -1 for none
-    # element type and id, contact point; None for none
-    predecessor: tuple[str, int, str] | None = None
+    predecessor: tuple[str, int, str] | None = None  # element type and id, contact point
     successor: tuple[str, int, str] | None = None  # likewise
     crosswalks: tuple[CrosswalkSpec, ...] = ()  # on this road
     stop_sign: float | None = None  # s of a stop sign for traffic against s; None for none [m]
@@ -120,23 +113,13 @@ class RoadSpec:
         """(n, 3) centre of a lane at s; the heading is that of the road."""
         share = s / self.length
 
-        def width(spec: LaneSpec) -> FloatArray:
-            end = spec.width if spec.end_width is None else spec.end_width
-            return spec.width + share * (end - spec.width)
-
-        side = [spec for spec in self.lanes if spec.id * lane > 0]
-        inner = sum((width(x) for x in side if abs(x.id) < abs(lane)), np.zeros(len(s)))
-        own = next(width(x) for x in side if x.id == lane)
+        inner, own = np.zeros(len(s)), np.zeros(len(s))
+        for spec in self.lanes:
+            width = spec.width + share * (spec.end_width - spec.width)
+            if spec.id * lane > 0 and abs(spec.id) < abs(lane):
+                inner = inner + width
+            own = width if spec.id == lane else own
         return self.at(s, np.sign(lane) * (inner + 0.5 * own))
-
-
-@dataclass(frozen=True)
-class Link:
-    """One connection of a junction: a lane of an incoming road into a connecting road."""
-
-    incoming: int
-    connecting: int
-    from_lane: int
 
 
 @dataclass
@@ -145,40 +128,33 @@ class RoadNetwork:
 
     name: str
     roads: dict[int, RoadSpec] = field(default_factory=dict)
-    links: list[Link] = field(default_factory=list)
+    # connections of junctions: incoming road, connecting road, lane of the incoming road
+    links: list[tuple[int, int, int]] = field(default_factory=list)
 
     def xml(self) -> str:
         """The OpenDRIVE file."""
         parts = [
-            '<?xml version="1.0" encoding="UTF-8"?>',
-            "<OpenDRIVE>",
+            '<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>',
             f'<header revMajor="1" revMinor="7" name="{self.name}" version="1"/>',
             *(_road_xml(road) for road in self.roads.values()),
         ]
-        for junction in sorted({self.junction_of(link) for link in self.links}):
+        for junction in sorted({self.roads[road].junction for _, road, _ in self.links}):
             parts.append(f'<junction id="{junction}" name="{self.name}{junction}">')
-            inside = (link for link in self.links if self.junction_of(link) == junction)
-            for number, link in enumerate(inside):
+            inside = (link for link in self.links if self.roads[link[1]].junction == junction)
+            for number, (incoming, connecting, lane) in enumerate(inside):
                 parts.append(
-                    f'<connection id="{number}" incomingRoad="{link.incoming}" '
-                    f'connectingRoad="{link.connecting}" contactPoint="start">'
-                    f'<laneLink from="{link.from_lane}" to="-1"/></connection>'
+                    f'<connection id="{number}" incomingRoad="{incoming}" '
+                    f'connectingRoad="{connecting}" contactPoint="start">'
+                    f'<laneLink from="{lane}" to="-1"/></connection>'
                 )
             parts.append("</junction>")
         return "\n".join([*parts, "</OpenDRIVE>", ""])
-
-    def junction_of(self, link: Link) -> int:
-        """Id of the junction a link belongs to."""
-        return self.roads[link.connecting].junction
 
 
 def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tuple[Piece, ...]:
     """Pieces from one pose to another: a line, a turn, or a cubic where neither fits.
 
-    Args:
-        start: x [m], y [m], heading [rad].
-        end: x [m], y [m], heading [rad].
-        ease: Whether a turn is clothoid-arc-clothoid rather than line-arc-line.
+    A turn is clothoid-arc-clothoid with `ease`, else line-arc-line.
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     cos, sin = np.cos(start[2]), np.sin(start[2])
@@ -193,18 +169,14 @@ def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tupl
     tangent = float(min(before, after))
     shape = _turn(turn, tangent, ease)
     head, tail = float(before) - tangent, float(after) - tangent
-    return (
-        *((line(head),) if head > 1e-6 else ()),
-        *shape,
-        *((line(tail),) if tail > 1e-6 else ()),
-    )
+    return tuple(piece for piece in (line(head), *shape, line(tail)) if piece.length > 1e-6)
 
 
 def _turn(turn: float, tangent: float, ease: bool) -> list[Piece]:
     if not ease:
         radius = tangent / np.tan(abs(turn) / 2)
         return [arc(float(radius * abs(turn)), float(np.sign(turn) / radius))]
-    unit = [spiral(1.0, 0.0, turn / 2), arc(1.0, turn / 2), spiral(1.0, turn / 2, 0.0)]
+    unit = [Piece(1.0, 0.0, turn / 2), arc(1.0, turn / 2), Piece(1.0, turn / 2, 0.0)]
     pose = (0.0, 0.0, 0.0)
     for piece in unit:
         pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
@@ -216,17 +188,9 @@ def _cubic(u: float, v: float, turn: float) -> Piece:
     """A Hermite cubic from the origin along u to (u, v), turned by `turn`."""
     reach = float(np.hypot(u, v))
     end_u, end_v = reach * np.cos(turn), reach * np.sin(turn)
-    coefficients = (
-        0.0,
-        reach,
-        float(3 * u - 2 * reach - end_u),
-        float(reach + end_u - 2 * u),
-        0.0,
-        0.0,
-        float(3 * v - end_v),
-        float(end_v - 2 * v),
-    )
-    return Piece(float(_cubic_arc(coefficients)[1][-1]), cubic=coefficients)
+    along = (0.0, reach, float(3 * u - 2 * reach - end_u), float(reach + end_u - 2 * u))
+    aside = (0.0, 0.0, float(3 * v - end_v), float(end_v - 2 * v))
+    return Piece(float(_cubic_arc(along + aside)[1][-1]), cubic=along + aside)
 
 
 def _cubic_arc(c: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
@@ -246,10 +210,8 @@ def _along(piece: Piece, pose: Sequence[float], d: FloatArray) -> FloatArray:
         p_grid, arc_grid = _cubic_arc(piece.cubic)
         p = np.interp(d, arc_grid, p_grid)
         c = piece.cubic
-        u, v = (
-            c[0] + p * (c[1] + p * (c[2] + p * c[3])),
-            c[4] + p * (c[5] + p * (c[6] + p * c[7])),
-        )
+        u = c[0] + p * (c[1] + p * (c[2] + p * c[3]))
+        v = c[4] + p * (c[5] + p * (c[6] + p * c[7]))
         turn = np.arctan2(
             c[5] + p * (2 * c[6] + 3 * p * c[7]), c[1] + p * (2 * c[2] + 3 * p * c[3])
         )
@@ -283,8 +245,9 @@ def _road_xml(road: RoadSpec) -> str:
         for name, end in (("predecessor", road.predecessor), ("successor", road.successor))
         if end
     )
-    left = "".join(_lane_xml(x, road) for x in sorted(road.lanes, key=lambda x: -x.id) if x.id > 0)
-    right = "".join(_lane_xml(x, road) for x in sorted(road.lanes, key=lambda x: -x.id) if x.id < 0)
+    lanes = sorted(road.lanes, key=lambda lane: -lane.id)
+    left = "".join(_lane_xml(lane, road) for lane in lanes if lane.id > 0)
+    right = "".join(_lane_xml(lane, road) for lane in lanes if lane.id < 0)
     return (
         f'<road id="{road.id}" length="{road.length!r}" junction="{road.junction}" rule="RHT">'
         f"<link>{ends}</link>"
@@ -299,16 +262,15 @@ def _road_xml(road: RoadSpec) -> str:
 
 
 def _lane_xml(lane: LaneSpec, road: RoadSpec) -> str:
-    end = lane.width if lane.end_width is None else lane.end_width
     links = "".join(
         f'<{name} id="{target}"/>'
         for name, target in (("predecessor", lane.predecessor), ("successor", lane.successor))
         if target is not None
     )
+    slope = (lane.end_width - lane.width) / road.length
     return (
         f'<lane id="{lane.id}" type="{lane.type}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{lane.width!r}" b="{(end - lane.width) / road.length!r}" '
-        'c="0" d="0"/></lane>'
+        f'<width sOffset="0" a="{lane.width!r}" b="{slope!r}" c="0" d="0"/></lane>'
     )
 
 
@@ -317,13 +279,8 @@ def _objects_xml(road: RoadSpec) -> str:
     for walk in road.crosswalks:
         half = 0.5 * (walk.last - walk.first)
         corners = "".join(
-            f'<cornerLocal u="{u!r}" v="{v!r}" z="0" height="0"/>'
-            for u, v in (
-                (-half, -walk.half),
-                (half, -walk.half),
-                (half, walk.half),
-                (-half, walk.half),
-            )
+            f'<cornerLocal u="{u * half!r}" v="{v * walk.half!r}" z="0" height="0"/>'
+            for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
         )
         objects.append(
             f'<object id="{walk.name}" type="crosswalk" name="{walk.name}" '

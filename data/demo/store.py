@@ -37,14 +37,7 @@ def convert_demo(recordings: Path, store: Path) -> list[ConversionReport]:
 
 
 def demo_store(path: Path) -> Path:
-    """The store of the demo; made anew unless it is there.
-
-    Args:
-        path: Folder of the store.
-
-    Returns:
-        The same path.
-    """
+    """The store of the demo at `path`, which is returned; made anew unless it is there."""
     if (path / "store.json").is_file():
         return path
     with tempfile.TemporaryDirectory(prefix="shiftsim-demo-") as scratch:

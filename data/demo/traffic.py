@@ -12,14 +12,7 @@ from math import cos, inf, sin, sqrt
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.demo.agents import (
-    WALKING,
-    Driver,
-    Walker,
-    goes_first,
-    has_room,
-    must_queue,
-)
+from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
 from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.paths import STEP, Zone, arc_at
 
@@ -51,10 +44,9 @@ class Traffic:
 
     def record(self, duration: float) -> list[Box]:
         """Simulate from time 0 and return the boxes of all frames."""
-        for number, driver in enumerate(self.drivers, start=1):
-            driver.token = number
-        for number, walker in enumerate(self.walkers, start=len(self.drivers) + 1):
-            walker.token = number
+        everybody: list[Driver | Walker] = [*self.drivers, *self.walkers]
+        for number, agent in enumerate(everybody, start=1):
+            agent.token = number
         waiting = list(self.drivers)
         active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):
@@ -107,13 +99,10 @@ class Traffic:
         for driver, zone in asking:
             if driver.v < 0.3 and _place_of(zone) in driver.waiting:
                 driver.patience -= DT
-            if (
-                driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
-                or driver.is_yielding(zone)
-                or driver.is_held_up(zone)
-                or any(self._conflict(zone, other) for other in refused)
-                or must_queue(driver, zone, drivers)
-            ):
+            is_far = driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
+            waits = driver.is_yielding(zone) or driver.is_held_up(zone)
+            refuses = any(self._conflict(zone, other) for other in refused)
+            if is_far or waits or refuses or must_queue(driver, zone, drivers):
                 continue
             if not any(self._is_in_the_way(d, driver, zone) for d in drivers if d is not driver):
                 driver.held.add(zone.id)
@@ -122,12 +111,11 @@ class Traffic:
                 refused.append(zone)
 
     def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
-        for zone in other.path.zones:
-            if self._conflict(wanted, zone) and (
-                zone.id in other.held or goes_first(other, zone, driver, wanted)
-            ):
-                return True
-        return False
+        return any(
+            zone.id in other.held or goes_first(other, zone, driver, wanted)
+            for zone in other.path.zones
+            if self._conflict(wanted, zone)
+        )
 
     def _conflict(self, a: Zone, b: Zone) -> bool:
         return (a.id, b.id) in self.town.conflicts

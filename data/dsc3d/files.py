@@ -61,19 +61,15 @@ def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
         values = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=False)
     except (pa.ArrowException, ValueError, TypeError) as error:
         raise ConversionError(f"{path}: column {key!r} is {column.type}, need numbers") from error
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise ConversionError(
-            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]:g} is not a finite number"
-            f" ({len(bad)} such values)",
-            "repair or delete the rows; no position can be made up",
-        )
     largest = _LARGEST.get(key, np.inf)
-    bad = np.flatnonzero(np.abs(values) > largest)
+    bad = np.flatnonzero(~np.isfinite(values))
+    what, hint = "not a finite number", "repair or delete the rows; no position can be made up"
+    if not len(bad):
+        bad = np.flatnonzero(np.abs(values) > largest)
+        what = f"beyond ±{largest:g}"
+        hint = "check the unit of the column, and that the file is whole"
     if len(bad):
-        raise ConversionError(
-            f"{path}: column {key!r}, row {bad[0]}: {values[bad[0]]:g} is beyond ±{largest:g}"
-            f" ({len(bad)} such values)",
-            "check the unit of the column, and that the file is whole",
-        )
+        place = f"{path}: column {key!r}, row {bad[0]}"
+        value = f"{values[bad[0]]:g} is {what} ({len(bad)} such values)"
+        raise ConversionError(f"{place}: {value}", hint)
     return values

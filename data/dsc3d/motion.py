@@ -18,13 +18,9 @@ _EPS = 1e-9  # s
 
 
 def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Yaw, pitch and roll of rotation vectors, and where they turn the z axis.
+    """(A, 3) yaw, pitch, roll [rad] and (A, 3) unit vectors along the height of objects.
 
-    Args:
-        rotation: (A, 3) axis times angle, object to local frame [rad].
-
-    Returns:
-        (A, 3) yaw, pitch, roll [rad], and (A, 3) unit vector along the height of the object.
+    `rotation` is (A, 3) axis times angle, object to local frame [rad].
     """
     angle = np.linalg.norm(rotation, axis=1)
     x, y, z = rotation.T
@@ -39,21 +35,13 @@ def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def believed_velocities(
-    stored: FloatArray | None,
-    xy: FloatArray,
-    time: FloatArray,
-    track: IntArray,
+    stored: FloatArray | None,  # (A, 2) as recorded, None where the file has none [m/s]
+    xy: FloatArray,  # (A, 2) [m]
+    time: FloatArray,  # (A,) [s]
+    track: IntArray,  # (A,) track of the row
     warnings: Counter[str],
 ) -> FloatArray:
-    """Stored velocities of the tracks where they fit the positions (nuPlan rule 459), else derived.
-
-    Args:
-        stored: (A, 2) as recorded, None where the file has none [m/s].
-        xy: (A, 2) positions [m].
-        time: (A,) [s].
-        track: (A,) track of the row.
-        warnings: Counts, added to.
-    """
+    """Stored velocities where they fit the positions (nuPlan rule 459), else derived ones."""
     derived = _central_differences(xy, time, track)
     if stored is None:
         warnings["tracks without stored velocity (derived)"] += int(track[-1]) + 1

@@ -16,14 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.dsc3d.files import (
-    DIMENSION,
-    POSITION,
-    ROTATION,
-    VELOCITY,
-    numbers,
-    read_table,
-)
+from shiftsim.data.dsc3d.files import DIMENSION, POSITION, ROTATION, VELOCITY, numbers, read_table
 from shiftsim.data.dsc3d.motion import (
     believed_velocities,
     held_headings,
@@ -123,9 +116,8 @@ def open_site(src: Path) -> Site:
     Raises:
         ConversionError: The file is missing, not JSON, without a key or of another major version.
     """
-    found = [
-        d for d in (src, src / "data", src / "release/data") if (d / "data_meta.json").exists()
-    ]
+    folders = (src, src / "data", src / "release/data")
+    found = [folder for folder in folders if (folder / "data_meta.json").exists()]
     if not found:
         raise ConversionError(
             f"{src} is no DSC3D folder: it has no data_meta.json",
@@ -176,12 +168,8 @@ def find_map(site: Site, given: Path | None = None) -> Path:
         if not given.is_file():
             raise ConversionError(f"map {given} does not exist")
         return given
-    places = [
-        site.folder / "map/map.xodr",
-        *sorted((site.folder / "map").glob("*.xodr")),
-        site.folder / "map.xodr",
-    ]
-    for path in places:
+    others = sorted((site.folder / "map").glob("*.xodr"))
+    for path in (site.folder / "map/map.xodr", *others, site.folder / "map.xodr"):
         if path.is_file():
             return path
     raise ConversionError(
@@ -193,12 +181,7 @@ def find_map(site: Site, given: Path | None = None) -> Path:
 def read_recording(
     site: Site, name: str, category_map: dict[str, str] | None = None
 ) -> Annotations:
-    """One recording, checked.
-
-    Args:
-        site: Its site.
-        name: Its name.
-        category_map: Known category by category of the data set, for other names.
+    """One recording, checked; `category_map` gives the known category for names of the data set.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.
@@ -219,13 +202,18 @@ def read_recording(
     most = int(np.bincount(frame).max())
     if most > _MAX_AT_ONCE:
         raise ConversionError(f"{path}: {most} boxes in one frame, more than {_MAX_AT_ONCE}")
-    _refuse_duplicates(track_ids, frame_ids, track, frame, path)
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(frame) == 0))
+    if len(twice):
+        one = f"track_id {track_ids[track[twice[0]]]} occurs twice"
+        where = f"at frame_id {frame_ids[frame[twice[0]]]} ({len(twice)} such rows)"
+        hint = "one of the boxes belongs to another track; renumber it"
+        raise ConversionError(f"{path}: {one} {where}", hint)
 
     def matrix(keys: tuple[str, ...]) -> FloatArray:
         return np.stack([columns[key][order] for key in keys], axis=1)
 
     sizes = _track_sizes(matrix(DIMENSION), track, len(track_ids), path, warnings)
-    names = _track_categories(table, order, track, len(track_ids), path, warnings)
+    names = _track_categories(table, order, track, path, warnings)
     names, kinds = _agent_kinds(names, category_map or {}, path)
     bottom, rotation = matrix(POSITION), matrix(ROTATION)
     angles, up = rotation_angles(rotation)
@@ -270,18 +258,13 @@ def _key(data: Any, dotted: str, path: Path) -> Any:
 
 
 def _check_site(site: Site, path: Path) -> None:
-    rate = site.frame_rate
+    is_place = (np.abs(site.offset) <= _MAX_OFFSET).all()
+    is_positive = 0 < site.frame_rate < np.inf and site.frame_distance > 0
     for is_good, what in (
         (1 <= site.zone <= 60, f"reference_utm.zone {site.zone!r} is not a UTM zone (1-60)"),
         (np.isfinite(site.offset).all(), "reference_utm.offset is not finite"),
-        (
-            (np.abs(site.offset) <= _MAX_OFFSET).all(),
-            f"reference_utm.offset {site.offset.tolist()} is not a place in UTM",
-        ),
-        (
-            np.isfinite(rate) and rate > 0 and site.frame_distance > 0,
-            "frame_rate and frame_distance must be positive",
-        ),
+        (is_place, f"reference_utm.offset {site.offset.tolist()} is not a place in UTM"),
+        (is_positive, "frame_rate and frame_distance must be positive"),
         (site.recordings, "no recordings are listed under locations"),
     ):
         if not is_good:
@@ -298,10 +281,9 @@ def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArr
         raise ConversionError(f"{path}: {len(ids)} frames, need at least 2")
     if (np.diff(ids) <= 0).any():
         raise ConversionError(f"{path}: frame_id must increase strictly")
-    if ((ids - ids[0]) % site.frame_distance).any():
-        raise ConversionError(
-            f"{path}: frame ids are not {site.frame_distance} (frame_distance) apart"
-        )
+    apart = site.frame_distance
+    if ((ids - ids[0]) % apart).any():
+        raise ConversionError(f"{path}: frame ids are not {apart} (frame_distance) apart")
     if "time" not in table.column_names or not pa.types.is_timestamp(table["time"].type):
         raise ConversionError(f"{path}: column 'time' with time stamps is missing")
     if table["time"].null_count:
@@ -315,7 +297,7 @@ def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArr
         )
     wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * site.period
     warnings["frames whose time disagrees with their id"] += int(wrong.sum())
-    warnings["frames missing"] += int((np.diff(ids) // site.frame_distance - 1).sum())
+    warnings["frames missing"] += int((np.diff(ids) // apart - 1).sum())
     return ids, int(stamps[0])
 
 
@@ -325,34 +307,17 @@ def _frame_index(frame_ids: IntArray, wanted: IntArray, path: Path) -> IntArray:
     index = np.searchsorted(frame_ids, wanted)
     found = frame_ids[np.minimum(index, len(frame_ids) - 1)] == wanted
     if not found.all():
-        raise ConversionError(
-            f"{path}: frame_id {int(wanted[~found][0])} is not listed in frames.parquet"
-            f" ({int((~found).sum())} such rows)"
-        )
+        what = f"frame_id {int(wanted[~found][0])} is not listed in frames.parquet"
+        raise ConversionError(f"{path}: {what} ({int((~found).sum())} such rows)")
     return index.astype(np.int64)
-
-
-def _refuse_duplicates(
-    track_ids: IntArray, frame_ids: IntArray, track: IntArray, frame: IntArray, path: Path
-) -> None:
-    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(frame) == 0))
-    if len(twice):
-        at = twice[0]
-        raise ConversionError(
-            f"{path}: track_id {track_ids[track[at]]} occurs twice at frame_id"
-            f" {frame_ids[frame[at]]} ({len(twice)} such rows)",
-            "one of the boxes belongs to another track; renumber it",
-        )
 
 
 def _track_sizes(
     sizes: FloatArray, track: IntArray, num_tracks: int, path: Path, warnings: Counter[str]
 ) -> FloatArray:
     if not (sizes > 0).all():
-        row = int(np.flatnonzero(~(sizes > 0).all(axis=1))[0])
-        raise ConversionError(
-            f"{path}: a box has the dimensions {sizes[row].tolist()}; all must be positive"
-        )
+        box = sizes[~(sizes > 0).all(axis=1)][0].tolist()
+        raise ConversionError(f"{path}: a box has the dimensions {box}; all must be positive")
     first = np.searchsorted(track, np.arange(num_tracks))
     varying = (np.abs(sizes - sizes[first][track]) > 1e-3).any(axis=1)
     out = sizes[first].copy()
@@ -364,12 +329,7 @@ def _track_sizes(
 
 
 def _track_categories(
-    table: pa.Table,
-    order: IntArray,
-    track: IntArray,
-    num_tracks: int,
-    path: Path,
-    warnings: Counter[str],
+    table: pa.Table, order: IntArray, track: IntArray, path: Path, warnings: Counter[str]
 ) -> tuple[str, ...]:
     if "category" not in table.column_names:
         raise ConversionError(f"{path}: column 'category' is missing")
@@ -388,7 +348,7 @@ def _track_categories(
         raise ConversionError(f"{path}: more than {_MAX_NAMES} categories")
     names = [normalise_category(str(name)) for name in encoded.dictionary.to_pylist()]
     codes = encoded.indices.to_numpy()[order].astype(np.int64)
-    votes = np.zeros((num_tracks, len(names)), np.int64)
+    votes = np.zeros((int(track[-1]) + 1, len(names)), np.int64)
     np.add.at(votes, (track, codes), 1)
     changing = int(((votes > 0).sum(axis=1) > 1).sum())
     warnings["tracks of changing category (most frequent taken)"] += changing

@@ -9,19 +9,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.graph import ConnectorRun
-from shiftsim.data.opendrive.records import (
-    DRIVABLE,
-    PAVED,
-    SEAMS,
-    WALKED,
-    OpenDrive,
-    Outline,
-    Repeat,
-    RoadObject,
-    Signal,
-)
+from shiftsim.data.opendrive.records import OpenDrive, Outline, Repeat, Road, RoadObject, Signal
 from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
 from shiftsim.data.polygons import largest_part, touching
 
@@ -30,6 +21,7 @@ _MIN_OVERLAP = 1.0  # m²
 _CLOSING = 0.5  # m
 _SLIVER = 0.05  # m, cracks between lanes that are closed in the drivable area
 _TILE, _TILE_OVERLAP = 50.0, 0.5  # m
+_USED = records.PAVED | records.WALKED | records.SEAMS
 _CROSSWALK_WORDS = ("crosswalk", "zebra", "pedestrian")
 
 
@@ -44,20 +36,14 @@ class LaneAreas:
 
 def group_connectors(
     connectors: Sequence[ConnectorRun],
-    polygons: Sequence[shapely.Polygon],
-    blocks: Sequence[tuple[int, int]],
-    are_stacked: Callable[[int, int], bool],
+    polygons: Sequence[shapely.Polygon],  # of the connectors
+    blocks: Sequence[tuple[int, int]],  # their (from, to) roadblocks
+    are_stacked: Callable[[int, int], bool],  # whether two of them lie on different levels
 ) -> IntArray:
     """Number of the intersection of each connector.
 
     Connectors belong together when they lie in one junction, belong to one roadblock connector, or
     overlap by more than 1 m² without sharing the lane they start or end at.
-
-    Args:
-        connectors: Lane connectors.
-        polygons: Their areas.
-        blocks: Their (from, to) roadblocks.
-        are_stacked: Whether two of them lie on different levels.
     """
     first: dict[object, int] = {}
     links = [
@@ -94,11 +80,6 @@ def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.
     return closed if isinstance(closed, shapely.Polygon) else largest_part(union.convex_hull)
 
 
-def without_holes(polygon: shapely.Polygon) -> shapely.Polygon:
-    """The polygon with its holes filled."""
-    return shapely.Polygon(polygon.exterior)
-
-
 def lane_areas(od: OpenDrive, shapes: Shapes) -> LaneAreas:
     """Areas of all lanes that cars do not follow."""
     areas = LaneAreas([], [], [])
@@ -106,25 +87,23 @@ def lane_areas(od: OpenDrive, shapes: Shapes) -> LaneAreas:
         for index, section in enumerate(road.sections):
             if road.section_end(index) - section.s < 0.01:
                 continue
-            if all(lane.type in DRIVABLE or lane.type == "none" for lane in section.lanes.values()):
+            kinds = {number: lane.type for number, lane in section.lanes.items()}
+            if not _USED & set(kinds.values()):
                 continue
             shape = shapes.section(road.id, index)
-            for number, lane in section.lanes.items():
+            for number, kind in kinds.items():
                 inner, outer = shape.inner[number], shape.outer[number]
                 width = float(np.hypot(*(outer - inner).T).max())
-                if width < 1e-3 or lane.type not in PAVED | WALKED | SEAMS:
+                if width < 1e-3 or kind not in _USED:
                     continue
                 area = lane_polygon(inner, outer)
-                step = 1 if number > 0 else -1
-                beside = [section.lanes.get(number + k * step) for k in (-1, 1)]
-                is_seam = lane.type in SEAMS and width < _SEAM_WIDTH
-                if lane.type in PAVED:
+                is_seam = kind in records.SEAMS and width < _SEAM_WIDTH
+                beside = {kinds.get(number - 1), kinds.get(number + 1)}
+                if kind in records.PAVED:
                     areas.paved.append(area)
-                elif lane.type in WALKED or (
-                    is_seam and any(other and other.type in WALKED for other in beside)
-                ):
+                elif kind in records.WALKED or (is_seam and beside & records.WALKED):
                     areas.walked.append(area)
-                if lane.type == "parking":
+                if kind == "parking":
                     areas.parking.append(area)
     return areas
 
@@ -151,13 +130,12 @@ def drivable_tiles(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]
             tiles.append(part)
             continue
         x, y, lap = 0.5 * (left + right), 0.5 * (bottom + top), 0.5 * _TILE_OVERLAP
-        halves = (
-            (shapely.box(left, bottom, x + lap, top), shapely.box(x - lap, bottom, right, top))
-            if right - left > top - bottom
-            else (shapely.box(left, bottom, right, y + lap), shapely.box(left, y - lap, right, top))
-        )
+        if right - left > top - bottom:
+            halves = (left, bottom, x + lap, top), (x - lap, bottom, right, top)
+        else:
+            halves = (left, bottom, right, y + lap), (left, y - lap, right, top)
         for half in halves:
-            waiting += _parts(shapely.intersection(part, half))
+            waiting += _parts(shapely.intersection(part, shapely.box(*half)))
     return sorted(tiles, key=lambda tile: tile.bounds)
 
 
@@ -185,13 +163,24 @@ def is_stop_line(thing: RoadObject) -> bool:
 
 def object_rings(line: ReferenceLine, thing: RoadObject) -> list[FloatArray]:
     """Outlines (V, 2) of an object and its copies, as the file draws them [m]."""
-    places = [(thing.s, thing.t)]
-    for repeat in thing.repeats:
-        places = _repeated(repeat)
+    places = _repeated(thing.repeats[-1]) if thing.repeats else [(thing.s, thing.t)]
+    length, width = (thing.length or 0.0) / 2, (thing.width or 0.0) / 2
+    corners = [[length, width], [-length, width], [-length, -width], [length, -width]]
+    outlines = thing.outlines or (Outline(on_road=False, corners=np.array(corners)),)
+    return [_place_ring(line, thing, outline, s, t) for s, t in places for outline in outlines]
+
+
+def rings_of(
+    roads: Iterable[Road], shapes: Shapes, is_wanted: Callable[[RoadObject], bool], least: int = 3
+) -> list[FloatArray]:
+    """Outlines of all objects of a kind that are finite and have at least some corners [m]."""
     return [
-        _place_ring(line, thing, outline, s, t)
-        for s, t in places
-        for outline in thing.outlines or (_box(thing),)
+        ring
+        for road in roads
+        for thing in road.objects
+        if is_wanted(thing)
+        for ring in object_rings(shapes.line(road.id), thing)
+        if len(ring) >= least and np.isfinite(ring).all()
     ]
 
 
@@ -208,12 +197,6 @@ def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
     return list(zip(s.tolist(), t.tolist(), strict=True))
 
 
-def _box(thing: RoadObject) -> Outline:
-    length, width = (thing.length or 0.0) / 2, (thing.width or 0.0) / 2
-    corners = [[length, width], [-length, width], [-length, -width], [length, -width]]
-    return Outline(on_road=False, corners=np.array(corners))
-
-
 def _place_ring(
     line: ReferenceLine, thing: RoadObject, outline: Outline, s: float, t: float
 ) -> FloatArray:
@@ -228,18 +211,13 @@ def _place_ring(
 
 def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     """All crosswalks that enclose an area."""
-    rings = [
-        ring
+    rings = rings_of(od.roads.values(), shapes, is_crosswalk)
+    rings += [
+        _signal_ring(road.id, signal, shapes)
         for road in od.roads.values()
-        for thing in road.objects
-        if is_crosswalk(thing)
-        for ring in object_rings(shapes.line(road.id), thing)
-        if len(ring) > 2 and np.isfinite(ring).all()
+        for signal in road.signals
+        if _is_crosswalk_signal(signal)
     ]
-    for road in od.roads.values():
-        for signal in road.signals:
-            if _is_crosswalk_signal(signal):
-                rings.append(_signal_ring(road.id, signal, shapes))
     polygons = [largest_part(shapely.Polygon(ring)) for ring in rings if np.isfinite(ring).all()]
     return [polygon for polygon in polygons if polygon.area > 0.1]
 
@@ -263,11 +241,5 @@ def _signal_ring(road: str, signal: Signal, shapes: Shapes) -> FloatArray:
 
 def parking_spaces(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     """Areas of parkingSpace objects."""
-    return [
-        largest_part(shapely.Polygon(ring))
-        for road in od.roads.values()
-        for thing in road.objects
-        if thing.type == "parkingSpace"
-        for ring in object_rings(shapes.line(road.id), thing)
-        if len(ring) > 2 and np.isfinite(ring).all()
-    ]
+    rings = rings_of(od.roads.values(), shapes, lambda thing: thing.type == "parkingSpace")
+    return [largest_part(shapely.Polygon(ring)) for ring in rings]

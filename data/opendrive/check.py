@@ -23,9 +23,7 @@ def check_map(
 ) -> tuple[dict[str, bool], dict[str, float]]:
     """Checks by name, and the figures behind them.
 
-    Args:
-        road: The map.
-        stacked: Pairs of lanes or roadblocks that lie over each other on different levels.
+    Pairs of lanes or roadblocks in `stacked` lie over each other on different levels.
     """
     lines = [road.baselines.at(edge) for edge in range(len(road.edges))]
     polygons = [road.edges.shape(edge) for edge in range(len(road.edges))]
@@ -36,10 +34,11 @@ def check_map(
     block_overlap = _largest_overlap(blocks[: road.num_roadblocks], road.blocks.ids, stacked)
     lanes = polygons[: road.num_lanes]
     lane_area = float(shapely.union_all(lanes).area if stacked else sum(p.area for p in lanes))
-    drivable = shapely.union_all(
-        [road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))]
-    ).area
-    ids = [i for layer in _layers(road) for i in layer.ids]
+    tiles = [road.drivable_areas.shape(i) for i in range(len(road.drivable_areas))]
+    drivable = shapely.union_all(tiles).area
+    layers: list[Layer] = [road.edges, road.blocks, road.intersections, road.stop_polygons]
+    layers += [road.crosswalks, road.walkways, road.car_parks, road.drivable_areas]
+    ids = [i for layer in layers for i in layer.ids]
     figures = {
         "baseline gap at joints [m]": gaps,
         "heading jump at joints [rad]": turns,
@@ -69,19 +68,6 @@ def check_map(
         "ids are disjoint": len(ids) == len(set(ids)),
     }
     return checks, figures
-
-
-def _layers(road: VectorMap) -> Sequence[Layer]:
-    return (
-        road.edges,
-        road.blocks,
-        road.intersections,
-        road.stop_polygons,
-        road.crosswalks,
-        road.walkways,
-        road.car_parks,
-        road.drivable_areas,
-    )
 
 
 def _joints(road: VectorMap, lines: Sequence[FloatArray]) -> tuple[float, float]:

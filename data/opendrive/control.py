@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive.areas import is_stop_line, object_rings
-from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, Piece
-from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal, Speed
+from shiftsim.data.opendrive.areas import is_stop_line, rings_of
+from shiftsim.data.opendrive.graph import LaneGraph, Piece
+from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal
 from shiftsim.data.opendrive.shapes import Shapes
 from shiftsim.data.polygons import largest_part
 
@@ -19,8 +19,7 @@ LIGHT, STOP, YIELD = "light", "stop", "yield"
 STOP_LINE_DEPTH = 1.0  # m
 _APPROACH = 100.0  # m before a junction within which a signal governs it
 _NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
-_STOP_TYPES = frozenset(("206", "R1-1"))
-_YIELD_TYPES = frozenset(("205", "R1-2"))
+_SIGNS = {"206": STOP, "R1-1": STOP, "205": YIELD, "R1-2": YIELD}  # by type
 _KMH, _MPH = SPEED_UNITS["km/h"], SPEED_UNITS["mph"]
 _TOWN = ("town", "townCollector", "townArterial", "townLocal", "townPrivate")
 _DEFAULTS_DE: dict[str, float | None] = {
@@ -44,11 +43,8 @@ class StopLine:
 
 def signal_control(signal: Signal) -> str | None:
     """What a signal asks of traffic: LIGHT, STOP, YIELD, or None."""
-    if signal.dynamic and signal.type.startswith("1000"):
-        return LIGHT
-    if signal.type in _STOP_TYPES:
-        return STOP
-    return YIELD if signal.type in _YIELD_TYPES else None
+    is_light = signal.dynamic and signal.type.startswith("1000")
+    return LIGHT if is_light else _SIGNS.get(signal.type)
 
 
 def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
@@ -61,45 +57,30 @@ def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
     }
     controls = []
     for connector in graph.connectors:
-        found: set[str | None] = set()
-        if connector.junctions:
-            for piece in connector.pieces:
-                found |= _controls_on(od.roads[piece.key.road], piece, known, reach=np.inf)
-            last = graph.lanes[connector.source].pieces[-1]
-            found |= _controls_on(od.roads[last.key.road], last, known, reach=_APPROACH)
+        last = graph.lanes[connector.source].pieces[-1]
+        places = [*((piece, np.inf) for piece in connector.pieces), (last, _APPROACH)]
+        found = set[str | None]()
+        for piece, reach in places if connector.junctions else ():
+            side = "+" if piece.end >= piece.begin else "-"
+            found |= {
+                signal_control(known.get(signal.id, signal))
+                for signal in od.roads[piece.key.road].signals
+                if signal.orientation in ("none", side)
+                and applies_to(signal, piece.key.lane)
+                and abs(signal.s - piece.end) <= reach
+            }
         controls.append(frozenset(control for control in found if control))
     return controls
-
-
-def _controls_on(
-    road: Road, piece: Piece, known: dict[str, Signal], reach: float
-) -> set[str | None]:
-    forward = piece.end >= piece.begin
-    return {
-        signal_control(known.get(signal.id, signal))
-        for signal in road.signals
-        if signal.orientation in ("none", "+" if forward else "-")
-        and applies_to(signal, piece.key.lane)
-        and abs(signal.s - piece.end) <= reach
-    }
 
 
 def stop_lines(
     od: OpenDrive,
     graph: LaneGraph,
     shapes: Shapes,
-    controls: Sequence[frozenset[str]],
-    polygons: Sequence[shapely.Polygon],
+    controls: Sequence[frozenset[str]],  # what governs each connector
+    polygons: Sequence[shapely.Polygon],  # of the lanes
 ) -> list[StopLine]:
-    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506).
-
-    Args:
-        od: The file.
-        graph: Lanes and connectors.
-        shapes: Their geometry.
-        controls: What governs each connector.
-        polygons: Areas of the lanes.
-    """
+    """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506)."""
     by_lane: dict[int, set[str]] = {}
     for connector, governed in zip(graph.connectors, controls, strict=True):
         if connector.junctions:
@@ -107,14 +88,17 @@ def stop_lines(
     drawn = _drawn_lines(od, shapes)
     tree = shapely.STRtree(np.array(drawn, dtype=object))
     lines = []
-    for lane, found in sorted(by_lane.items(), key=lambda item: item[0]):
+    for lane, found in sorted(by_lane.items()):
         left, right = shapes.borders(graph.lanes[lane].pieces[-1])
         box = _end_box(left, right)
         near = tree.query(box.buffer(_NEAR_END), predicate="intersects").tolist()
-        near = [i for i in near if _lies_across(drawn[i], polygons[lane], box)]
+        near = [i for i in near if polygons[lane].intersects(drawn[i])]
+        near = [i for i in near if drawn[i].distance(box) < _NEAR_END]
         if near:
-            nearest = min(near, key=lambda i: drawn[i].distance(box))
-            box = shapely.intersection(_deepened(drawn[nearest]), polygons[lane])
+            line = drawn[min(near, key=lambda i: drawn[i].distance(box))]
+            if line.area <= 0.1:  # drawn without a depth
+                line = line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
+            box = shapely.intersection(line, polygons[lane])
         if (found or near) and (polygon := largest_part(box)).area > 0.01:
             control = next((c for c in (LIGHT, STOP, YIELD) if c in found), STOP)
             lines.append(StopLine(polygon, control, lane))
@@ -122,24 +106,15 @@ def stop_lines(
 
 
 def _drawn_lines(od: OpenDrive, shapes: Shapes) -> list[shapely.Geometry]:
-    drawn = []
+    drawn: list[shapely.Geometry] = []
     for road in od.roads.values():
-        line = shapes.line(road.id)
-        for thing in road.objects:
-            if is_stop_line(thing):
-                drawn += [
-                    shapely.MultiPoint(ring).convex_hull
-                    for ring in object_rings(line, thing)
-                    if len(ring) > 1 and np.isfinite(ring).all()
-                ]
+        rings = rings_of([road], shapes, is_stop_line, least=2)
+        drawn += [shapely.MultiPoint(ring).convex_hull for ring in rings]
         for signal in road.signals:
-            if (
-                signal.type == "294"
-                and not signal.reference
-                and np.isfinite([signal.s, signal.t]).all()
-            ):
+            is_finite = np.isfinite([signal.s, signal.t]).all()
+            if signal.type == "294" and not signal.reference and is_finite:
                 half = (signal.width or 3.0) / 2
-                ends = line.evaluate(np.full(2, signal.s))
+                ends = shapes.line(road.id).evaluate(np.full(2, signal.s))
                 drawn.append(shapely.LineString(ends.offset(signal.t + np.array([-half, half]))))
     return drawn
 
@@ -154,22 +129,6 @@ def _end_box(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     if back @ (left[-2] - left[-1]) < 0:
         back = -back
     return shapely.Polygon([left[-1], right[-1], right[-1] + back, left[-1] + back])
-
-
-def _deepened(line: shapely.Geometry) -> shapely.Geometry:
-    """A drawn line as an area: itself where it has one, else widened to the depth of a line."""
-    if line.area > 0.1:
-        return line
-    return line.buffer(STOP_LINE_DEPTH / 2, cap_style="flat")
-
-
-def _lies_across(line: shapely.Geometry, lane: shapely.Polygon, box: shapely.Polygon) -> bool:
-    return bool(lane.intersects(line)) and line.distance(box) < _NEAR_END
-
-
-def is_lit(connector: ConnectorRun, found: frozenset[str]) -> bool:
-    """Whether lights govern a connector."""
-    return bool(connector.junctions) and LIGHT in found
 
 
 def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:
@@ -194,9 +153,9 @@ def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float |
 
 def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
     section = road.sections[piece.key.section]
-    own = _last(section.lanes[piece.key.lane].speeds, s - section.s)
-    if own is not None:
-        return own.limit
+    own = [speed for speed in section.lanes[piece.key.lane].speeds if speed.s <= s - section.s]
+    if own:
+        return own[-1].limit
     kinds = [kind for kind in road.types if kind.s <= s] or list(road.types[:1])
     if kinds and kinds[-1].speed is not None:
         return kinds[-1].speed.limit
@@ -206,11 +165,6 @@ def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
     land = (kinds[-1].country if kinds else "") or country
     table = _DEFAULTS_US if land.upper() in ("US", "USA") else _DEFAULTS_DE
     return table.get(kinds[-1].type if kinds else "town", table["town"])
-
-
-def _last(records: Sequence[Speed], s: float) -> Speed | None:
-    before = [record for record in records if record.s <= s]
-    return before[-1] if before else None
 
 
 def _signal_limit(road: Road, piece: Piece, s: float) -> float | None:

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive.records import ARC, PARAM_POLY3, POLY3, SPIRAL, Geometry
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -47,10 +47,9 @@ class ReferenceLine:
     # end to end; else it is cut off where the stated length is used up
     stretched: bool = True
 
-    @property
-    def starts(self) -> FloatArray:
-        """(n,) where the records begin [m]."""
-        return np.array([g.s for g in self.geometries])
+    def _records_at(self, s: FloatArray) -> IntArray:
+        starts = np.array([g.s for g in self.geometries])
+        return np.maximum(np.searchsorted(starts, s, side="right") - 1, 0)
 
     def evaluate(self, s: FloatArray) -> Poses:
         """Poses at distances `s` (K,) [m]; beyond the ends the line stays at its ends.
@@ -58,7 +57,7 @@ class ReferenceLine:
         nuPlan rule 501: the heading at a joint is that of the later record.
         """
         s = np.asarray(s, np.float64)
-        index = np.maximum(np.searchsorted(self.starts, s, side="right") - 1, 0)
+        index = self._records_at(s)
         out = np.empty((3, len(s)))
         for number in np.unique(index):
             record = self.geometries[number]
@@ -73,8 +72,7 @@ class ReferenceLine:
 
     def kinds(self, s: FloatArray) -> list[str]:
         """Kind of the record at distances `s` (K,) [m]; at a joint the later one."""
-        index = np.maximum(np.searchsorted(self.starts, s, side="right") - 1, 0)
-        return [self.geometries[i].kind for i in index]
+        return [self.geometries[i].kind for i in self._records_at(s)]
 
     def joints(self) -> tuple[FloatArray, FloatArray]:
         """Gap [m] and turn [rad] from the end of each record to the start of the next, (n - 1,)."""

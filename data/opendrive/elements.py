@@ -40,9 +40,7 @@ class Reader:
         try:
             return float(text)
         except ValueError:
-            return self._rescue(element, name, text)
-
-    def _rescue(self, element: Any, name: str, text: str) -> float:
+            pass
         found = _LEADING_NUMBER.match(text.replace(",", ".", 1))
         if found is None:
             raise self.error(
@@ -58,6 +56,11 @@ class Reader:
             return int(element.get(name))
         except (TypeError, ValueError):
             return None
+
+    def pairs(self, parent: Any, tag: str, names: tuple[str, str]) -> tuple[tuple[int, int], ...]:
+        """Two integers of each child of a kind, where it has both."""
+        found = [[self.integer(child, name) for name in names] for child in parent.findall(tag)]
+        return tuple((a, b) for a, b in found if a is not None and b is not None)
 
     def cubics(self, elements: list[Any], key: str) -> FloatArray:
         """(n, 5) rows s, a, b, c, d by s; records with NaN or infinity are left out."""
@@ -78,22 +81,15 @@ class Reader:
 def read_object(element: Any, reader: Reader) -> RoadObject:
     """One object; outlines with numbers that are not finite are left out."""
     reader.counts[f"object {element.get('type', '')}"] += 1
-    outlines = []
-    for outline in element.iter("outline"):
-        corners = _read_outline(outline, reader)
-        if corners is not None:
-            outlines.append(corners)
+    outlines = [_read_outline(outline, reader) for outline in element.iter("outline")]
     return RoadObject(
-        id=element.get("id", ""),
-        type=element.get("type", ""),
-        subtype=element.get("subtype", ""),
-        name=element.get("name", ""),
+        **{key: element.get(key, "") for key in ("id", "type", "subtype", "name")},
         s=reader.number(element, "s"),
         t=reader.number(element, "t"),
         heading=reader.number(element, "hdg"),
         length=_optional(element, "length", reader),
         width=_optional(element, "width", reader),
-        outlines=tuple(outlines),
+        outlines=tuple(outline for outline in outlines if outline is not None),
         repeats=tuple(_read_repeat(e, reader) for e in element.findall("repeat")),
         lanes=_read_validity(element, reader),
     )
@@ -125,12 +121,8 @@ def _read_repeat(element: Any, reader: Reader) -> Repeat:
 
 
 def _read_validity(element: Any, reader: Reader) -> tuple[tuple[int, int], ...]:
-    ranges = []
-    for child in element.findall("validity"):
-        first, last = reader.integer(child, "fromLane"), reader.integer(child, "toLane")
-        if first is not None and last is not None:
-            ranges.append((min(first, last), max(first, last)))
-    return tuple(ranges)
+    ranges = reader.pairs(element, "validity", ("fromLane", "toLane"))
+    return tuple((min(pair), max(pair)) for pair in ranges)
 
 
 def _optional(element: Any, name: str, reader: Reader) -> float | None:
@@ -150,17 +142,14 @@ def read_signal(element: Any, reader: Reader) -> Signal:
         reader.counts[f"signal {label}"] += 1
     value = _optional(element, "value", reader)
     return Signal(
-        id=element.get("id", ""),
-        name=element.get("name", ""),
+        **{key: element.get(key, "") for key in ("id", "name", "country", "unit")},
         type=kind,
         subtype=subtype,
-        country=element.get("country", ""),
         dynamic=element.get("dynamic") == "yes",
         s=reader.number(element, "s"),
         t=reader.number(element, "t"),
         orientation=element.get("orientation", "none"),
         value=value,
-        unit=element.get("unit", ""),
         width=_optional(element, "width", reader),
         lanes=_read_validity(element, reader),
         reference=is_reference,

@@ -9,6 +9,8 @@ the lanes before it.
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 import shapely
@@ -24,6 +26,7 @@ SEAM_LENGTH, SEAM_SHARE = 3.0, 0.25  # m, and share of the shorter lane
 MAX_GAP, INFER_GAP, SNAP_GAP = 2.0, 0.1, 0.05  # m
 _MAX_CHAIN = 64  # lanes along one connector
 _MAX_STEPS = 2_000  # in the search for ways from one lane through junctions
+_Group: TypeAlias = tuple[str, int, bool]  # road, section, whether it runs along the road
 _CARS = frozenset(("all", "car", "autonomousTraffic", "motorVehicle"))
 
 
@@ -67,9 +70,8 @@ class ConnectorRun:
 class LaneGraph:
     """Lanes and connectors of the map."""
 
-    # lanes; those of one roadblock follow each other
-    lanes: list[LaneRun] = field(default_factory=list)
-    connectors: list[ConnectorRun] = field(default_factory=list)  # lane connectors
+    lanes: list[LaneRun] = field(default_factory=list)  # those of a roadblock follow each other
+    connectors: list[ConnectorRun] = field(default_factory=list)
     # drivable lanes that are part of neither: short, narrow, or dead ends in junctions
     dropped: list[Piece] = field(default_factory=list)
 
@@ -89,12 +91,7 @@ def road_order(road: str) -> tuple[int, int, str]:
 
 
 def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> LaneGraph:
-    """Lanes, roadblocks and connectors of a file.
-
-    Args:
-        od: The file.
-        warnings: Takes a count per kind of what was inferred or dropped.
-    """
+    """Lanes, roadblocks and connectors of a file; counts what was inferred or dropped."""
     return _Builder(od, warnings).build()
 
 
@@ -164,16 +161,13 @@ class _Builder:
             onward = LaneKey(key.road, key.section + 1, key.lane)
             if onward not in self.nodes:
                 continue
-            pair = (key, onward) if self._is_forward(key) else (onward, key)
-            if (
-                self.after[pair[0]]
-                or self.before[pair[1]]
-                or not self._is_forward(key) == self._is_forward(onward)
-            ):
+            is_forward = self._is_forward(key)
+            source, target = (key, onward) if is_forward else (onward, key)
+            linked = self.after[source] or self.before[target]
+            if linked or self._is_forward(onward) != is_forward:
                 continue
-            ends = self.gates[pair[0]][1], self.gates[pair[1]][0]
-            if float(np.abs(ends[0] - ends[1]).max()) < INFER_GAP:
-                self._join(*pair)
+            if np.abs(self.gates[source][1] - self.gates[target][0]).max() < INFER_GAP:
+                self._join(source, target)
                 inferred += 1
         if inferred:
             self.warnings["lane link missing between sections, inferred"] += inferred
@@ -188,14 +182,12 @@ class _Builder:
             self._part(source, key)
         for target in targets:
             self._part(key, target)
-        for source in sources:
-            for target in targets:
-                if source != target:
-                    self._join(source, target)
+        for source, target in product(sources, targets):
+            if source != target:
+                self._join(source, target)
         self.graph.dropped.append(self.nodes.pop(key))
-        self.warnings[
-            "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
-        ] += 1
+        what = "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
+        self.warnings[what] += 1
 
     def _drop_wide_gaps(self) -> None:
         pairs = [(a, b) for a in sorted(self.nodes) for b in sorted(self.after[a])]
@@ -213,11 +205,11 @@ class _Builder:
     def _in_junction(self, key: LaneKey) -> bool:
         return self.od.roads[key.road].junction is not None
 
-    def _group_of(self, key: LaneKey) -> tuple[str, int, bool]:
+    def _group_of(self, key: LaneKey) -> _Group:
         return key.road, key.section, self._is_forward(key)
 
     def _build_lanes(self) -> None:
-        groups: dict[tuple[str, int, bool], list[LaneKey]] = defaultdict(list)
+        groups: dict[_Group, list[LaneKey]] = defaultdict(list)
         for key in self.nodes:
             if not self._in_junction(key):
                 groups[self._group_of(key)].append(key)
@@ -226,7 +218,7 @@ class _Builder:
         order = sorted(groups, key=lambda g: (road_order(g[0]), g[1], g[2]))
         onward = {g: h for g in order if (h := self._continuation(groups[g], groups)) is not None}
         has_previous = set(onward.values())
-        placed: set[tuple[str, int, bool]] = set()
+        placed: set[_Group] = set()
         block = 0
         for first in [g for g in order if g not in has_previous] + order:
             if first in placed:
@@ -242,10 +234,8 @@ class _Builder:
             block += 1
 
     def _continuation(
-        self,
-        keys: list[LaneKey],
-        groups: dict[tuple[str, int, bool], list[LaneKey]],
-    ) -> tuple[str, int, bool] | None:
+        self, keys: list[LaneKey], groups: dict[_Group, list[LaneKey]]
+    ) -> _Group | None:
         """The group that continues a group lane by lane, or None."""
         if any(len(self.after[key]) != 1 for key in keys):
             return None
@@ -253,11 +243,9 @@ class _Builder:
         if self._in_junction(targets[0]):
             return None
         group = self._group_of(targets[0])
-        if groups[group] != targets or any(
-            self.before[t] != {k} for k, t in zip(keys, targets, strict=True)
-        ):
-            return None
-        return group if group != self._group_of(keys[0]) else None
+        is_group = groups[group] == targets and group != self._group_of(keys[0])
+        follow = all(self.before[t] == {k} for k, t in zip(keys, targets, strict=True))
+        return group if is_group and follow else None
 
     def _cut_seams(self) -> None:
         """Short connectors between lanes that no junction joins (nuPlan rule 504)."""
@@ -310,14 +298,9 @@ class _Builder:
 
     def _add_connector(self, source: int, target: int, path: Sequence[LaneKey]) -> None:
         junctions = {self.od.roads[key.road].junction for key in path}
-        self.graph.connectors.append(
-            ConnectorRun(
-                [self.nodes[key] for key in path],
-                source,
-                target,
-                frozenset(junction for junction in junctions if junction is not None),
-            )
-        )
+        inside = frozenset(junction for junction in junctions if junction is not None)
+        pieces = [self.nodes[key] for key in path]
+        self.graph.connectors.append(ConnectorRun(pieces, source, target, inside))
 
 
 def split_pieces(pieces: list[Piece], at: float) -> tuple[list[Piece], list[Piece]]:

@@ -37,12 +37,9 @@ class SectionBorders:
 
 
 def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> FloatArray:
-    """Piecewise cubic at `s` (K,), 0 before its first record.
+    """Piecewise cubic (n, 5) s, a, b, c, d at `s` (K,) [m], 0 before its first record.
 
-    Args:
-        records: (n, 5) s, a, b, c, d.
-        s: Where to evaluate [m].
-        look_up: Where to look for the record; differs from `s` at the end of a section.
+    `look_up` is where to look for the record; it differs from `s` at the end of a section.
     """
     if len(records) == 0:
         return np.zeros_like(s)
@@ -63,14 +60,9 @@ def section_borders(
 ) -> SectionBorders:
     """Borders of the lanes of a section at road distances `s` (K,) within it [m].
 
-    Args:
-        road: The road.
-        section: Number of the section.
-        s: Distances from the start of the road [m].
-        repair: Whether negative widths count as 0, borders of right lanes that were written as
-            positive numbers are put on the right, and records that begin at the very end of the
-            section are left to the next one.
-        look_up: Where to look for the records instead of at `s`: which side of a step counts.
+    With `repair`, negative widths count as 0, borders of right lanes that were written as positive
+    numbers are put on the right, and records that begin at the very end of the section are left to
+    the next one. `look_up` is where to look for the records instead of at `s`.
     """
     s = np.asarray(s, np.float64)
     begin, end = road.sections[section].s, road.section_end(section)
@@ -93,11 +85,8 @@ def section_borders(
                 outer = evaluate_cubics(lane.borders, s - begin, look_up - begin)
                 outer = -outer if repair and border_is_mirrored(lane) else outer
             if repair:
-                if not np.isfinite(outer).all():
-                    outer = np.nan_to_num(outer, nan=0.0)
-                outer = np.clip(sign * outer, sign * previous, _MAX_OFFSET) * sign
-            previous = outer
-            borders.outer[number] = previous
+                outer = np.clip(sign * np.nan_to_num(outer), sign * previous, _MAX_OFFSET) * sign
+            previous = borders.outer[number] = outer
     return borders
 
 
@@ -118,11 +107,7 @@ def runs_forward(road: Road, section: int, lane: int) -> bool:
 def lane_links(od: OpenDrive, warnings: Counter[str]) -> list[tuple[LaneKey, LaneKey]]:
     """Directed edges between lanes of all types, in the direction of travel, sorted.
 
-    Only what the file links; nothing is inferred from geometry.
-
-    Args:
-        od: The file.
-        warnings: Takes one count per link that leads nowhere.
+    Only what the file links, nothing inferred from geometry; links that lead nowhere are counted.
     """
     linker = _Linker(od, warnings)
     for road in od.roads.values():
@@ -181,11 +166,8 @@ class _Linker:
             return
         if not incoming.sections or not connecting.sections:
             return
-        ends = [
-            end
-            for end, link in ((START, incoming.predecessor), (END, incoming.successor))
-            if link is not None and link.kind == "junction" and link.id == junction
-        ]
+        links = ((START, incoming.predecessor), (END, incoming.successor))
+        ends = [e for e, x in links if x and (x.kind, x.id) == ("junction", junction)]
         contact = connection.contact or nearer_end(incoming, (ends or [END])[0], connecting)
         end = ends[0] if len(ends) == 1 else nearer_end(connecting, contact, incoming)
         here, there = _end_section(incoming, end), _end_section(connecting, contact)
@@ -196,35 +178,27 @@ class _Linker:
         """A link of two lanes that touch, where traffic can pass (nuPlan rule 503)."""
         if 0 in (side[2], other[2]):
             return
-        if any(
-            lane not in road.sections[section].lanes for road, section, lane, _ in (side, other)
-        ):
-            self.warnings["link to a lane that does not exist, dropped"] += 1
-            return
-        keys = [LaneKey(road.id, section, lane) for road, section, lane, _ in (side, other)]
-        leaves = [
-            runs_forward(road, section, lane) == (end == END)
-            for road, section, lane, end in (side, other)
-        ]
+        leaves = []
+        for road, section, lane, end in (side, other):
+            if lane not in road.sections[section].lanes:
+                self.warnings["link to a lane that does not exist, dropped"] += 1
+                return
+            leaves.append(runs_forward(road, section, lane) == (end == END))
+        source, target = (LaneKey(road.id, *place) for road, *place, _ in (side, other))
         if leaves[0] == leaves[1]:
             self.warnings["lane link against the direction of travel, dropped"] += 1
         else:
-            self.edges.add((keys[0], keys[1]) if leaves[0] else (keys[1], keys[0]))
+            self.edges.add((source, target) if leaves[0] else (target, source))
 
 
 def _end_section(road: Road, end: str) -> int:
     return 0 if end == START else len(road.sections) - 1
 
 
-def end_point(road: Road, end: str) -> FloatArray:
-    """(2,) start or end of the reference line [m]."""
-    at = np.array([0.0 if end == START else road.length])
-    pose = ReferenceLine(road.geometries).evaluate(at)
-    return np.array([pose.x[0], pose.y[0]])
-
-
 def nearer_end(road: Road, end: str, other: Road) -> str:
-    """The end of `other` that lies nearer to an end of `road`."""
-    here = end_point(road, end)
-    distances = [float(np.hypot(*(end_point(other, e) - here))) for e in (START, END)]
+    """The end of `other` that lies nearer to an end of `road`; a tie goes to its start."""
+    at = np.array([0.0 if end == START else road.length])
+    here = ReferenceLine(road.geometries).evaluate(at)
+    there = ReferenceLine(other.geometries).evaluate(np.array([0.0, other.length]))
+    distances = np.hypot(there.x - here.x, there.y - here.y)
     return START if distances[0] <= distances[1] else END

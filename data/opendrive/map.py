@@ -1,32 +1,21 @@
 """OpenDRIVE to the semantic map of nuPlan's kind."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
-from shiftsim.data.opendrive import areas
+from shiftsim.data.opendrive import areas, control
 from shiftsim.data.opendrive.check import check_map
-from shiftsim.data.opendrive.control import (
-    LIGHT,
-    STOP,
-    YIELD,
-    connector_controls,
-    is_lit,
-    speed_limit,
-    stop_lines,
-)
+from shiftsim.data.opendrive.control import LIGHT, STOP, YIELD
 from shiftsim.data.opendrive.graph import LaneGraph, Piece, build_lane_graph
 from shiftsim.data.opendrive.lanes import LaneKey
-from shiftsim.data.opendrive.overlaps import (
-    Levels,
-    cut_crossings,
-    overlapping,
-    subtract_overlaps,
-)
+from shiftsim.data.opendrive.overlaps import Levels, cut_crossings, overlapping, subtract_overlaps
 from shiftsim.data.opendrive.preparation import prepare
 from shiftsim.data.opendrive.records import OpenDrive
 from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
@@ -35,6 +24,7 @@ from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_m
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
+_Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -54,8 +44,7 @@ class MapReport:
 
     warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
     origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
-    # self-checks: name and whether the map passes
-    checks: dict[str, bool] = field(default_factory=dict)
+    checks: dict[str, bool] = field(default_factory=dict)  # self-checks: whether the map passes
     figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
 
 
@@ -88,9 +77,12 @@ def build_road_map(
     return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
 
 
+def _chains(graph: LaneGraph) -> list[list[Piece]]:
+    return [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+
+
 def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
-    chains = [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
-    return Shapes(od, [*(piece for chain in chains for piece in chain), *graph.dropped])
+    return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
 
 
 class _Maker:
@@ -108,21 +100,17 @@ class _Maker:
     def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
         self._shape_lanes()
         self._shape_connectors()
-        self.controls = connector_controls(self.od, self.graph)
+        self.controls = control.connector_controls(self.od, self.graph)
         self._number()
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblock_specs(), *self._block_connector_specs()]
         layers = self._areas()
-        shift = _Shift(offset)
         vector_map = build_map(
             name,
-            edges=[shift.edge(spec) for spec in edges],
-            blocks=[replace(spec, polygon=shift.polygon(spec.polygon)) for spec in blocks],
+            edges=_moved(edges, offset),
+            blocks=_moved(blocks, offset),
             epsg=epsg,
-            **{
-                layer: [replace(spec, polygon=shift.polygon(spec.polygon)) for spec in specs]
-                for layer, specs in layers.items()
-            },
+            **{layer: _moved(specs, offset) for layer, specs in layers.items()},
         )
         checks, figures = check_map(vector_map, self._stacked_ids())
         report = MapReport(dict(self.warnings), tuple(self._origins()), checks, figures)
@@ -130,10 +118,13 @@ class _Maker:
 
     def _stacked_ids(self) -> set[tuple[str, str]]:
         """Pairs of lanes, and of roadblocks, that lie on different levels."""
-        lanes = self.graph.lanes
         pairs = {(self.lane_ids[i], self.lane_ids[j]) for i, j in self.stacked}
-        blocks = [(lanes[i].block, lanes[j].block) for i, j in self.stacked]
-        return pairs | {(self.block_ids[min(b)], self.block_ids[max(b)]) for b in blocks}
+        blocks = self._stacked_blocks()
+        return pairs | {(self.block_ids[a], self.block_ids[b]) for a, b in blocks}
+
+    def _stacked_blocks(self) -> set[tuple[int, int]]:
+        blocks = [lane.block for lane in self.graph.lanes]
+        return {(min(blocks[i], blocks[j]), max(blocks[i], blocks[j])) for i, j in self.stacked}
 
     def _new_ids(self, count: int) -> list[str]:
         first = self._next_id
@@ -179,7 +170,7 @@ class _Maker:
             connectors, self.connector_polygons, self.pairs, levels.are_stacked
         )
         self.group_ids = self._new_ids(int(self.groups.max(initial=-1)) + 1)
-        self.stop_lines = stop_lines(
+        self.stop_lines = control.stop_lines(
             self.od, self.graph, self.shapes, self.controls, self.lane_polygons
         )
         self.stop_ids = self._new_ids(len(self.stop_lines))
@@ -211,7 +202,7 @@ class _Maker:
                 right=right,
                 left_id=self._boundary(lane.block, lane.index),
                 right_id=self._boundary(lane.block, lane.index + 1),
-                speed_limit=speed_limit(self.od, lane.pieces, self.country),
+                speed_limit=control.speed_limit(self.od, lane.pieces, self.country),
                 lane_index=lane.index,
                 left_lane=self._neighbor(number, -1),
                 right_lane=self._neighbor(number, 1),
@@ -242,9 +233,9 @@ class _Maker:
                 right=right,
                 left_id=left_id,
                 right_id=right_id,
-                speed_limit=speed_limit(self.od, connector.pieces, self.country),
+                speed_limit=control.speed_limit(self.od, connector.pieces, self.country),
                 intersection_id=self.group_ids[self.groups[number]],
-                has_traffic_lights=is_lit(connector, self.controls[number]),
+                has_traffic_lights=bool(connector.junctions) and LIGHT in self.controls[number],
                 stop_lines=[
                     stop_id
                     for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
@@ -259,12 +250,7 @@ class _Maker:
             members[lane.block].append(number)
         order = sorted(members)
         polygons = [self._roadblock_polygon(members[block]) for block in order]
-        stacked = {
-            (min(pair), max(pair))
-            for pair in (
-                (self.graph.lanes[i].block, self.graph.lanes[j].block) for i, j in self.stacked
-            )
-        }
+        stacked = self._stacked_blocks()
         polygons, _ = subtract_overlaps(polygons, [p.area for p in polygons], stacked)
         for block, polygon in zip(order, polygons, strict=True):
             yield BlockSpec(
@@ -303,7 +289,7 @@ class _Maker:
         for group, group_id in enumerate(self.group_ids):
             numbers = np.flatnonzero(self.groups == group).tolist()
             polygon = areas.merge_closed([self.connector_polygons[i] for i in numbers], 0.5)
-            specs.append(AreaSpec(group_id, areas.without_holes(polygon), self._kind(numbers)))
+            specs.append(AreaSpec(group_id, shapely.Polygon(polygon.exterior), self._kind(numbers)))
         return specs
 
     def _kind(self, numbers: Sequence[int]) -> int:
@@ -313,34 +299,22 @@ class _Maker:
             return PASS_THROUGH
         return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
 
-    def _stop_specs(self) -> list[AreaSpec]:
-        return [
-            AreaSpec(stop_id, line.polygon, STOP_KINDS[line.control])
-            for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
-        ]
-
     def _areas(self) -> dict[str, list[AreaSpec]]:
         intersections = self._intersections()
         other = areas.lane_areas(self.od, self.shapes)
-        car_parks = areas.merge_areas(
-            [*other.parking, *areas.parking_spaces(self.od, self.shapes)], 0.5
-        )
-        dropped = [
-            lane_polygon(*self.shapes.borders(p)) for p in self.graph.dropped if p.length > 0.01
-        ]
-        drivable = areas.drivable_tiles(
-            [
-                *self.lane_polygons,
-                *self.connector_polygons,
-                *(spec.polygon for spec in intersections if spec.kind != PASS_THROUGH),
-                *other.paved,
-                *car_parks,
-                *dropped,
-            ]
-        )
+        spaces = areas.parking_spaces(self.od, self.shapes)
+        car_parks = areas.merge_areas([*other.parking, *spaces], 0.5)
+        pieces = [piece for piece in self.graph.dropped if piece.length > 0.01]
+        dropped = [lane_polygon(*self.shapes.borders(piece)) for piece in pieces]
+        edges = [*self.lane_polygons, *self.connector_polygons]
+        inner = [spec.polygon for spec in intersections if spec.kind != PASS_THROUGH]
+        drivable = areas.drivable_tiles([*edges, *inner, *other.paved, *car_parks, *dropped])
         return {
             "intersections": intersections,
-            "stop_polygons": self._stop_specs(),
+            "stop_polygons": [
+                AreaSpec(stop_id, line.polygon, STOP_KINDS[line.control])
+                for stop_id, line in zip(self.stop_ids, self.stop_lines, strict=True)
+            ],
             "crosswalks": self._specs(areas.crosswalk_polygons(self.od, self.shapes)),
             "walkways": self._specs(areas.merge_areas(other.walked, 0.05)),
             "car_parks": self._specs(car_parks),
@@ -352,37 +326,21 @@ class _Maker:
         return [AreaSpec(i, polygon) for i, polygon in zip(ids, polygons, strict=True)]
 
     def _origins(self) -> Iterator[Origin]:
-        runs: list[tuple[str, list[Piece]]] = [
-            *((i, lane.pieces) for i, lane in zip(self.lane_ids, self.graph.lanes, strict=True)),
-            *(
-                (i, c.pieces)
-                for i, c in zip(self.connector_ids, self.graph.connectors, strict=True)
-            ),
-        ]
-        for edge_id, pieces in runs:
+        ids, runs = [*self.lane_ids, *self.connector_ids], _chains(self.graph)
+        for edge_id, pieces in zip(ids, runs, strict=True):
             for piece in pieces:
                 yield Origin(edge_id, piece.key, piece.begin, piece.end)
 
 
-@dataclass(frozen=True)
-class _Shift:
-    """Moves shapes to their place in the world."""
-
-    offset: FloatArray
-
-    def polygon(self, polygon: shapely.Polygon) -> shapely.Polygon:
-        """A polygon moved."""
-        return shapely.transform(polygon, lambda xy: xy + self.offset)
-
-    def edge(self, spec: EdgeSpec) -> EdgeSpec:
-        """An edge moved."""
-        return replace(
-            spec,
-            polygon=self.polygon(spec.polygon),
-            baseline=spec.baseline + self.offset,
-            left=None if spec.left is None else spec.left + self.offset,
-            right=None if spec.right is None else spec.right + self.offset,
-        )
+def _moved(specs: Iterable[_Spec], offset: FloatArray) -> list[_Spec]:
+    """Edges, blocks or areas at their place in the world."""
+    out = []
+    for spec in specs:
+        lines = {name: getattr(spec, name, None) for name in ("baseline", "left", "right")}
+        shapes = {name: line + offset for name, line in lines.items() if line is not None}
+        polygon = shapely.transform(spec.polygon, lambda xy: xy + offset)
+        out.append(replace(spec, polygon=polygon, **shapes))
+    return out
 
 
 def turn_type(line: FloatArray) -> int:

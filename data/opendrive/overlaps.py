@@ -49,20 +49,6 @@ class Trace:
         return float(np.arctan2(step[1], step[0]))
 
 
-def trace(od: OpenDrive, shapes: Shapes, pieces: Sequence[Piece]) -> Trace:
-    """Points along a chain of pieces, one per metre."""
-    parts, done = [], 0.0
-    for piece in pieces:
-        share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _SAMPLE)), 1) + 1)
-        s = piece.begin + share * (piece.end - piece.begin)
-        elevation = od.roads[piece.key.road].elevation
-        height = evaluate_cubics(elevation, s, s)
-        parts.append((shapes.centers(piece, s), done + share * piece.length, height))
-        done += piece.length
-    xy, distance, heights = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Trace(xy, distance, heights)
-
-
 def overlapping(polygons: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of polygons that share more than a border."""
     return [pair for pair, area in shared_areas(polygons).items() if area > OVERLAP]
@@ -83,32 +69,46 @@ class Levels:
         self._is_flat = not any(road.elevation[:, 1:].any() for road in od.roads.values())
 
     def trace(self, chain: int) -> Trace:
-        """Points along one chain."""
-        if chain not in self._traces:
-            self._traces[chain] = trace(self._od, self._shapes, self._chains[chain])
+        """Points along one chain, one per metre."""
+        if chain in self._traces:
+            return self._traces[chain]
+        parts, done = [], 0.0
+        for piece in self._chains[chain]:
+            share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _SAMPLE)), 1) + 1)
+            s = piece.begin + share * (piece.end - piece.begin)
+            height = evaluate_cubics(self._od.roads[piece.key.road].elevation, s, s)
+            parts.append((self._shapes.centers(piece, s), done + share * piece.length, height))
+            done += piece.length
+        self._traces[chain] = Trace(*map(np.concatenate, zip(*parts, strict=True)))
         return self._traces[chain]
+
+    def region(self, first: int, second: int) -> shapely.Geometry:
+        """The common area of two chains."""
+        return shapely.intersection(self._polygons[first], self._polygons[second])
+
+    def _middles(self, first: int, second: int) -> list[tuple[Trace, int]]:
+        """Each of two chains, with its point next to the middle of their common area."""
+        middle = self.region(first, second).centroid
+        point = np.array([[middle.x, middle.y]])
+        return [(t, t.nearest(point)[0]) for t in (self.trace(first), self.trace(second))]
 
     def are_stacked(self, first: int, second: int) -> bool:
         """Whether two chains pass their common area on different levels."""
         if self._is_flat:
             return False
-        region = shapely.intersection(self._polygons[first], self._polygons[second])
-        return are_stacked(self.trace(first), self.trace(second), region)
+        (one, i), (other, j) = self._middles(first, second)
+        return bool(abs(one.height[i] - other.height[j]) > LEVEL)
 
-
-def are_stacked(first: Trace, second: Trace, region: shapely.Geometry) -> bool:
-    """Whether two chains pass a common region on different levels."""
-    point = np.array([[region.centroid.x, region.centroid.y]])
-    heights = [t.height[t.nearest(point)[0]] for t in (first, second)]
-    return bool(abs(heights[0] - heights[1]) > LEVEL)
+    def cross(self, first: int, second: int) -> bool:
+        """Whether two chains cross at an angle, on one level."""
+        (one, i), (other, j) = self._middles(first, second)
+        angle = abs((one.heading(i) - other.heading(j) + np.pi) % (2 * np.pi) - np.pi)
+        is_steep = _CROSSING_ANGLE < angle < np.pi - _CROSSING_ANGLE
+        return is_steep and not self.are_stacked(first, second)
 
 
 def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[LaneGraph, int]:
-    """Make intersections where lanes cross on one level without a junction.
-
-    Returns:
-        The graph, new where something was cut, and how many pairs of lanes cross.
-    """
+    """The graph with intersections where lanes cross on one level, and how many pairs cross."""
     polygons = [lane_polygon(*shapes.joined_borders(lane.pieces)) for lane in graph.lanes]
     levels = Levels(od, shapes, [lane.pieces for lane in graph.lanes], polygons)
     intervals: dict[int, list[tuple[float, float]]] = defaultdict(list)
@@ -116,34 +116,23 @@ def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[Lane
     for pair in overlapping(polygons):
         if graph.lanes[pair[0]].block == graph.lanes[pair[1]].block:
             continue
-        traces = [levels.trace(lane) for lane in pair]
-        region = shapely.intersection(polygons[pair[0]], polygons[pair[1]])
-        if not _cross(traces[0], traces[1], region):
+        if not levels.cross(*pair):
             continue
         crossings += 1
-        corners = shapely.get_coordinates(region)
-        for lane, points in zip(pair, traces, strict=True):
+        corners = shapely.get_coordinates(levels.region(*pair))
+        for lane in pair:
+            points = levels.trace(lane)
             along = points.distance[points.nearest(corners)]
             span = float(along.min()) - _MARGIN, float(along.max()) + _MARGIN
             intervals[graph.lanes[lane].block].append(span)
     return (_Cutter(graph, intervals).cut() if crossings else graph), crossings
 
 
-def _cross(first: Trace, second: Trace, region: shapely.Geometry) -> bool:
-    if are_stacked(first, second, region):
-        return False
-    point = np.array([[region.centroid.x, region.centroid.y]])
-    turn = first.heading(first.nearest(point)[0]) - second.heading(second.nearest(point)[0])
-    angle = abs((turn + np.pi) % (2 * np.pi) - np.pi)
-    return bool(_CROSSING_ANGLE < angle < np.pi - _CROSSING_ANGLE)
-
-
 class _Cutter:
     """Cuts roadblocks at intervals; what lies in the intervals becomes connectors."""
 
     def __init__(self, graph: LaneGraph, intervals: dict[int, list[tuple[float, float]]]) -> None:
-        self.old = graph
-        self.intervals = intervals
+        self.old, self.intervals = graph, intervals
         self.blocks: dict[tuple[int, int], int] = {}
         self.lanes: list[LaneRun] = []
         self.inner: list[ConnectorRun] = []
@@ -261,10 +250,7 @@ def subtract_overlaps(
 ) -> tuple[list[shapely.Polygon], int]:
     """Polygons without the overlaps, which go to the shorter of two; and how many there were.
 
-    Args:
-        polygons: Areas.
-        lengths: How long each is [m].
-        stacked: Pairs (i, j), i < j, that may overlap.
+    Pairs (i, j), i < j, in `stacked` may overlap.
     """
     out = list(polygons)
     pairs = [pair for pair in overlapping(polygons) if pair not in stacked]

@@ -16,11 +16,7 @@ MAX_LANE_LENGTH = 3e6  # m, of all lanes together
 
 
 def prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
-    """The file in the frame of its header, without roads that cannot be drawn.
-
-    Args:
-        od: The file.
-        warnings: Takes a count per kind of what is wrong with the roads.
+    """The file in the frame of its header, without roads that cannot be drawn; counts them.
 
     Raises:
         MapError: The file has more road than one map can hold.
@@ -68,12 +64,10 @@ def _placed(road: records.Road, offset: tuple[float, float, float, float]) -> re
 
 def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:
     gaps, _ = ReferenceLine(road.geometries).joints()
-    small = int(((gaps > GAP_NOTED) & (gaps <= GAP_SERIOUS)).sum())
-    serious = int((gaps > GAP_SERIOUS).sum())
-    if small:
-        warnings[f"gap of more than {GAP_NOTED:g} m between geometries"] += small
-    if serious:
-        warnings[f"gap of more than {GAP_SERIOUS:g} m between geometries"] += serious
+    for low, high in ((GAP_NOTED, GAP_SERIOUS), (GAP_SERIOUS, np.inf)):
+        count = int(((gaps > low) & (gaps <= high)).sum())
+        if count:
+            warnings[f"gap of more than {low:g} m between geometries"] += count
 
 
 def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:

@@ -14,25 +14,9 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
+from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.elements import CUBIC, Reader, read_object, read_signal
-from shiftsim.data.opendrive.records import (
-    ARC,
-    LINE,
-    PARAM_POLY3,
-    POLY3,
-    SPEED_UNITS,
-    SPIRAL,
-    Connection,
-    Geometry,
-    Junction,
-    Lane,
-    LaneSection,
-    OpenDrive,
-    Road,
-    RoadLink,
-    RoadType,
-    Speed,
-)
+from shiftsim.data.opendrive.records import OpenDrive, Road
 from shiftsim.errors import ConversionError
 
 MAX_BYTES = 200_000_000
@@ -48,12 +32,6 @@ def read_opendrive(path: Path) -> OpenDrive:
 
     Entities, document types and external references are refused: the file is data, not a program.
 
-    Args:
-        path: The file.
-
-    Returns:
-        Its roads and junctions; an empty file gives none.
-
     Raises:
         ConversionError: The file is missing, too large, not OpenDRIVE, or broken beyond repair.
     """
@@ -61,51 +39,38 @@ def read_opendrive(path: Path) -> OpenDrive:
         size = path.stat().st_size
         data = path.read_bytes() if size <= MAX_BYTES else b""
     except OSError as error:
-        raise ConversionError(
-            f"{path.name}: cannot be read: {error.strerror}", "give the path of an .xodr file"
-        ) from error
+        what = f"{path.name}: cannot be read: {error.strerror}"
+        raise ConversionError(what, "give the path of an .xodr file") from error
     if size > MAX_BYTES:
-        raise ConversionError(
-            f"{path.name}: {size} bytes, more than {MAX_BYTES}", "cut the map into smaller files"
-        )
+        what = f"{path.name}: {size} bytes, more than {MAX_BYTES}"
+        raise ConversionError(what, "cut the map into smaller files")
     return parse_opendrive(data, path.name)
 
 
 def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     """Like `read_opendrive`, from the bytes of a file."""
     reader = Reader(source)
-    header: Any = None
+    header: tuple[Any, str | None, Any] = (("", ""), None, None)  # revision, geoReference, offset
     roads: dict[str, Road] = {}
-    seen: set[str] = set()
-    junctions: dict[str, Junction] = {}
+    seen: set[tuple[str, str]] = set()
+    junctions: dict[str, records.Junction] = {}
     for element in _top_elements(_strip_junk(data, reader), reader):
         name = element.get("id", "")
         if element.tag == "header":
+            reader.place = "header"
             header = _read_header(element, reader)
-        elif element.tag == "road":
-            reader.place = f"road {name!r}"
-            if name in seen:
-                raise reader.error("its id occurs twice", "give every road its own id")
-            seen.add(name)
+            continue
+        reader.place = f"{element.tag} {name!r}"
+        if (element.tag, name) in seen:
+            raise reader.error("its id occurs twice", f"give every {element.tag} its own id")
+        seen.add((element.tag, name))
+        if element.tag == "road":
             road = _read_road(element, name, reader)
             if road is not None:
                 roads[name] = road
         else:
-            reader.place = f"junction {name!r}"
-            if name in junctions:
-                raise reader.error("its id occurs twice", "give every junction its own id")
             junctions[name] = _read_junction(element, name, reader)
-    revision, geo_reference, offset = header or (("", ""), None, None)
-    return OpenDrive(
-        source=source,
-        revision=revision,
-        geo_reference=geo_reference,
-        offset=offset,
-        roads=roads,
-        junctions=junctions,
-        counts=dict(reader.counts),
-        warnings=dict(reader.warnings),
-    )
+    return OpenDrive(source, *header, roads, junctions, dict(reader.counts), dict(reader.warnings))
 
 
 def _strip_junk(data: bytes, reader: Reader) -> bytes:
@@ -150,10 +115,8 @@ def _top_elements(data: bytes, reader: Reader) -> Iterator[Any]:
 
 def _check_root(root: Any, reader: Reader) -> None:
     if root.getroottree().docinfo.doctype:
-        raise ConversionError(
-            f"{reader.source}: has a DOCTYPE, which OpenDRIVE does not use",
-            "remove the DOCTYPE and its entities",
-        )
+        what = f"{reader.source}: has a DOCTYPE, which OpenDRIVE does not use"
+        raise ConversionError(what, "remove the DOCTYPE and its entities")
     if root.getparent() is not None or etree.QName(root).localname != "OpenDRIVE":
         raise _not_opendrive(reader)
 
@@ -170,7 +133,6 @@ def _drop_namespaces(element: Any) -> None:
 
 
 def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
-    reader.place = "header"
     geo = element.findtext("geoReference")
     shift = element.find("offset")
     offset = None
@@ -193,9 +155,8 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
     reader.counts["road with left-hand traffic"] += element.get("rule") == "LHT"
     geometries = _read_plan_view(element.find("planView"), reader)
     stated = reader.number(element, "length", np.nan)
-    sections = (
-        [] if lanes is None else [_read_section(e, reader) for e in lanes.iter("laneSection")]
-    )
+    found = () if lanes is None else lanes.iter("laneSection")
+    sections = [_read_section(e, reader) for e in found]
     if geometries is None:
         return None
     end = geometries[-1].s + geometries[-1].length
@@ -208,6 +169,7 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
         reader.warn("records out of order")
     link = element.find("link")
     objects, signals = element.find("objects"), element.find("signals")
+    placed = [] if signals is None else signals.iter("signal", "signalReference")
     return Road(
         id=name,
         length=min(stated, end),
@@ -221,34 +183,26 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
         predecessor=_read_link(link, "predecessor"),
         successor=_read_link(link, "successor"),
         types=_read_types(element.findall("type"), reader),
-        objects=()
-        if objects is None
-        else tuple(read_object(e, reader) for e in objects.findall("object")),
-        signals=()
-        if signals is None
-        else tuple(
-            read_signal(e, reader)
-            for e in signals.iter("signal", "signalReference")
-            if e.get("s") is not None
+        objects=tuple(
+            read_object(e, reader) for e in (() if objects is None else objects.findall("object"))
         ),
+        signals=tuple(read_signal(e, reader) for e in placed if e.get("s") is not None),
     )
 
 
-def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None:
-    records: list[Geometry] = []
-    tiny: list[Geometry] = []
+def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...] | None:
+    geometries: list[records.Geometry] = []
+    tiny: list[records.Geometry] = []
     for child in () if element is None else element.findall("geometry"):
-        shape: Any = next(
-            (e for e in child if e.tag in (LINE, ARC, SPIRAL, POLY3, PARAM_POLY3)), None
-        )
-        kind = LINE if shape is None else shape.tag
+        shape: Any = next((e for e in child if e.tag in records.SHAPES), None)
+        kind = records.LINE if shape is None else shape.tag
         reader.counts[f"geometry {kind}"] += 1
         length = reader.number(child, "length")
         s = reader.number(child, "s")
         x, y, heading = (reader.number(child, k, np.nan) for k in ("x", "y", "hdg"))
         if shape is None:
             reader.warn("geometry without a shape taken as a line")
-        if kind == PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
+        if kind == records.PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
             reader.warn("road left out: paramPoly3 without coefficients")
             return None
         coefficients, p_end = _read_shape(shape, length, reader)
@@ -260,70 +214,72 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[Geometry, ...] | None
             return None
         if length < TINY_LENGTH:
             reader.warn("geometry without length, skipped")
-            tiny.append(Geometry(s, x, y, heading, max(length, 0.0), LINE))
+            tiny.append(records.Geometry(s, x, y, heading, max(length, 0.0), records.LINE))
         else:
-            records.append(Geometry(s, x, y, heading, length, kind, coefficients, p_end))
-    records = records or tiny[:1]  # a road without length still links its neighbours
-    if not records:
+            geometries.append(records.Geometry(s, x, y, heading, length, kind, coefficients, p_end))
+    geometries = geometries or tiny[:1]  # a road without length still links its neighbours
+    if not geometries:
         reader.warn("road left out: no geometry")
         return None
-    if any(a.s > b.s for a, b in pairwise(records)):
+    if any(a.s > b.s for a, b in pairwise(geometries)):
         reader.warn("records out of order")
-    return tuple(sorted(records, key=lambda record: record.s))
+    return tuple(sorted(geometries, key=lambda record: record.s))
 
 
 def _read_shape(shape: Any, length: float, reader: Reader) -> tuple[tuple[float, ...], float]:
-    if shape is None or shape.tag == LINE:
+    if shape is None or shape.tag == records.LINE:
         return (), 0.0
-    names = {ARC: ("curvature",), SPIRAL: ("curvStart", "curvEnd"), POLY3: CUBIC}
+    names = {
+        records.ARC: ("curvature",),
+        records.SPIRAL: ("curvStart", "curvEnd"),
+        records.POLY3: CUBIC,
+    }
     values = tuple(reader.number(shape, k) for k in names.get(shape.tag, _PARAM_CUBIC))
     return values, length if shape.get("pRange") == "arcLength" else 1.0
 
 
-def _read_link(link: Any, name: str) -> RoadLink | None:
+def _read_link(link: Any, name: str) -> records.RoadLink | None:
     found = None if link is None else link.find(name)
     if found is None or found.get("elementId") is None:
         return None
-    contact = found.get("contactPoint")
-    return RoadLink(
-        found.get("elementType", "road"),
-        found.get("elementId"),
-        contact if contact in ("start", "end") else None,
+    return records.RoadLink(
+        found.get("elementType", "road"), found.get("elementId"), _contact(found)
     )
 
 
-def _read_types(elements: list[Any], reader: Reader) -> tuple[RoadType, ...]:
+def _contact(element: Any) -> str | None:
+    contact = element.get("contactPoint")
+    return contact if contact in ("start", "end") else None
+
+
+def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, ...]:
     types = []
     for element in elements:
-        speed = element.find("speed")
+        s, speed = reader.number(element, "s"), element.find("speed")
+        limit = None if speed is None else _read_speed(speed, reader)
         types.append(
-            RoadType(
-                reader.number(element, "s"),
-                element.get("type", "unknown"),
-                element.get("country", ""),
-                None if speed is None else _read_speed(speed, reader),
-            )
+            records.RoadType(s, element.get("type", "unknown"), element.get("country", ""), limit)
         )
     return tuple(sorted(types, key=lambda record: record.s))
 
 
-def _read_speed(element: Any, reader: Reader) -> Speed:
+def _read_speed(element: Any, reader: Reader) -> records.Speed:
     unit = element.get("unit", "")
     reader.counts[f"speed {unit or 'm/s'}"] += 1
     begin = reader.number(element, "sOffset")
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
-        return Speed(begin, None)
+        return records.Speed(begin, None)
     # nuPlan rule 508: without a unit in m/s
-    limit = reader.number(element, "max") * SPEED_UNITS.get(unit or "m/s", np.nan)
+    limit = reader.number(element, "max") * records.SPEED_UNITS.get(unit or "m/s", np.nan)
     if not (np.isfinite(limit) and limit > 0):
         reader.warn("speed limit that is not a positive number in a known unit")
-        return Speed(begin, None)
-    return Speed(begin, limit)
+        return records.Speed(begin, None)
+    return records.Speed(begin, limit)
 
 
-def _read_section(element: Any, reader: Reader) -> LaneSection:
-    lanes: dict[int, Lane] = {}
+def _read_section(element: Any, reader: Reader) -> records.LaneSection:
+    lanes: dict[int, records.Lane] = {}
     reader.counts["lane section"] += 1
     for child in element.iter("lane"):
         number = reader.integer(child, "id")
@@ -345,10 +301,10 @@ def _read_section(element: Any, reader: Reader) -> LaneSection:
     start = reader.number(element, "s")
     if not np.isfinite(start):
         raise reader.error(f"laneSection (line {element.sourceline}) has s={start}", "correct s")
-    return LaneSection(max(start, 0.0), lanes)
+    return records.LaneSection(max(start, 0.0), lanes)
 
 
-def _read_lane(element: Any, number: int, reader: Reader) -> Lane:
+def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:
     link = element.find("link")
     widths, borders = element.findall("width"), element.findall("border")
     reader.counts["width"] += len(widths)
@@ -357,7 +313,7 @@ def _read_lane(element: Any, number: int, reader: Reader) -> Lane:
     reader.counts[f"lane type {kind or 'none'}"] += 1
     if not widths and not borders:
         reader.warn("lane without width and border")
-    lane = Lane(
+    lane = records.Lane(
         id=number,
         type=kind or "none",
         widths=reader.cubics(widths, "sOffset"),
@@ -372,8 +328,8 @@ def _read_lane(element: Any, number: int, reader: Reader) -> Lane:
         ),
         direction=element.get("direction", "standard"),
     )
-    records = lane.widths if len(lane.widths) else lane.borders
-    if len(records) and records[0, 0] > 1e-6:
+    cubics = lane.widths if len(lane.widths) else lane.borders
+    if len(cubics) and cubics[0, 0] > 1e-6:
         reader.warn("lane width begins after its section")
     return lane
 
@@ -383,27 +339,18 @@ def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
     return tuple(i for i in found if i is not None)
 
 
-def _read_junction(element: Any, name: str, reader: Reader) -> Junction:
+def _read_junction(element: Any, name: str, reader: Reader) -> records.Junction:
     kind = element.get("type", "default")
     reader.counts[f"junction type {kind}"] += 1
     connections = []
     for child in element.findall("connection"):
-        links = []
-        for link in child.findall("laneLink"):
-            pair = reader.integer(link, "from"), reader.integer(link, "to")
-            if pair[0] is not None and pair[1] is not None:
-                links.append((pair[0], pair[1]))
+        links = reader.pairs(child, "laneLink", ("from", "to"))
         reader.counts["connection"] += 1
         reader.counts["lane link in a junction"] += len(links)
-        contact = child.get("contactPoint")
+        into = child.get("connectingRoad") or child.get("linkedRoad") or ""
         connections.append(
-            Connection(
-                child.get("incomingRoad", ""),
-                child.get("connectingRoad") or child.get("linkedRoad") or "",
-                contact if contact in ("start", "end") else None,
-                tuple(links),
-            )
+            records.Connection(child.get("incomingRoad", ""), into, _contact(child), links)
         )
     if not connections:
         reader.warn("junction without connections")
-    return Junction(name, kind, tuple(connections))
+    return records.Junction(name, kind, tuple(connections))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from shiftsim.arrays import FloatArray
 
-LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
+SHAPES = LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s
 
 # Types of lanes by what they are used for.
@@ -115,8 +115,7 @@ class RoadObject:
     heading: float  # relative to the road [rad]
     length: float | None  # along the object's x axis [m]; None where not given
     width: float | None  # across [m]; None where not given
-    # polygons; the box of length and width holds where there are none
-    outlines: tuple[Outline, ...] = ()
+    outlines: tuple[Outline, ...] = ()  # where there are none, the box of length and width holds
     repeats: tuple[Repeat, ...] = ()  # copies
     lanes: tuple[tuple[int, int], ...] = ()  # lanes it is valid for; empty for all
 
@@ -174,8 +173,7 @@ class Connection:
     incoming: str  # road that leads to the junction
     connecting: str  # road inside the junction, or the linked road of a direct junction
     contact: str | None  # which end of the connecting road touches the incoming one
-    # pairs (lane of the incoming road, lane of the connecting road)
-    lane_links: tuple[tuple[int, int], ...]
+    lane_links: tuple[tuple[int, int], ...]  # pairs (incoming lane, connecting lane)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +192,7 @@ class OpenDrive:
     source: str  # name of the file, for messages
     revision: tuple[str, str]  # major and minor version as written
     geo_reference: str | None  # as written; None where there is none
-    # header offset x, y, z [m], heading [rad]; None where there is none
-    offset: tuple[float, float, float, float] | None
+    offset: tuple[float, float, float, float] | None  # of the header: x, y, z [m], heading [rad]
     roads: dict[str, Road]  # by id, in the order of the file
     junctions: dict[str, Junction]  # by id, in the order of the file
     counts: dict[str, int]  # how many records of each kind the file holds, dropped ones included

@@ -62,10 +62,8 @@ class Shapes:
         """Borders of all lanes of a section."""
         key = road, section
         if key not in self._sections:
-            stops = self._stops.get(key, set())
-            self._sections[key] = _sample_section(
-                self._od.roads[road], section, self._lines[road], stops
-            )
+            place = self._od.roads[road], section, self._lines[road]
+            self._sections[key] = _sample_section(*place, self._stops.get(key, set()))
         return self._sections[key]
 
     def borders(self, piece: Piece) -> tuple[FloatArray, FloatArray]:
@@ -81,10 +79,8 @@ class Shapes:
 
     def joined_borders(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
         """Borders of a chain of pieces; ends that nearly meet become one vertex."""
-        parts = [self.borders(piece) for piece in pieces]
-        left = _join([part[0] for part in parts])
-        right = _join([part[1] for part in parts])
-        return left, right
+        left, right = zip(*map(self.borders, pieces), strict=True)
+        return _join(left), _join(right)
 
     def centers(self, piece: Piece, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
@@ -98,38 +94,22 @@ class Shapes:
 
     def baseline(
         self,
-        pieces: Sequence[Piece],
-        start: FloatArray | None = None,
-        end: FloatArray | None = None,
+        pieces: Sequence[Piece],  # in the direction of travel
+        start: FloatArray | None = None,  # (2,) where it must begin, near its own start [m]
+        end: FloatArray | None = None,  # (2,) where it must end [m]
     ) -> FloatArray:
-        """Centre line of a chain of pieces with a vertex about every 0.25 m.
-
-        Args:
-            pieces: In the direction of travel.
-            start: (2,) point it must begin at, near its own; None for its own [m].
-            end: (2,) point it must end at [m].
-        """
+        """Centre line of a chain of pieces with a vertex about every 0.25 m."""
         pieces = [part for piece in pieces for part in self._without_steps(piece)]
         firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
         jumps = np.zeros((len(pieces) + 1, 2))
-        for number in range(1, len(pieces)):
-            jumps[number] = firsts[number][0] - firsts[number - 1][1]
+        for number, (before, after) in enumerate(pairwise(firsts), start=1):
+            jumps[number] = after[0] - before[1]
         shifts = [(-0.5 * jumps[i], 0.5 * jumps[i + 1]) for i in range(len(pieces))]
         if start is not None:
             shifts[0] = (start - firsts[0][0], shifts[0][1])
         if end is not None:
             shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
-        grids = []
-        for piece in pieces:
-            count = max(int(np.ceil(piece.length / _DENSE_STEP)), 2)
-            grids.append(np.linspace(0.0, 1.0, count + 1))
-        dense = np.concatenate(
-            [
-                self._shifted(piece, share, shift)
-                for piece, share, shift in zip(pieces, grids, shifts, strict=True)
-            ]
-        )
-        return _divide(dense)
+        return _divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
 
     def _without_steps(self, piece: Piece) -> list[Piece]:
         """The piece, cut where the middle of the lane jumps."""
@@ -145,10 +125,9 @@ class Shapes:
             stops.reverse()
         return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
 
-    def _shifted(
-        self, piece: Piece, share: FloatArray, shift: tuple[FloatArray, FloatArray]
-    ) -> FloatArray:
-        """Centre points at shares of a piece, its two ends moved by `shift` (2,), (2,)."""
+    def _shifted(self, piece: Piece, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Dense centre points of a piece, its two ends moved by `shift` (2,), (2,)."""
+        share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _DENSE_STEP)), 2) + 1)
         points = self.centers(piece, piece.begin + share * (piece.end - piece.begin))
         room = 0.5 if shift[0].any() and shift[1].any() else 1.0
         reach = min(_BLEND / piece.length, room) if piece.length > 0 else room
@@ -189,14 +168,9 @@ def _divide(dense: FloatArray) -> FloatArray:
 
 
 def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """A line (K, 2) whose ends leave and arrive in the directions of its neighbours.
+    """A line (K, 2) whose ends leave and arrive in the directions of the lines before and after.
 
     Only where they differ enough to be a kink; the line moves aside by some centimetres.
-
-    Args:
-        line: The line [m].
-        before: (K, 2) line that ends where it begins [m].
-        after: (K, 2) line that begins where it ends [m].
     """
     bent = _bend_start(line, before[-1] - before[-2])
     return _bend_start(bent[::-1], after[0] - after[1])[::-1]
@@ -280,12 +254,9 @@ def _sample_section(
 
 def _evaluate_section(road: Road, section: int, line: ReferenceLine, s: FloatArray) -> SectionShape:
     borders, poses = section_borders(road, section, s, repair=True), line.evaluate(s)
-    points = {id(t): poses.offset(t) for t in borders.inner.values()}
-    outer = {}
-    for number, t in borders.outer.items():
-        points.setdefault(id(t), poses.offset(t))
-        outer[number] = points[id(t)]
-    return SectionShape(s, {n: points[id(t)] for n, t in borders.inner.items()}, outer)
+    sides = borders.inner, borders.outer
+    points = {id(t): poses.offset(t) for side in sides for t in side.values()}
+    return SectionShape(s, *({n: points[id(t)] for n, t in side.items()} for side in sides))
 
 
 def _breakpoints(road: Road, section: int, begin: float, end: float) -> list[float]:
