@@ -156,10 +156,7 @@ def _line(style: Style) -> dict[str, Any]:
 
 
 def _dots(
-    groups: Sequence[Group],
-    places: Sequence[_Place],
-    styles: dict[str, Style],
-    allow_partial: bool,
+    groups: Sequence[Group], places: Sequence[_Place], styles: dict[str, Style], allow_partial: bool
 ) -> Any:
     """Planners side by side at every place, one panel per traffic mode."""
     modes = traffics(groups)

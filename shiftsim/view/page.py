@@ -84,13 +84,7 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
 
 
 def framed(
-    body: str,
-    *,
-    title: str,
-    meta: str,
-    styles: Sequence[str],
-    scripts: Sequence[str],
-    **parts: str,
+    body: str, *, title: str, meta: str, styles: Sequence[str], scripts: Sequence[str], **parts: str
 ) -> str:
     """A whole page from files of this folder, with one head for all pages.
 
