@@ -240,9 +240,8 @@ class EgoState(InterpolatableState):
     @cached_property
     def waypoint(self) -> Waypoint:
         """The box, with the velocity of the rear axle."""
-        return Waypoint(
-            self.time_point, self.car_footprint, self.dynamic_car_state.rear_axle_velocity_2d
-        )
+        velocity = self.dynamic_car_state.rear_axle_velocity_2d
+        return Waypoint(self.time_point, self.car_footprint, velocity)
 
     @cached_property
     def agent(self) -> AgentState:
@@ -312,14 +311,10 @@ class KinematicBicycleModel:
         step_bicycle(row, accel, rate, self._vehicle.wheel_base, sampling_time.time_s, row)
         x, y, heading, vx, vy, ax, ay, steering, *turning = row.tolist()
         steering_rate, yaw_rate, yaw_accel = turning
+        pose, velocity = StateSE2(x, y, heading), StateVector2D(vx, vy)
+        reached = StateVector2D(ax, ay)
+        now = TimePoint(time + sampling_time.time_us)
+        turn = (yaw_rate, yaw_accel, steering_rate)
         return EgoState.build_from_rear_axle(
-            StateSE2(x, y, heading),
-            StateVector2D(vx, vy),
-            StateVector2D(ax, ay),
-            steering,
-            TimePoint(time + sampling_time.time_us),
-            self._vehicle,
-            angular_vel=yaw_rate,
-            angular_accel=yaw_accel,
-            tire_steering_rate=steering_rate,
+            pose, velocity, reached, steering, now, self._vehicle, True, *turn
         )
