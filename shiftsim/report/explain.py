@@ -65,7 +65,10 @@ def select_tasks(
     scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in _rows_of(run.metrics, full):
-        metrics.setdefault(_key(row), []).append(_with_role(row))
+        name = row["metric"]
+        role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
+        row |= {"role": role, "weight": WEIGHTS.get(name)}
+        metrics.setdefault(_key(row), []).append(row)
     out = []
     for row in rows:
         cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
@@ -76,12 +79,6 @@ def select_tasks(
 def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = table.filter(pc.equal(table["token"], token)).to_pylist()
     return rows
-
-
-def _with_role(row: dict[str, Any]) -> dict[str, Any]:
-    name = row["metric"]
-    role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
-    return {**row, "role": role, "weight": WEIGHTS.get(name)}
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
