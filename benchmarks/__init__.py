@@ -62,12 +62,11 @@ def load_track(name: str) -> Track:
 def known_sets() -> tuple[KnownSet, ...]:
     """The lists of scenarios that are known, small ones before those that hold them."""
     columns = ("label", "thresholds", "count", "sha256")
-    return tuple(
-        KnownSet(
-            name, *(table[column] for column in columns), tokens=tuple(table.get("tokens", ()))
-        )
-        for name, table in _read("sets").items()
-    )
+    out = []
+    for name, table in _read("sets").items():
+        values = {column: table[column] for column in columns}
+        out.append(KnownSet(name=name, tokens=tuple(table.get("tokens", ())), **values))
+    return tuple(out)
 
 
 @cache
