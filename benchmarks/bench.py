@@ -50,13 +50,9 @@ def plan_bench(
 ) -> Plan:
     """Check all runs of a track before the first one starts.
 
-    Args:
-        track: The track.
-        settings: Settings of `RunConfig`; traffic, noise, seeds and thresholds are the track's
-            unless they are given.
-        reference: Store, or `STORE:SPLIT`, with the scenarios of the track's published list;
-            empty to leave it out.
-        out: The folder; by default `runs/<id>`.
+    Traffic, noise, seeds and thresholds are the track's unless the settings, of `RunConfig`, give
+    them. `reference` is the store, or `STORE:SPLIT`, with the scenarios of the track's published
+    list, empty to leave it out; `out` the folder, by default `runs/<id>`.
 
     Raises:
         ShiftsimError: A setting is wrong, or something is missing.
@@ -163,9 +159,8 @@ class _Total:
 def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:
     """The runs of folders, where the folder of a benchmark stands for all of its runs.
 
-    Returns:
-        The runs, the lists of scenarios that benchmarks name, and a function that makes the
-        tables which only a benchmark has.
+    Returns the runs, the lists of scenarios that benchmarks name, and a function that makes the
+    tables which only a benchmark has.
 
     Raises:
         ShiftsimError: A folder is neither, or damaged.

@@ -90,16 +90,10 @@ def _unused(name: str, tables: Sequence[Table]) -> str:
 def write_report(
     folder: Path, tables: Sequence[Table], drawn: Sequence[Figure], styles: Sequence[str]
 ) -> list[Path]:
-    """Write tables and pictures.
+    """Write tables and pictures to a folder, made if needed, and return the files.
 
-    Args:
-        folder: Where to; made if needed. Files of the same names are replaced.
-        tables: The tables: one file per format, and one per table for `csv`.
-        drawn: The pictures, written as PNG, and shown in the HTML page.
-        styles: Of `FORMATS`.
-
-    Returns:
-        The files.
+    There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
+    files and shown in the HTML page. Files of the same names are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}

@@ -35,16 +35,9 @@ def select_tasks(
 ) -> list[dict[str, Any]]:
     """The tasks of one scenario, each with its score row and its metric rows.
 
-    Args:
-        run: The run.
-        token: Scenario token, or an unambiguous beginning of one.
-        planner: Only this planner.
-        noise: Only this noise.
-        seed: Only this seed.
-
-    Returns:
-        Rows of `tasks.parquet`, with `cls`, `why` and `metrics` added; every metric has its `role`
-        (`multiplier`, `weighted` or empty) and `weight`.
+    The token may be an unambiguous beginning of one. Rows are those of `tasks.parquet`, with `cls`,
+    `why` and `metrics` added; every metric has its `role` (`multiplier`, `weighted` or empty) and
+    `weight`.
 
     Raises:
         ConfigError: There is no such task, or several scenarios begin like that.

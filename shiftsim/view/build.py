@@ -189,13 +189,8 @@ def write_site(
 ) -> int:
     """Write one page per scenario and `index.html`, which lists them; returns how many pages.
 
-    Args:
-        folder: Where the list goes; the pages go to its subfolder `replay`.
-        galleries: One per store.
-        title: Heading of the list.
-        limit: At most so many pages, the lowest scores first; 0 for all.
-        above: HTML between heading and list; the caller escapes what comes from data.
-        on_progress: Called with the number of pages written and their total.
+    The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
+    subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
     """
     pages = folder / "replay"
     pages.mkdir(parents=True, exist_ok=True)

@@ -114,10 +114,9 @@ class StandInFinder(MetaPathFinder, Loader):
     def exec_module(self, module: ModuleType) -> None:
         """Put the names into a module."""
         if wanted := MODULES.get(module.__name__, "").split():
-            sources = [
-                import_module(f"shiftsim.compat.nuplan.stand_ins.{name}") for name in _SOURCES
-            ]
-            known = {name: value for source in sources for name, value in vars(source).items()}
+            known: dict[str, Any] = {}
+            for source in _SOURCES:
+                known |= vars(import_module(f"shiftsim.compat.nuplan.stand_ins.{source}"))
             vars(module).update((name, known[name]) for name in wanted)
 
         def missing(name: str) -> Any:
@@ -129,8 +128,7 @@ class StandInFinder(MetaPathFinder, Loader):
 def install() -> bool:
     """Make `import nuplan…` work in this process; call it before importing a planner's module.
 
-    Returns:
-        Whether the stand-ins are used: false where nuPlan's devkit is there.
+    Returns whether the stand-ins are used: false where nuPlan's devkit is there.
     """
     if any(isinstance(finder, StandInFinder) for finder in sys.meta_path):
         return True

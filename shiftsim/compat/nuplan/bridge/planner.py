@@ -42,7 +42,7 @@ class NuplanPlanner:
             ConfigError: It asks for sensor data.
         """
         if self._scene is not None:
-            self._take_report()
+            self.close()
             self._planner = self._make()
         wanted = self._planner.observation_type()
         if not (inspect.isclass(wanted) and issubclass(wanted, DetectionsTracks)):
@@ -74,10 +74,7 @@ class NuplanPlanner:
     def close(self) -> None:
         """Take the last report."""
         if self._scene is not None:
-            self._take_report()
-
-    def _take_report(self) -> None:
-        self.report = self._planner.generate_planner_report()
+            self.report = self._planner.generate_planner_report()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "NuplanPlanner":
         return NuplanPlanner(copy.deepcopy(self._source, memo), self._arguments)

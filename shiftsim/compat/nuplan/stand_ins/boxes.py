@@ -87,15 +87,8 @@ def get_pacifica_parameters() -> VehicleParameters:
 class OrientedBoxPointType(IntEnum):
     """Points of a box."""
 
-    FRONT_BUMPER = 1
-    REAR_BUMPER = 2
-    FRONT_LEFT = 3
-    FRONT_RIGHT = 4
-    REAR_LEFT = 5
-    REAR_RIGHT = 6
-    CENTER = 7
-    LEFT = 8
-    RIGHT = 9
+    FRONT_BUMPER, REAR_BUMPER, FRONT_LEFT, FRONT_RIGHT = range(1, 5)
+    REAR_LEFT, REAR_RIGHT, CENTER, LEFT, RIGHT = range(5, 10)
 
 
 # half lengths forward and half widths to the left of the centre

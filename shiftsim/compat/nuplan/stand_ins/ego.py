@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -121,24 +121,19 @@ def get_acceleration_shifted(
     return StateVector2D(*(ref_accel.array + shift))
 
 
+@dataclass(eq=False, repr=False)
 class DynamicCarState:
     """Velocities and accelerations of a car, in its own frame."""
 
-    def __init__(
-        self,
-        rear_axle_to_center_dist: float,
-        rear_axle_velocity_2d: StateVector2D,
-        rear_axle_acceleration_2d: StateVector2D,
-        angular_velocity: float = 0.0,
-        angular_acceleration: float = 0.0,
-        tire_steering_rate: float = 0.0,
-    ) -> None:
+    rear_axle_to_center_dist: InitVar[float]
+    rear_axle_velocity_2d: StateVector2D
+    rear_axle_acceleration_2d: StateVector2D
+    angular_velocity: float = 0.0
+    angular_acceleration: float = 0.0
+    tire_steering_rate: float = 0.0
+
+    def __post_init__(self, rear_axle_to_center_dist: float) -> None:
         self._center = StateVector2D(rear_axle_to_center_dist, 0.0)
-        self.rear_axle_velocity_2d = rear_axle_velocity_2d
-        self.rear_axle_acceleration_2d = rear_axle_acceleration_2d
-        self.angular_velocity = angular_velocity
-        self.angular_acceleration = angular_acceleration
-        self.tire_steering_rate = tire_steering_rate
 
     @classmethod
     def build_from_rear_axle(cls, *values: Any, **named: Any) -> "DynamicCarState":
@@ -197,14 +192,9 @@ class EgoState(InterpolatableState):
     ) -> "EgoState":
         """From what is known at the rear axle."""
         footprint = CarFootprint.build_from_rear_axle(rear_axle_pose, vehicle_parameters)
-        motion = DynamicCarState(
-            footprint.rear_axle_to_center_dist,
-            rear_axle_velocity_2d,
-            rear_axle_acceleration_2d,
-            angular_vel,
-            angular_accel,
-            tire_steering_rate,
-        )
+        distance, velocity = footprint.rear_axle_to_center_dist, rear_axle_velocity_2d
+        turning = (angular_vel, angular_accel, tire_steering_rate)
+        motion = DynamicCarState(distance, velocity, rear_axle_acceleration_2d, *turning)
         return cls(footprint, motion, tire_steering_angle, is_in_auto_mode, time_point)
 
     @classmethod
@@ -222,14 +212,11 @@ class EgoState(InterpolatableState):
     ) -> "EgoState":
         """From what is known at the centre of the box."""
         footprint = CarFootprint(center, vehicle_parameters)
-        back = StateVector2D(-footprint.rear_axle_to_center_dist, 0.0)
-        motion = DynamicCarState(
-            footprint.rear_axle_to_center_dist,
-            get_velocity_shifted(back, center_velocity_2d, angular_vel),
-            get_acceleration_shifted(back, center_acceleration_2d, angular_vel, angular_accel),
-            angular_vel,
-            angular_accel,
-        )
+        distance, turning = footprint.rear_axle_to_center_dist, (angular_vel, angular_accel)
+        back = StateVector2D(-distance, 0.0)
+        velocity = get_velocity_shifted(back, center_velocity_2d, angular_vel)
+        accel = get_acceleration_shifted(back, center_acceleration_2d, *turning)
+        motion = DynamicCarState(distance, velocity, accel, *turning)
         return cls(footprint, motion, tire_steering_angle, is_in_auto_mode, time_point)
 
     @property
