@@ -51,10 +51,7 @@ def load_track(name: str) -> Track:
     return Track(
         name=name,
         title=table["title"],
-        planners=tuple(table["planners"]),
-        traffic=tuple(table["traffic"]),
-        noise=tuple(table["noise"]),
-        seeds=tuple(table["seeds"]),
+        **{one: tuple(table[one]) for one in ("planners", "traffic", "noise", "seeds")},
         reference={one.name: one for one in known_sets()}[sets["reference"]],
         own_thresholds=sets["own_thresholds"],
         own_note=sets["own_note"],
@@ -64,26 +61,19 @@ def load_track(name: str) -> Track:
 @cache
 def known_sets() -> tuple[KnownSet, ...]:
     """The lists of scenarios that are known, small ones before those that hold them."""
-    return tuple(
-        KnownSet(
-            name=name,
-            label=table["label"],
-            thresholds=table["thresholds"],
-            count=table["count"],
-            sha256=table["sha256"],
-            tokens=tuple(table.get("tokens", ())),
-        )
-        for name, table in _read("sets").items()
-    )
+    columns = ("label", "thresholds", "count", "sha256")
+    out = []
+    for name, table in _read("sets").items():
+        values = {column: table[column] for column in columns}
+        out.append(KnownSet(name=name, tokens=tuple(table.get("tokens", ())), **values))
+    return tuple(out)
 
 
 @cache
 def published() -> Published:
     """The figures of the paper."""
     table = _read("published")
-    shift, noise, comparison = (
-        table[name] for name in ("semantic_shift", "noise_robustness", "comparison")
-    )
+    shift, noise = table["semantic_shift"], table["noise_robustness"]
     return Published(
         source=table["source"],
         cities=table["cities"],
@@ -92,8 +82,8 @@ def published() -> Published:
         semantic_shift=_tables(shift),
         noises=noise["columns"],
         robustness=_tables(noise),
-        sets=comparison["columns"],
-        comparison=comparison["rows"],
+        sets=table["comparison"]["columns"],
+        comparison=table["comparison"]["rows"],
     )
 
 

@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,9 @@ def plan_bench(
 ) -> Plan:
     """Check all runs of a track before the first one starts.
 
-    Args:
-        track: The track.
-        settings: Settings of `RunConfig`; traffic, noise, seeds and thresholds are the track's
-            unless they are given.
-        reference: Store, or `STORE:SPLIT`, with the scenarios of the track's published list;
-            empty to leave it out.
-        out: The folder; by default `runs/<id>`.
+    Traffic, noise, seeds and thresholds are the track's unless the settings, of `RunConfig`, give
+    them. `reference` is the store, or `STORE:SPLIT`, with the scenarios of the track's published
+    list, empty to leave it out; `out` the folder, by default `runs/<id>`.
 
     Raises:
         ShiftsimError: A setting is wrong, or something is missing.
@@ -72,20 +69,13 @@ def plan_bench(
         sets[track.reference.name] = values | rules
     folder = Path(out) if out else RUNS / _name(track, sets)
     _check_folder(folder, track)
-    runs = {
-        f"{name}-{traffic}": _prepared(
-            track, table | {"traffic": traffic}, folder / f"{name}-{traffic}"
-        )
-        for name, table in sets.items()
-        for traffic in modes
-    }
+    runs = {}
+    for name, traffic in product(sets, modes):
+        out_run = folder / f"{name}-{traffic}"  # the run goes on with what its folder holds
+        given = {"traffic": traffic, "out": str(out_run), "resume": out_run.exists()}
+        config = make_config(sets[name] | given, where=f"bench {track.name}")
+        runs[out_run.name] = prepare(config)
     return Plan(track, folder, runs, _own_list(next(iter(runs.values()))))
-
-
-def _prepared(track: Track, table: Mapping[str, Any], folder: Path) -> Prepared:
-    """One run; it goes on with what its folder holds."""
-    values = {**table, "out": str(folder), "resume": folder.exists()}
-    return prepare(make_config(values, where=f"bench {track.name}"))
 
 
 def _name(track: Track, sets: Mapping[str, Mapping[str, Any]]) -> str:
@@ -126,10 +116,8 @@ def run_bench(
 ) -> list[Run]:
     """Do all runs; those that are complete already are kept as they are.
 
-    Args:
-        plan: The benchmark.
-        on_progress: Called after every rollout, with counts over all runs.
-        argv: The command line, for the manifests.
+    `on_progress` is called after every rollout with counts over all runs; `argv`, the command line,
+    is for the manifests.
     """
     plan.folder.mkdir(parents=True, exist_ok=True)
     own = plan.own
@@ -171,9 +159,8 @@ class _Total:
 def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:
     """The runs of folders, where the folder of a benchmark stands for all of its runs.
 
-    Returns:
-        The runs, the lists of scenarios that benchmarks name, and a function that makes the
-        tables which only a benchmark has.
+    Returns the runs, the lists of scenarios that benchmarks name, and a function that makes the
+    tables which only a benchmark has.
 
     Raises:
         ShiftsimError: A folder is neither, or damaged.

@@ -24,38 +24,19 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
             done = sum(_finished(group, track) for group in mine)
             expected = whole * track.rollouts_per_scenario
             verdict = "complete" if done == expected else f"partial ({done}/{expected})"
-            rows.append(
-                (
-                    label,
-                    planner,
-                    Number(done, 0),
-                    Number(expected, 0),
-                    verdict if done else "not run",
-                )
-            )
+            counts = (Number(done, 0), Number(expected, 0))
+            rows.append((label, planner, *counts, verdict if done else "not run"))
     missing = [name for name in track.planners if name not in {g.planner for g in inside}]
-    others = f"planners of the paper that are not here: {', '.join(missing)}" if missing else ""
-    return Table(
-        "coverage",
-        f"Coverage of the track {track.name}",
-        ("set", "planner", "rollouts", "of", "verdict"),
-        tuple(rows),
-        2,
-        tuple(
-            filter(
-                None,
-                (
-                    f"contract: traffic {', '.join(track.traffic)} × noise "
-                    f"{', '.join(track.noise)} × seeds {', '.join(map(str, track.seeds))} on all "
-                    f"scenarios; own scenarios under thresholds {track.own_thresholds}, "
-                    f"{track.reference.label} under {track.reference.thresholds}",
-                    f"scores that are not complete are not the benchmark's; own scenarios: "
-                    f"{track.own_note}",
-                    others,
-                ),
-            )
-        ),
-    )
+    notes = [
+        f"contract: traffic {', '.join(track.traffic)} × noise {', '.join(track.noise)} × seeds "
+        f"{', '.join(map(str, track.seeds))} on all scenarios; own scenarios under thresholds "
+        f"{track.own_thresholds}, {track.reference.label} under {track.reference.thresholds}",
+        f"scores that are not complete are not the benchmark's; own scenarios: {track.own_note}",
+    ]
+    notes += [f"planners of the paper that are not here: {', '.join(missing)}"] if missing else []
+    header = ("set", "planner", "rollouts", "of", "verdict")
+    title = f"Coverage of the track {track.name}"
+    return Table("coverage", title, header, tuple(rows), 2, tuple(notes))
 
 
 def _belongs(group: Group, track: Track) -> bool:

@@ -50,13 +50,7 @@ class Options:
 def make_tables(
     groups: Sequence[Group], published: Published | None = None, options: Options | None = None
 ) -> list[Table]:
-    """The tables of a report, in the order of `TABLES`.
-
-    Args:
-        groups: What was run.
-        published: Figures of the paper.
-        options: What is shown; everything by default.
-    """
+    """The tables of a report, in the order of `TABLES`; without `options` everything is shown."""
     chosen = options or Options()
     partial = chosen.allow_partial
     beside = published if chosen.beside else None
@@ -80,42 +74,26 @@ def make_tables(
     out: list[Table] = []
     for name in (name for name in TABLES if name in chosen.tables):
         note = "" if name in _ABOUT_DATA else made_up
-        out += [_noted(table, note) for table in makers[name]() if table is not None]
-    return _named_apart(out)
-
-
-def _noted(table: Table, note: str) -> Table:
-    """The table with one more note, unless it says so already."""
-    if not note or any(note in other for other in table.notes):
-        return table
-    return replace(table, notes=(*table.notes, note))
-
-
-def _named_apart(tables: Sequence[Table]) -> list[Table]:
-    """The same tables, numbered where several have one name."""
-    out: list[Table] = []
-    for table in tables:
-        name, number = table.name, 1
-        while name in {other.name for other in out}:
-            number += 1
-            name = f"{table.name}-{number}"
-        out.append(replace(table, name=name))
+        for table in filter(None, makers[name]()):
+            said = any(note in other for other in table.notes)
+            notes = table.notes if said or not note else (*table.notes, note)
+            out.append(replace(table, name=_unused(table.name, out), notes=notes))
     return out
+
+
+def _unused(name: str, tables: Sequence[Table]) -> str:
+    """The name, numbered where tables have it already."""
+    numbered = (name, *(f"{name}-{number + 2}" for number in range(len(tables))))
+    return next(one for one in numbered if one not in {table.name for table in tables})
 
 
 def write_report(
     folder: Path, tables: Sequence[Table], drawn: Sequence[Figure], styles: Sequence[str]
 ) -> list[Path]:
-    """Write tables and pictures.
+    """Write tables and pictures to a folder, made if needed, and return the files.
 
-    Args:
-        folder: Where to; made if needed. Files of the same names are replaced.
-        tables: The tables: one file per format, and one per table for `csv`.
-        drawn: The pictures, written as PNG, and shown in the HTML page.
-        styles: Of `FORMATS`.
-
-    Returns:
-        The files.
+    There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
+    files and shown in the HTML page. Files of the same names are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}
@@ -161,14 +139,8 @@ def _page(body: str, pictures: Mapping[Path, str]) -> str:
         f'{base64.b64encode(path.read_bytes()).decode()}">'
         for path, title in pictures.items()
     )
-    return "\n".join(
-        [
-            "<!doctype html>",
-            '<html lang="en"><head><meta charset="utf-8"><title>shiftsim report</title>',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<style>{_STYLE}</style></head><body>",
-            body,
-            *images,
-            "</body></html>",
-        ]
-    )
+    head = f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>shiftsim report</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>{_STYLE}</style></head><body>"""
+    return "\n".join([head, body, *images, "</body></html>"])

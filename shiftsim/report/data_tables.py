@@ -25,11 +25,8 @@ _COLUMNS = {
 
 def own_statistics(groups: Sequence[Group]) -> dict[str, StoreStats | str]:
     """Statistics of every data set by its label, or why there are none."""
-    out: dict[str, StoreStats | str] = {}
-    for data in distinct_sets(groups):
-        run = next(group.run for group in groups if group.data.key == data.key)
-        out[data.label] = _statistics(run, data)
-    return out
+    runs = {group.data.key: group.run for group in reversed(groups)}
+    return {data.label: _statistics(runs[data.key], data) for data in distinct_sets(groups)}
 
 
 def _statistics(run: Run, data: DataSet) -> StoreStats | str:
@@ -68,18 +65,14 @@ def benchmark_comparison(published: Published, found: Mapping[str, StoreStats | 
         (name, *values, *(_property(name, stats) for stats in own.values()))
         for name, values in published.comparison.items()
     ]
-    return Table(
-        "benchmark-comparison",
-        "Benchmarks compared",
-        ("property", *published.sets, *(f"{label} (own)" for label in own)),
-        tuple(rows),
-        1 + len(published.sets) + len(own),
-        (
-            f"nuPlan, interPlan, DeepPlan: {published.source}",
-            "own sets: measured from the store; interaction density: mean number of agents near "
-            "the ego's path within 3 s",
-        ),
+    notes = (
+        f"nuPlan, interPlan, DeepPlan: {published.source}",
+        "own sets: measured from the store; interaction density: mean number of agents near "
+        "the ego's path within 3 s",
     )
+    header = ("property", *published.sets, *(f"{label} (own)" for label in own))
+    title = "Benchmarks compared"
+    return Table("benchmark-comparison", title, header, tuple(rows), len(header), notes)
 
 
 def _property(name: str, stats: StoreStats) -> str:

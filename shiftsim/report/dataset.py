@@ -1,5 +1,6 @@
 """Statistics of a store as tables and as a picture."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -46,19 +47,17 @@ def published_scenarios(city: str) -> int | None:
 
 
 def stats_table(stats: StoreStats, *, by: str = "city", style: str = "text") -> str:
-    """Means per scenario of each group and of all, as text.
-
-    Args:
-        stats: The statistics.
-        by: `city` or `type`.
-        style: One of `FORMATS`; `csv` has one row per scenario.
-    """
+    """Means per scenario of each group (`city` or `type`) and of all; `csv` has every scenario."""
     one_of("format", style, FORMATS)
     if style == "csv":
-        return _csv(stats)
+        rows = [["token", "city", "type", *COLUMNS]]
+        for token, row in stats.rows.items():
+            numbers = [repr(getattr(row, name)) for name in COLUMNS]
+            rows.append([token, stats.cities[token], stats.types[token], *numbers])
+        return csv_text(rows)
     lines = [[by, *_HEADINGS.values()]]
-    for name, row in stats.groups(by).items():
-        lines.append([name, *(_cell(column, row) for column in _HEADINGS)])
+    for name, means in stats.groups(by).items():
+        lines.append([name, *(_cell(column, means) for column in _HEADINGS)])
     notes = "means per scenario; t0 = at iteration 0, else over all iterations; m, m/s"
     sets = ", ".join(f"{name} {count}" for name, count in PUBLISHED_SETS.items())
     return "\n".join([*aligned(lines, 1), f" {notes}", f" published scenarios: {sets}"])
@@ -70,14 +69,6 @@ def _cell(name: str, row: dict[str, float]) -> str:
     if name == "intersection":
         return f"{100.0 * row[name]:.0f} %"
     return f"{row[name]:.0f}" if name == "scenarios" else f"{row[name]:.1f}"
-
-
-def _csv(stats: StoreStats) -> str:
-    rows = [["token", "city", "type", *COLUMNS]]
-    for token, row in stats.rows.items():
-        numbers = [repr(getattr(row, name)) for name in COLUMNS]
-        rows.append([token, stats.cities[token], stats.types[token], *numbers])
-    return csv_text(rows)
 
 
 def stats_dict(stats: StoreStats) -> dict[str, object]:
@@ -94,12 +85,7 @@ def stats_dict(stats: StoreStats) -> dict[str, object]:
 
 
 def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
-    """Draw scenarios and agents per city as bars.
-
-    Args:
-        stats: The statistics.
-        path: The picture; its ending decides the format.
-        title: What stands above.
+    """Draw scenarios and agents per city as bars; the ending of the path decides the format.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -122,24 +108,23 @@ def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
         raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
 
 
+def _say_values(
+    axes: Any, places: Iterable[float], values: Iterable[float], form: str = "{:.1f}", size: int = 9
+) -> None:
+    for place, value in zip(places, values, strict=True):
+        axes.annotate(form.format(value), (place, value), ha="center", va="bottom", fontsize=size)
+
+
 def _draw_counts(axes: Any, cities: list[str], groups: _Means) -> None:
     counts = [groups[name]["scenarios"] for name in cities]
     axes.bar(cities, counts, color="#3b6ea5", label="this store", width=0.6)
     published = [published_scenarios(name) for name in cities]
     if any(published):
-        axes.bar(
-            cities,
-            [count or 0 for count in published],
-            fill=False,
-            edgecolor="black",
-            linestyle="--",
-            label="published",
-            width=0.75,
-        )
+        dashed = {"fill": False, "edgecolor": "black", "linestyle": "--", "width": 0.75}
+        axes.bar(cities, [count or 0 for count in published], label="published", **dashed)
         axes.margins(y=0.18)
         axes.legend(frameon=False, ncols=2, loc="upper center")
-    for place, count in enumerate(counts):
-        axes.annotate(f"{count:.0f}", (place, count), ha="center", va="bottom", fontsize=9)
+    _say_values(axes, range(len(counts)), counts, "{:.0f}")
     axes.set_title("Scenarios", fontsize=9)
     sets = "\n".join(f"{name}  {count}" for name, count in PUBLISHED_SETS.items())
     axes.set_xlabel(f"published sets:\n{sets}", fontsize=8, color="0.35")
@@ -153,8 +138,7 @@ def _draw_agents(axes: Any, names: list[str], groups: _Means) -> None:
         start = [groups[name].get(f"{kind}_t0", 0.0) for name in names]
         axes.bar(places, over, width * 0.95, color=color, alpha=0.45)
         axes.bar(places, start, width * 0.95, color=color, label=kind)
-        for place, value in zip(places, over, strict=True):
-            axes.annotate(f"{value:.1f}", (place, value), ha="center", va="bottom", fontsize=8)
+        _say_values(axes, places, over, size=8)
     axes.set_xticks(range(len(names)), names)
     axes.set_title("Agents per scenario\n(full colour: at t0; pale: over the scenario)", fontsize=9)
     axes.margins(y=0.18)
@@ -164,6 +148,5 @@ def _draw_agents(axes: Any, names: list[str], groups: _Means) -> None:
 def _draw_interactions(axes: Any, names: list[str], groups: _Means) -> None:
     values = [groups[name].get("interactions", 0.0) for name in names]
     axes.bar(names, values, color="#8a5aa8", width=0.6)
-    for place, value in enumerate(values):
-        axes.annotate(f"{value:.1f}", (place, value), ha="center", va="bottom", fontsize=9)
+    _say_values(axes, range(len(values)), values)
     axes.set_title("Interaction density\n(agents near the ego's path within 3 s)", fontsize=9)

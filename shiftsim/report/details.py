@@ -15,12 +15,7 @@ from shiftsim.runs.results import Run
 
 
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:
-    """Every pair of planners on the same scenarios; None where there is no pair.
-
-    Args:
-        groups: The groups.
-        noisy: Compare under noise instead of without.
-    """
+    """Every pair of planners on the same scenarios, clean or noisy; None where there is no pair."""
     blocks: dict[tuple[object, ...], list[Group]] = {}  # they differ in nothing but the planner
     for group in groups:
         if group.is_complete and (group.noise != "none") == noisy:
@@ -37,16 +32,10 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         for (first, second), result, p_value in zip(pairs, results, corrected, strict=True):
             num_recordings.add(first.data.num_recordings)
             smallest = max(smallest, result.smallest_p)
-            rows.append(
-                (
-                    *(first.data.label, first.traffic, first.noise, first.planner, second.planner),
-                    Number(result.difference),
-                    result.interval,
-                    f"{result.wins}/{result.ties}/{result.losses}",
-                    Number(result.p_value, 4),
-                    Number(p_value, 4),
-                )
-            )
+            where = (first.data.label, first.traffic, first.noise, first.planner, second.planner)
+            count = f"{result.wins}/{result.ties}/{result.losses}"
+            tests = (Number(result.p_value, 4), Number(p_value, 4))
+            rows.append((*where, Number(result.difference), result.interval, count, *tests))
     if not rows:
         return None
     notes = [
@@ -86,16 +75,10 @@ def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> l
             where = np.array(data.types) == name
             scores = (g.estimate("cls", where, allow_partial=allow_partial) for g in columns)
             rows.append((name or "unknown", Number(int(where.sum()), 0), *scores))
-        out.append(
-            Table(
-                f"scenario-types_{data.name}",
-                f"Scores by scenario type: {data.label}, clean, CLS x 100",
-                ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in columns)),
-                tuple(rows),
-                1,
-                (data.rules,),
-            )
-        )
+        header = ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in columns))
+        title = f"Scores by scenario type: {data.label}, clean, CLS x 100"
+        name = f"scenario-types_{data.name}"
+        out.append(Table(name, title, header, tuple(rows), 1, (data.rules,)))
     return out
 
 
@@ -103,29 +86,23 @@ def planning_times(groups: Sequence[Group]) -> Table:
     """How long planners think, and how often the simulator's fallback plan had to do."""
     each = {(group.run.path, group.planner): group for group in groups}
     runs = {group.run.path: group.run for group in groups}
-    labels = ("set", "traffic", "planner")
     times = ("ms per step", "95 % ms", "worst 95 % ms", "s per rollout")
-    return Table(
-        "planning-time",
-        "Planning time, and steps driven on a degraded (fallback) plan",
-        (*labels, "rollouts", *times, "degraded steps", "in rollouts"),
-        tuple(_times_row(group) for group in each.values()),
-        len(labels),
-        (
-            "per step: mean and 95th percentile within a rollout, of both the median over the "
-            "rollouts, which compilation at the start of a run does not touch; per rollout: the "
-            "median of reading, driving and scoring",
-            *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
-        ),
+    header = ("set", "traffic", "planner", "rollouts", *times, "degraded steps", "in rollouts")
+    notes = (
+        "per step: mean and 95th percentile within a rollout, of both the median over the "
+        "rollouts, which compilation at the start of a run does not touch; per rollout: the "
+        "median of reading, driving and scoring",
+        *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
     )
+    title = "Planning time, and steps driven on a degraded (fallback) plan"
+    return Table("planning-time", title, header, tuple(map(_times_row, each.values())), 3, notes)
 
 
 def _times_row(group: Group) -> tuple[Cell, ...]:
     planner = group.planner.removesuffix(f" @{group.run.path.name}")  # as its run calls it
     tasks, scores = group.run.tasks, group.run.scores
-    done = tasks.filter(
-        pc.and_(pc.equal(tasks["planner"], planner), pc.equal(tasks["status"], "ok"))
-    )
+    finished = pc.equal(tasks["status"], "ok")
+    done = tasks.filter(pc.and_(pc.equal(tasks["planner"], planner), finished))
     degraded = scores.filter(pc.equal(scores["planner"], planner))["degraded_steps"].to_numpy()
 
     def known(name: str) -> FloatArray:
@@ -138,8 +115,7 @@ def _times_row(group: Group) -> tuple[Cell, ...]:
     return (
         *(group.data.label, group.traffic, group.planner),
         Number(len(done), 0),
-        Number(float(np.median(mean))) if len(mean) else None,
-        Number(float(np.median(tail))) if len(tail) else None,
+        *(Number(float(np.median(one))) if len(one) else None for one in (mean, tail)),
         Number(float(tail.max())) if len(tail) else None,
         Number(sum(each), 3) if each else None,
         Number(int(degraded.sum()), 0),

@@ -35,16 +35,9 @@ def select_tasks(
 ) -> list[dict[str, Any]]:
     """The tasks of one scenario, each with its score row and its metric rows.
 
-    Args:
-        run: The run.
-        token: Scenario token, or an unambiguous beginning of one.
-        planner: Only this planner.
-        noise: Only this noise.
-        seed: Only this seed.
-
-    Returns:
-        Rows of `tasks.parquet`, with `cls`, `why` and `metrics` added; every metric has its `role`
-        (`multiplier`, `weighted` or empty) and `weight`.
+    The token may be an unambiguous beginning of one. Rows are those of `tasks.parquet`, with `cls`,
+    `why` and `metrics` added; every metric has its `role` (`multiplier`, `weighted` or empty) and
+    `weight`.
 
     Raises:
         ConfigError: There is no such task, or several scenarios begin like that.
@@ -65,7 +58,10 @@ def select_tasks(
     scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in _rows_of(run.metrics, full):
-        metrics.setdefault(_key(row), []).append(_with_role(row))
+        name = row["metric"]
+        role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
+        row |= {"role": role, "weight": WEIGHTS.get(name)}
+        metrics.setdefault(_key(row), []).append(row)
     out = []
     for row in rows:
         cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
@@ -76,12 +72,6 @@ def select_tasks(
 def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = table.filter(pc.equal(table["token"], token)).to_pylist()
     return rows
-
-
-def _with_role(row: dict[str, Any]) -> dict[str, Any]:
-    name = row["metric"]
-    role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
-    return {**row, "role": role, "weight": WEIGHTS.get(name)}
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:

@@ -145,21 +145,13 @@ def _curve(
 
 
 def _line(style: Style) -> dict[str, Any]:
-    return {
-        "color": style.colour,
-        "marker": style.marker,
-        "markersize": 6.0 * _SIZES.get(style.marker, 1.0),
-        "linewidth": 1.4,
-        "markeredgecolor": "white",
-        "markeredgewidth": 0.5,
-    }
+    look = {"linewidth": 1.4, "markeredgecolor": "white", "markeredgewidth": 0.5}
+    size = 6.0 * _SIZES.get(style.marker, 1.0)
+    return {"color": style.colour, "marker": style.marker, "markersize": size, **look}
 
 
 def _dots(
-    groups: Sequence[Group],
-    places: Sequence[_Place],
-    styles: dict[str, Style],
-    allow_partial: bool,
+    groups: Sequence[Group], places: Sequence[_Place], styles: dict[str, Style], allow_partial: bool
 ) -> Any:
     """Planners side by side at every place, one panel per traffic mode."""
     modes = traffics(groups)
@@ -204,15 +196,7 @@ def _score_axis(axes: Any) -> None:
 
 def _finish(figure: Any, data: DataSet, title: str, note: str) -> None:
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper center",
-        ncols=min(4, max(1, len(labels))),
-        frameon=False,
-        fontsize=8,
-        handlelength=3.2,
-        title=f"{title}: {data.label}",
-        title_fontsize=10,
-    )
+    look = {"loc": "outside upper center", "frameon": False, "fontsize": 8, "handlelength": 3.2}
+    look |= {"ncols": min(4, max(1, len(labels))), "title_fontsize": 10}
+    figure.legend(handles, labels, title=f"{title}: {data.label}", **look)
     figure.supxlabel(f"{data.rules}\n{note}", fontsize=6.5, color=_GREY)

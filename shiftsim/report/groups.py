@@ -150,9 +150,7 @@ def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
 def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Group]:
     """The groups of runs, in the order of runs, planners and noises.
 
-    Args:
-        runs: The runs.
-        known: Published lists, by which sets are recognised.
+    Sets of scenarios are recognised by the published lists that are known.
 
     Raises:
         DataError: Runs contradict each other, or hold no tasks.
@@ -162,9 +160,8 @@ def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Gro
     for group in (group for run in runs for group in _groups(run, known, labels[run.path])):
         key = (group.data.key, group.traffic, group.planner, group.noise)
         other = seen.setdefault(key, group)
-        if group.seeds != other.seeds or not np.array_equal(
-            group.values, other.values, equal_nan=True
-        ):
+        alike = np.array_equal(group.values, other.values, equal_nan=True)
+        if group.seeds != other.seeds or not alike:
             raise DataError(
                 f"{group.run.path.name!r} and {other.run.path.name!r} both hold "
                 f"{group.planner} {group.noise} {group.traffic} on {group.data.name}, and differ",
@@ -211,8 +208,7 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
     data = _data_set(run, known)
     traffic = str(run.manifest["determining"]["traffic"])
     # nuPlan rule 570: a metric without a score counts as 0
-    columns = [pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS]
-    table = np.stack(columns, axis=1)
+    table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
     for planner in _ordered(tasks["planner"], run.manifest["config"]["planners"]):
         for noise in _ordered(tasks["noise"], NOISE_NAMES):
@@ -224,15 +220,8 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
             rows = np.flatnonzero(_matching(scores, planner, noise))
             row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
             values[row_seeds, places[rows].astype(np.int64)] = table[rows]
-            yield Group(
-                run=run,
-                data=data,
-                traffic=TRAFFIC.get(traffic, traffic),
-                planner=labels.get(planner, planner),
-                noise=noise,
-                seeds=tuple(seeds.tolist()),
-                values=values,
-            )
+            mode, name = TRAFFIC.get(traffic, traffic), labels.get(planner, planner)
+            yield Group(run, data, mode, name, noise, tuple(seeds.tolist()), values)
 
 
 def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:

@@ -46,11 +46,8 @@ def semantic_shift(
 ) -> list[Table]:
     """Clean scores of all scenarios, per city and per metric: one table per set of scenarios.
 
-    Args:
-        groups: The groups.
-        published: Figures of the paper; its sites give cities their short names and order.
-        beside: Show its scores as well: in the same table where the cities are the same.
-        allow_partial: Show labelled means of incomplete groups.
+    The paper's sites give cities their short names and order. `beside` shows its scores as well, in
+    the same table where the cities are the same; `allow_partial` labelled means of what is there.
     """
     clean = [group for group in groups if group.noise == "none"]
     others = [group for group in clean if group.data.known != VAL14]
@@ -84,14 +81,14 @@ def _columns(
         found = next(same, None)
         return None if found is None else estimate(found)
 
-    columns = [_Column(group.data.label, VAL14, on_val14) for group in val14[:1]]
-    columns.append(_Column(data.label, "all", estimate))
-    columns.append(_Column("95 % CI", "", score_interval))
-    for city, heading in _cities(data, published).items():
-        columns.append(_Column(heading, heading, partial(estimate, where=data.within(city))))
-    for name in METRICS:
-        columns.append(_Column(COLUMNS[name], COLUMNS[name], partial(estimate, name=name)))
-    return columns
+    cities = _cities(data, published).items()
+    return [
+        *(_Column(group.data.label, VAL14, on_val14) for group in val14[:1]),
+        _Column(data.label, "all", estimate),
+        _Column("95 % CI", "", score_interval),
+        *(_Column(name, name, partial(estimate, where=data.within(city))) for city, name in cities),
+        *(_Column(COLUMNS[n], COLUMNS[n], partial(estimate, name=n)) for n in METRICS),
+    ]
 
 
 def _cities(data: DataSet, published: Published | None) -> dict[str, str]:
@@ -124,14 +121,10 @@ def _semantic_table(
         rows += [_published_row(traffic, name, left[name], columns) for name in left]
     notes += [_few_note(data), _own_list_note(data, published) if published else ""]
     notes += [f"{PUBLISHED[1:-1]}: {paper.source}"] if paper else []
-    return Table(
-        f"semantic-shift_{data.name}",
-        f"Zero-shot generalization: {data.label}, clean, scores x 100",
-        ("traffic", "planner", *(column.heading for column in columns)),
-        tuple(rows),
-        2,
-        tuple(filter(None, notes)),
-    )
+    header = ("traffic", "planner", *(column.heading for column in columns))
+    title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
+    name = f"semantic-shift_{data.name}"
+    return Table(name, title, header, tuple(rows), 2, tuple(filter(None, notes)))
 
 
 def traffics(groups: Iterable[Group]) -> list[str]:
@@ -172,26 +165,16 @@ def published_semantic(published: Published) -> Table:
         for traffic, planners in published.semantic_shift.items()
         for planner, values in planners.items()
     ]
-    return Table(
-        "semantic-shift_published",
-        "Zero-shot generalization as published",
-        ("traffic", "planner", *(_SETS.get(name, name) for name in published.columns)),
-        tuple(rows),
-        2,
-        (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan"),
-    )
+    header = ("traffic", "planner", *(_SETS.get(name, name) for name in published.columns))
+    notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
+    title = "Zero-shot generalization as published"
+    return Table("semantic-shift_published", title, header, tuple(rows), 2, notes)
 
 
 def noise_robustness(
     groups: Sequence[Group], published: Published | None = None, *, allow_partial: bool = False
 ) -> Table | None:
-    """Scores by noise, mean and deviation over the seeds; None where all is clean.
-
-    Args:
-        groups: The groups.
-        published: Figures of the paper, to be shown as well.
-        allow_partial: Show labelled means of incomplete groups.
-    """
+    """Scores by noise, mean and deviation over the seeds; None where all is clean."""
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
@@ -202,8 +185,7 @@ def noise_robustness(
     for data in sets:
         mine = [group for group in groups if group.data.key == data.key]
         cells = {
-            (group.traffic, group.planner, group.noise): group.estimate(allow_partial=allow_partial)
-            for group in mine
+            (g.traffic, g.planner, g.noise): g.estimate(allow_partial=allow_partial) for g in mine
         }
         for traffic in traffics(mine):
             for planner in dict.fromkeys(g.planner for g in mine if g.traffic == traffic):

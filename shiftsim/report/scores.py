@@ -55,12 +55,7 @@ class ScoreRow:
 
 
 def score_rows(run: Run, *, by: str | None = None) -> list[ScoreRow]:
-    """One row per planner and noise, in the order of the settings.
-
-    Args:
-        run: The run.
-        by: One of `GROUPINGS` that splits the rows further.
-    """
+    """One row per planner and noise, in the order of the settings; `by` splits them further."""
     return [row for group in read_groups([run]) for row in _score_rows(group, by)]
 
 
@@ -83,27 +78,19 @@ def _score_row(labels: tuple[str, ...], values: FloatArray) -> ScoreRow:
     seeds = zip(values, finished, strict=True)
     means = np.array([seed[done].mean(axis=0) for seed, done in seeds if any(done)])
     spread = means.std(axis=0, ddof=1) if len(means) > 1 else None
-    return ScoreRow(
-        labels,
-        num_done=int(finished.sum()),
-        num_expected=finished.size,
-        num_scenarios=values.shape[1],
-        num_seeds=len(values),
-        means={} if not len(means) else _by_column(means.mean(axis=0)),
-        deviations={} if spread is None else _by_column(spread),
-    )
+    mean = means.mean(axis=0) if len(means) else None
+    counts = (int(finished.sum()), finished.size, values.shape[1], len(values))
+    return ScoreRow(labels, *counts, _by_column(mean), _by_column(spread))
 
 
-def _by_column(values: FloatArray) -> dict[str, float]:
-    return dict(zip(COLUMNS, values.tolist(), strict=True))
+def _by_column(values: FloatArray | None) -> dict[str, float]:
+    return {} if values is None else dict(zip(COLUMNS, values.tolist(), strict=True))
 
 
 def score_table(runs: Sequence[Run], *, allow_partial: bool = False) -> str:
     """The scores of runs as text; threshold profile, metric version and count stand with it.
 
-    Args:
-        runs: The runs.
-        allow_partial: Print the mean over the finished tasks of an incomplete row, labelled so.
+    `allow_partial` prints the mean over the finished tasks of an incomplete row, labelled so.
     """
     return text(replace(scores(read_groups(runs), allow_partial=allow_partial), title=""))
 
@@ -126,11 +113,9 @@ def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: boo
             labels = (*where, *row.labels)
             rows += _cells(labels, row, allow_partial)
             full += _cells_in_full(labels, row, caption, allow_partial)
-    header = (*heading, *COLUMNS.values())
-    count = len(heading)
-    machine = Table(
-        "scores", "", (*header, "statistic", "done", "expected", "label"), tuple(full), count
-    )
+    header, count = (*heading, *COLUMNS.values()), len(heading)
+    header_in_full = (*header, "statistic", "done", "expected", "label")
+    machine = Table("scores", "", header_in_full, tuple(full), count)
     title, notes = "All planners and noises, scores x 100", tuple(dict.fromkeys(captions))
     return Table("scores", title, header, tuple(rows), count, notes, machine)
 
@@ -246,7 +231,6 @@ def summary(run: Run) -> dict[str, Any]:
 def failures(run: Run) -> list[dict[str, Any]]:
     """Tasks that failed or are missing: key, status, error and hint."""
     names = [*Task._fields, "status", "error", "hint"]
-    rows: list[dict[str, Any]] = (
-        run.tasks.filter(pc.not_equal(run.tasks["status"], "ok")).select(names).to_pylist()
-    )
+    failed = run.tasks.filter(pc.not_equal(run.tasks["status"], "ok"))
+    rows: list[dict[str, Any]] = failed.select(names).to_pylist()
     return rows

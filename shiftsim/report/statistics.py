@@ -44,14 +44,12 @@ def bootstrap_interval(
     """Percentile interval of the mean; clusters are drawn with replacement.
 
     The mean of a draw is over its scenarios, so large recordings weigh as they do in the score.
+    None with fewer than two clusters: then nothing is known of the spread between them.
 
     Args:
         values: (S,) one value per scenario.
         clusters: (S,) recording of each, as `cluster_codes` gives them.
         draws: How many samples are drawn.
-
-    Returns:
-        None with fewer than two clusters: then nothing is known of the spread between them.
     """
     sums, sizes = np.bincount(clusters, values), np.bincount(clusters).astype(np.float64)
     count = len(sums)
@@ -87,25 +85,12 @@ class Comparison(NamedTuple):
 def compare(
     first: FloatArray, second: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> Comparison:
-    """Compare two planners scenario by scenario.
-
-    Args:
-        first: (S,) scores of one planner.
-        second: (S,) scores of the other one on the same scenarios.
-        clusters: (S,) recording of each scenario.
-        draws: Samples of bootstrap and test.
-    """
+    """Compare (S,) scores of two planners on the same scenarios, of the recordings `clusters`."""
     delta = first - second
-    p_value, smallest = sign_flip_test(delta, clusters, draws=draws)
-    return Comparison(
-        difference=float(delta.mean()),
-        interval=bootstrap_interval(delta, clusters, draws=draws),
-        p_value=p_value,
-        smallest_p=smallest,
-        wins=int(np.sum(delta > 0.0)),
-        ties=int(np.sum(delta == 0.0)),
-        losses=int(np.sum(delta < 0.0)),
-    )
+    interval = bootstrap_interval(delta, clusters, draws=draws)
+    tested = sign_flip_test(delta, clusters, draws=draws)
+    counts = (int(np.sum(which)) for which in (delta > 0.0, delta == 0.0, delta < 0.0))
+    return Comparison(float(delta.mean()), interval, *tested, *counts)
 
 
 def sign_flip_test(

@@ -14,13 +14,7 @@ FORMATS = tuple(ENDINGS)
 
 
 def render(table: Table, style: str, *, width: int = 0) -> str:
-    """A table in one of `FORMATS`.
-
-    Args:
-        table: The table.
-        style: The format.
-        width: Longest line of text; wider tables are printed in pieces. 0 for any.
-    """
+    """A table in one of `FORMATS`; as text, those wider than `width` are printed in pieces."""
     one_of("format", style, FORMATS)
     return text(table, width) if style == "text" else _WRITERS[style](table)
 
@@ -65,8 +59,7 @@ def csv_text(rows: Iterable[Sequence[str]]) -> str:
 def _parts(cells: Sequence[Cell]) -> dict[str, list[str]]:
     """One or several columns, by what the cells hold; keys are added to the column's name."""
     if any(isinstance(cell, Interval) for cell in cells):
-        ends = [(c.low, c.high) if isinstance(c, Interval) else (None, None) for c in cells]
-        return {" low": [_full(low) for low, _ in ends], " high": [_full(high) for _, high in ends]}
+        return {f" {end}": [_full(getattr(c, end, None)) for c in cells] for end in ("low", "high")}
     out = {"": [_plain(cell) for cell in cells]}
     spreads = [cell.std if isinstance(cell, Estimate) else None for cell in cells]
     if any(spread is not None for spread in spreads):
@@ -134,22 +127,15 @@ def _latex(table: Table) -> str:
     head, *rows = (line([latex_escape(cell) for cell in cells]) for cells in table.lines)
     notes = "; ".join(latex_escape(note) for note in table.notes)
     caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
-    return "\n".join(
-        [
-            r"\begin{table}  % needs \usepackage{booktabs}",
-            r"\centering",
-            f"\\caption{{{caption}}}",
-            f"\\label{{tab:{table.name}}}",
-            f"\\begin{{tabular}}{{{columns}}}",
-            r"\toprule",
-            head,
-            r"\midrule",
-            *rows,
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-        ]
-    )
+    begin = [
+        r"\begin{table}  % needs \usepackage{booktabs}",
+        r"\centering",
+        f"\\caption{{{caption}}}",
+        f"\\label{{tab:{table.name}}}",
+        f"\\begin{{tabular}}{{{columns}}}",
+    ]
+    end = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+    return "\n".join([*begin, r"\toprule", head, r"\midrule", *rows, *end])
 
 
 def _html(table: Table) -> str:
@@ -161,24 +147,16 @@ def _html(table: Table) -> str:
         return f"<tr>{''.join(parts)}</tr>"
 
     head, *rows = table.lines
-    return "\n".join(
-        [
-            f'<section id="{html.escape(table.name)}">',
-            f"<h2>{html.escape(table.title)}</h2>",
-            "<div class=wide><table>",
-            f"<thead>{row(head, 'th')}</thead>",
-            "<tbody>",
-            *(row(cells, "td") for cells in rows),
-            "</tbody></table></div>",
-            *(f"<p>{html.escape(note)}</p>" for note in table.notes),
-            "</section>",
-        ]
-    )
+    lines = [
+        f'<section id="{html.escape(table.name)}">',
+        f"<h2>{html.escape(table.title)}</h2>",
+        f"<div class=wide><table>\n<thead>{row(head, 'th')}</thead>\n<tbody>",
+        *(row(cells, "td") for cells in rows),
+        "</tbody></table></div>",
+        *(f"<p>{html.escape(note)}</p>" for note in table.notes),
+    ]
+    return "\n".join([*lines, "</section>"])
 
 
-_WRITERS: dict[str, Callable[[Table], str]] = {
-    "md": _markdown,
-    "csv": _csv,
-    "latex": _latex,
-    "html": _html,
-}
+_WRITERS: dict[str, Callable[[Table], str]]
+_WRITERS = {"md": _markdown, "csv": _csv, "latex": _latex, "html": _html}

@@ -28,7 +28,8 @@ class Choice:
         wanted = [
             task
             for task in sorted(tasks)
-            if (not self.planners or _bare(task.planner) in self.planners)
+            # a planner's name may end in the remark that tells runs apart
+            if (not self.planners or task.planner.partition(" (")[0] in self.planners)
             and (not self.noises or task.noise in self.noises)
             and (not self.seeds or task.seed in self.seeds or task.noise == "none")
         ]
@@ -38,21 +39,11 @@ class Choice:
         return [task for task in wanted if first[task.planner, task.noise] == task]
 
 
-def _bare(planner: str) -> str:
-    """A planner's name without the remark that tells runs apart."""
-    return planner.partition(" (")[0]
-
-
 class Gallery:
     """The stored rollouts of one or several runs on the same store, scenario by scenario."""
 
     def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
-        """Index the runs.
-
-        Args:
-            runs: Runs whose rollouts are shown together.
-            store: The open store they were made with.
-            choice: Which of their rollouts to show.
+        """Index the runs, which were made with this open store.
 
         Raises:
             DataError: A run was made with another store.
@@ -172,12 +163,9 @@ def page_name(token: str) -> str:
 
 
 def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> str:
-    """The page that lists scenarios, sortable and filterable.
+    """The page that lists rows of `Gallery.rows`, sortable and filterable.
 
-    Args:
-        title: Its heading.
-        rows: Rows of `Gallery.rows`.
-        above: HTML between heading and list; the caller escapes what comes from data.
+    `above` is HTML between heading and list; the caller escapes what comes from data.
     """
     return framed(
         "list.html",
@@ -201,13 +189,8 @@ def write_site(
 ) -> int:
     """Write one page per scenario and `index.html`, which lists them; returns how many pages.
 
-    Args:
-        folder: Where the list goes; the pages go to its subfolder `replay`.
-        galleries: One per store.
-        title: Heading of the list.
-        limit: At most so many pages, the lowest scores first; 0 for all.
-        above: HTML between heading and list; the caller escapes what comes from data.
-        on_progress: Called with the number of pages written and their total.
+    The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
+    subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
     """
     pages = folder / "replay"
     pages.mkdir(parents=True, exist_ok=True)
@@ -224,13 +207,7 @@ def write_site(
 
 
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
-    """One gallery per store.
-
-    Args:
-        runs: The runs.
-        stores: The open store of each run.
-        choice: Which rollouts to show.
-    """
+    """One gallery per store; `stores` are the open ones of each run."""
     by_store: dict[str, tuple[Any, list[Run]]] = {}
     for run, store in zip(runs, stores, strict=True):
         by_store.setdefault(store.hash, (store, []))[1].append(run)

@@ -53,12 +53,7 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
 
 
 def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -> Page:
-    """One self-contained HTML page.
-
-    Args:
-        scenario: The scenario that was driven.
-        shown: One to six rollouts of it.
-        back: Relative address of a page to return to, empty for none.
+    """One self-contained HTML page of one to six rollouts; `back` is the address of the list.
 
     Raises:
         ValueError: There are no rollouts, or more than six.
@@ -67,11 +62,12 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
         raise ValueError(f"a replay shows 1 to {MAX_ROLLOUTS} rollouts, not {len(shown)}")
     replay = Replay(scenario, shown)
     meta = describe_scene(replay) | {"back": back}
-    sections = {"scene": pack(scene_fields(replay))}
+    data = [
+        _data("meta", "application/json", json_text(meta)),
+        _data("scene", "text/plain", pack(scene_fields(replay))),
+    ]
     for index in range(len(shown)):
-        sections[f"rollout{index}"] = pack(rollout_fields(replay, index))
-    data = [_data("meta", "application/json", json_text(meta))]
-    data += [_data(name, "text/plain", text) for name, text in sections.items()]
+        data.append(_data(f"rollout{index}", "text/plain", pack(rollout_fields(replay, index))))
     text = framed(
         "replay.html",
         title=f"{scenario.token} · shiftsim",
@@ -84,23 +80,11 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
 
 
 def framed(
-    body: str,
-    *,
-    title: str,
-    meta: str,
-    styles: Sequence[str],
-    scripts: Sequence[str],
-    **parts: str,
+    body: str, *, title: str, meta: str, styles: Sequence[str], scripts: Sequence[str], **parts: str
 ) -> str:
     """A whole page from files of this folder, with one head for all pages.
 
-    Args:
-        body: The file with what stands between head and scripts.
-        title: Of the page.
-        meta: One more `meta` element.
-        styles: The style sheets.
-        scripts: The scripts.
-        parts: What is filled into the body, beside `title`.
+    `body` is the file with what stands between head and scripts; `title` and `parts` are filled in.
     """
     return fill(
         asset("frame.html"),

@@ -155,13 +155,12 @@ def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
     """Tracks that are there at some time; values of absent samples repeat the one before."""
     used = _used(tracks)
     valid = tracks.valid[:, used]
-    rows = np.where(valid, np.arange(len(valid))[:, None], 0)
-    rows = np.maximum.accumulate(rows, axis=0)
-    rows = np.maximum(rows, valid.argmax(axis=0)[None, :])  # before its first sample: that one
-    columns = np.arange(valid.shape[1])[None, :]
-    poses = tracks.poses[:, used][rows, columns]
     first = valid.argmax(axis=0)
-    sizes = tracks.sizes[:, used][first, columns[0]]
+    rows = np.maximum.accumulate(np.where(valid, np.arange(len(valid))[:, None], 0), axis=0)
+    rows = np.maximum(rows, first)  # before its first sample: that one
+    columns = np.arange(valid.shape[1])
+    poses = tracks.poses[:, used][rows, columns]
+    sizes = tracks.sizes[:, used][first, columns]
     return {
         "tracks.valid": valid,
         "tracks.kind": tracks.kinds[used].astype(np.uint8),

@@ -30,17 +30,12 @@ _AGENTS = {
     AgentKind.PEDESTRIAN: "#a8791e",
     AgentKind.BICYCLE: "#8a5f9e",
 }
+_MARKER: dict[str, Any] = {"markersize": 6, "markeredgecolor": "white", "markeredgewidth": 0.5}
 _OTHER, _LOG = "#8f8f8f", "#6e6e6e"
 
 
 def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: float) -> None:
-    """A still of one moment, or a film of the whole rollout, by the ending of the file's name.
-
-    Args:
-        path: `.pdf`, `.png`, `.svg`, or `.mp4`, `.gif`.
-        scenario: The scenario that was driven.
-        shown: Rollouts of it; noisy ones are dashed.
-        at: Time of a still from the start [s].
+    """A still `at` seconds from the start, or a film of it all, by the ending of the file's name.
 
     Raises:
         ConfigError: The ending or the time is none of those possible.
@@ -127,27 +122,11 @@ def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
         style, ego = styles[item.planner], item.log.ego
         clean = item.noise == "none"
         label = item.planner if clean else f"{item.planner} {item.noise}"
-        drawn += axes.plot(
-            ego[:, 0],
-            ego[:, 1],
-            color=style.colour,
-            linewidth=1.8,
-            linestyle="-" if clean else (0, (5, 3)),
-            marker=style.marker,
-            markersize=6,
-            markeredgecolor="white",
-            markeredgewidth=0.5,
-            markevery=(min(10, len(ego) - 1), 30),
-            zorder=6,
-            label=label,
-        )
-        drawn += _draw_boxes(
-            axes,
-            center_poses(ego[row : row + 1, :3]),
-            np.array([[PACIFICA.length, PACIFICA.width]]),
-            style.colour,
-            zorder=7,
-        )
+        line = {"color": style.colour, "linewidth": 1.8, "linestyle": "-" if clean else (0, (5, 3))}
+        mark = {"marker": style.marker, "markevery": (min(10, len(ego) - 1), 30)}
+        drawn += axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=label, **line, **mark, **_MARKER)
+        pose, size = center_poses(ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
+        drawn += _draw_boxes(axes, pose, np.array(size), style.colour, zorder=7)
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
     axes.legend(fontsize=8, frameon=False, **place)
     return drawn

@@ -39,11 +39,7 @@ class _Span(NamedTuple):
 
 
 class BridgeMap(AbstractMap):
-    """A `VectorMap` behind nuPlan's map interface.
-
-    Attributes:
-        source: The map.
-    """
+    """A `VectorMap` behind nuPlan's map interface."""
 
     def __init__(self, source: VectorMap) -> None:
         self.source = source
@@ -104,10 +100,8 @@ class BridgeMap(AbstractMap):
     def get_one_map_object(self, point: Any, layer: Any) -> Any:
         """The only object whose area holds a point, or None."""
         found = self.get_all_map_objects(point, layer)
-        assert len(found) < 2, (
-            f"{len(found)} objects of layer {layer.name} hold the point; "
-            "get_all_map_objects() gives them all"
-        )
+        several = f"{len(found)} objects of layer {layer.name} hold the point"
+        assert len(found) < 2, f"{several}; get_all_map_objects() gives them all"
         return found[0] if found else None
 
     def get_proximal_map_objects(
@@ -170,21 +164,11 @@ class BridgeMap(AbstractMap):
         """None: a shiftsim map has no rasters."""
         return []
 
-    def get_raster_map_layer(self, layer: Any) -> NoReturn:
-        """Not possible.
-
-        Raises:
-            NotImplementedError: Always.
-        """
+    def get_raster_map_layer(self, *layers: Any, **named: Any) -> NoReturn:
+        """Not possible: raises NotImplementedError."""
         raise NotImplementedError("maps of shiftsim have no raster layers")
 
-    def get_raster_map(self, layers: Sequence[Any]) -> NoReturn:
-        """Not possible; see `get_raster_map_layer`."""
-        self.get_raster_map_layer(None)
-
-    def get_distance_to_nearest_raster_layer(self, point: Any, layer: Any) -> NoReturn:
-        """Not possible; see `get_raster_map_layer`."""
-        self.get_raster_map_layer(layer)
+    get_raster_map = get_distance_to_nearest_raster_layer = get_raster_map_layer
 
     def _get_roadblock(self, roadblock_id: str) -> Any:  # private, and yet used by public planners
         return self.get_map_object(roadblock_id, _LAYERS.ROADBLOCK)

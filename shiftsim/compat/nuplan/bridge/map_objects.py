@@ -117,9 +117,27 @@ class _Mapped:
         """Its area."""
         return self._layer.shape(self._index)
 
-    def _linked(self, table: Lists, layer: str) -> list[Any]:
-        """The objects of a layer that a table of the map lists for this one."""
-        return [self._map.object(layer, i) for i in table.at(self._index).tolist()]
+
+def _linked(table: str, layer: str) -> Any:
+    """A property: the objects of a layer that a table of the map lists for this one."""
+
+    def find(mapped: _Mapped) -> list[Any]:
+        found: Lists = getattr(mapped._source, table)
+        return [mapped._map.object(layer, i) for i in found.at(mapped._index).tolist()]
+
+    return cached_property(find)
+
+
+def _boundary(side: int, name: str) -> Any:
+    """A property: the line on the left (0) or right (1) of an edge."""
+
+    def find(edge: _Mapped) -> BridgePolyline:
+        xy: FloatArray = getattr(edge._source, f"{name}_boundaries").at(edge._index)
+        if len(xy) < 2:
+            raise MapError(f"map {edge._map.map_name!r}: {edge.id!r} has no {name} boundary")
+        return BridgePolyline(edge._source.boundary_ids[edge._index][side], xy)
+
+    return cached_property(find)
 
 
 class _Edge(_Mapped):
@@ -129,42 +147,16 @@ class _Edge(_Mapped):
     get_width_left_right = _NotInNuplan()
     oriented_distance = _NotInNuplan()
 
-    @cached_property
-    def incoming_edges(self) -> list[Any]:
-        """Edges that lead here."""
-        return self._linked(self._source.incoming, "edges")
-
-    @cached_property
-    def outgoing_edges(self) -> list[Any]:
-        """Edges that this one leads to."""
-        return self._linked(self._source.outgoing, "edges")
-
-    @cached_property
-    def stop_lines(self) -> list[Any]:
-        """Where its lights make one stop."""
-        return self._linked(self._source.stop_lines, "stop_polygons")
+    incoming_edges = _linked("incoming", "edges")
+    outgoing_edges = _linked("outgoing", "edges")
+    stop_lines = _linked("stop_lines", "stop_polygons")  # where its lights make one stop
+    left_boundary = _boundary(0, "left")
+    right_boundary = _boundary(1, "right")
 
     @cached_property
     def baseline_path(self) -> BridgePolyline:
         """Its centre line."""
         return BridgePolyline(self.id, self._source.baselines.at(self._index))
-
-    @cached_property
-    def left_boundary(self) -> BridgePolyline:
-        """The line on its left."""
-        return self._boundary(self._source.left_boundaries.at(self._index), 0)
-
-    @cached_property
-    def right_boundary(self) -> BridgePolyline:
-        """The line on its right."""
-        return self._boundary(self._source.right_boundaries.at(self._index), 1)
-
-    def _boundary(self, xy: FloatArray, side: int) -> BridgePolyline:
-        if len(xy) < 2:
-            raise MapError(
-                f"map {self._map.map_name!r}: {self.id!r} has no {('left', 'right')[side]} boundary"
-            )
-        return BridgePolyline(self._source.boundary_ids[self._index][side], xy)
 
     @property
     def speed_limit_mps(self) -> float | None:
@@ -237,20 +229,9 @@ class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
     parallel_edges = _NotInNuplan()
     children_stop_lines = _NotInNuplan()
 
-    @cached_property
-    def incoming_edges(self) -> list[Any]:
-        """Blocks that lead here."""
-        return self._linked(self._source.block_incoming, "blocks")
-
-    @cached_property
-    def outgoing_edges(self) -> list[Any]:
-        """Blocks that this one leads to."""
-        return self._linked(self._source.block_outgoing, "blocks")
-
-    @cached_property
-    def interior_edges(self) -> list[Any]:
-        """Its lanes or lane connectors."""
-        return self._linked(self._source.block_edges, "edges")
+    incoming_edges = _linked("block_incoming", "blocks")
+    outgoing_edges = _linked("block_outgoing", "blocks")
+    interior_edges = _linked("block_edges", "edges")  # its lanes or lane connectors
 
     @property
     def intersection(self) -> Any:

@@ -19,18 +19,14 @@ from shiftsim.world.state import Trajectory
 
 
 class NuplanPlanner:
-    """Drives with a nuPlan planner; `shiftsim.compat.nuplan.wrap` makes it.
-
-    Attributes:
-        report: What the planner reported of the scenario before, or None.
-    """
+    """Drives with a nuPlan planner; `shiftsim.compat.nuplan.wrap` makes it."""
 
     def __init__(self, source: Any, arguments: Mapping[str, Any]) -> None:
         self._source, self._arguments = source, dict(arguments)
         self._planner = self._make()
         self.code = _hash_of_code(type(self._planner))
         self.name = str(self._planner.name())
-        self.report: Any = None
+        self.report: Any = None  # what the planner reported of the scenario before
         self._scene: SceneInfo | None = None
         self._map: BridgeMap | None = None
         self._history: HistoryKeeper | None = None
@@ -46,7 +42,7 @@ class NuplanPlanner:
             ConfigError: It asks for sensor data.
         """
         if self._scene is not None:
-            self._take_report()
+            self.close()
             self._planner = self._make()
         wanted = self._planner.observation_type()
         if not (inspect.isclass(wanted) and issubclass(wanted, DetectionsTracks)):
@@ -59,11 +55,7 @@ class NuplanPlanner:
             self._map = BridgeMap(scene.map)
         self._scene, self._history = scene, HistoryKeeper(scene)
         goal: Any = None if scene.goal is None else StateSE2(*scene.goal.tolist())
-        self._planner.initialize(
-            PlannerInitialization(
-                route_roadblock_ids=list(scene.route), mission_goal=goal, map_api=self._map
-            )
-        )
+        self._planner.initialize(PlannerInitialization(list(scene.route), goal, self._map))
 
     def plan(self, observation: Observation) -> Trajectory:
         """The planner's trajectory.
@@ -82,10 +74,7 @@ class NuplanPlanner:
     def close(self) -> None:
         """Take the last report."""
         if self._scene is not None:
-            self._take_report()
-
-    def _take_report(self) -> None:
-        self.report = self._planner.generate_planner_report()
+            self.report = self._planner.generate_planner_report()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "NuplanPlanner":
         return NuplanPlanner(copy.deepcopy(self._source, memo), self._arguments)

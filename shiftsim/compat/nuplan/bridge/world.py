@@ -33,37 +33,24 @@ from shiftsim.world.state import VehicleParameters as Dimensions
 HEIGHT = 1.8  # m, of all objects: the arrays of a scenario have none
 ROW_SECONDS = 0.05  # s, between the rows of a log
 _STEP_US = 100_000  # us, between the poses that the tracker reads
+_DIMENSIONS = ("width", "front_length", "rear_length", "wheel_base", "height")
 _COG = 1.67  # m, rear axle to the centre of gravity, nuPlan's pacifica
 
 
 def vehicle_parameters(vehicle: Dimensions) -> Any:
     """Dimensions of the ego."""
-    return VehicleParameters(
-        width=vehicle.width,
-        front_length=vehicle.front_length,
-        rear_length=vehicle.rear_length,
-        cog_position_from_rear_axle=_COG,
-        wheel_base=vehicle.wheel_base,
-        vehicle_name="pacifica",
-        vehicle_type="gen1",
-        height=vehicle.height,
-    )
+    size = {name: getattr(vehicle, name) for name in _DIMENSIONS}
+    kind = {"vehicle_name": "pacifica", "vehicle_type": "gen1"}
+    return VehicleParameters(cog_position_from_rear_axle=_COG, **size, **kind)
 
 
 def ego_state(time_us: int, row: FloatArray, vehicle: Any) -> Any:
     """The ego state of a row (11,), columns of `STATE_COLUMNS`."""
     x, y, heading, vx, vy, ax, ay, steering, steering_rate, yaw_rate, yaw_accel = row.tolist()
+    pose, velocity, accel = StateSE2(x, y, heading), StateVector2D(vx, vy), StateVector2D(ax, ay)
+    time, turning = TimePoint(int(time_us)), (yaw_rate, yaw_accel, steering_rate)
     return EgoState.build_from_rear_axle(
-        rear_axle_pose=StateSE2(x, y, heading),
-        rear_axle_velocity_2d=StateVector2D(vx, vy),
-        rear_axle_acceleration_2d=StateVector2D(ax, ay),
-        tire_steering_angle=steering,
-        time_point=TimePoint(int(time_us)),
-        vehicle_parameters=vehicle,
-        is_in_auto_mode=True,
-        angular_vel=yaw_rate,
-        angular_accel=yaw_accel,
-        tire_steering_rate=steering_rate,
+        pose, velocity, accel, steering, time, vehicle, True, *turning
     )
 
 
@@ -85,13 +72,8 @@ class SeenTracks(DetectionsTracks):
         token = tracks.tokens[track]
         length, width = tracks.sizes[0, track].tolist()
         box = OrientedBox(StateSE2(*tracks.poses[0, track].tolist()), length, width, HEIGHT)
-        metadata = SceneObjectMetadata(
-            timestamp_us=self._time_us,
-            token=f"{token}@{self._time_us}",
-            track_id=track,
-            track_token=token,
-            category_name=kind.fullname,
-        )
+        sample, now_us = f"{token}@{self._time_us}", self._time_us
+        metadata = SceneObjectMetadata(now_us, sample, track, token, kind.fullname)
         if tracks.kinds[track] > LAST_AGENT_KIND:
             return StaticObject(kind, box, metadata)
         velocity = StateVector2D(*tracks.velocities[0, track].tolist())
@@ -127,18 +109,14 @@ class HistoryKeeper:
         if self._buffer is None or observation.iteration != self._iteration + 1:
             samples = [self._sample(observation, row) for row in range(last + 1)]
             egos, seen = (list(part) for part in zip(*samples, strict=True))
-            self._buffer = SimulationHistoryBuffer.initialize_from_list(
-                HISTORY_SAMPLES, egos, seen, self._interval
-            )
+            make = SimulationHistoryBuffer.initialize_from_list
+            self._buffer = make(HISTORY_SAMPLES, egos, seen, self._interval)
         else:
             self._buffer.append(*self._sample(observation, last))
         self._iteration = observation.iteration
         now_us = int(observation.time_us)
-        return PlannerInput(
-            iteration=SimulationIteration(TimePoint(now_us), observation.iteration),
-            history=self._buffer,
-            traffic_light_data=traffic_lights(now_us, observation.lights),
-        )
+        now = SimulationIteration(TimePoint(now_us), observation.iteration)
+        return PlannerInput(now, self._buffer, traffic_lights(now_us, observation.lights))
 
     def _sample(self, observation: Observation, row: int) -> tuple[Any, Any]:
         history = observation.history
@@ -148,16 +126,10 @@ class HistoryKeeper:
 
 
 def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Trajectory:
-    """A plan of nuPlan's as ours.
+    """What a planner returned, as ours; the times are those of this iteration and the next [us].
 
     The states of an `InterpolatedTrajectory` are taken as they are. Another kind of trajectory is
     asked for its states wherever the simulation looks at it.
-
-    Args:
-        plan: What the planner returned.
-        now_us: Time stamp of this iteration [us].
-        next_us: Time stamp of the next iteration [us].
-        planner: Name of the planner, for messages.
 
     Raises:
         PlannerError: It is no trajectory of ego states.
@@ -189,16 +161,7 @@ def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Traject
 def _row(state: Any) -> tuple[float, ...]:
     pose, motion = state.rear_axle, state.dynamic_car_state
     velocity, accel = motion.rear_axle_velocity_2d, motion.rear_axle_acceleration_2d
-    return (
-        pose.x,
-        pose.y,
-        pose.heading,
-        velocity.x,
-        velocity.y,
-        accel.x,
-        accel.y,
-        state.tire_steering_angle,
-        motion.tire_steering_rate,
-        motion.angular_velocity,
-        motion.angular_acceleration,
-    )
+    moving = velocity.x, velocity.y, accel.x, accel.y
+    steering = state.tire_steering_angle, motion.tire_steering_rate
+    turning = motion.angular_velocity, motion.angular_acceleration
+    return (pose.x, pose.y, pose.heading, *moving, *steering, *turning)

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2, part
+from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2, derived, part
 from shiftsim.compat.nuplan.stand_ins.transforms import (
     translate_longitudinally,
     translate_longitudinally_and_laterally,
 )
 from shiftsim.world.state import PACIFICA
+
+_DIMENSIONS = ("width", "front_length", "rear_length", "wheel_base", "height")
 
 
 class _Halves:
@@ -23,15 +25,8 @@ class _Halves:
     width: Any
     length: Any
 
-    @property
-    def half_width(self) -> float:
-        """Half the width [m]."""
-        return float(self.width / 2.0)
-
-    @property
-    def half_length(self) -> float:
-        """Half the length [m]."""
-        return float(self.length / 2.0)
+    half_width = derived(lambda self: float(self.width / 2.0), "Half the width [m].")
+    half_length = derived(lambda self: float(self.length / 2.0), "Half the length [m].")
 
 
 @dataclass
@@ -62,15 +57,14 @@ class VehicleParameters(BoxParameters):
         self.wheel_base, self.height = wheel_base, height
         self.vehicle_name, self.vehicle_type = vehicle_name, vehicle_type
 
-    @property
-    def rear_axle_to_center(self) -> float:
-        """From the rear axle forward to the centre of the box [m]."""
-        return self.half_length - self.rear_length
-
-    @property
-    def length_cog_to_front_axle(self) -> float:
-        """From the centre of gravity forward to the front axle [m]."""
-        return self.wheel_base - self.cog_position_from_rear_axle
+    rear_axle_to_center = derived(
+        lambda self: self.half_length - self.rear_length,
+        "From the rear axle forward to the centre of the box [m].",
+    )
+    length_cog_to_front_axle = derived(
+        lambda self: self.wheel_base - self.cog_position_from_rear_axle,
+        "From the centre of gravity forward to the front axle [m].",
+    )
 
     def __hash__(self) -> int:
         return hash(tuple(vars(self).values()))
@@ -83,29 +77,18 @@ class VehicleParameters(BoxParameters):
 def get_pacifica_parameters() -> VehicleParameters:
     """The car of nuPlan, which is also shiftsim's ego."""
     return VehicleParameters(
-        width=PACIFICA.width,
-        front_length=PACIFICA.front_length,
-        rear_length=PACIFICA.rear_length,
+        **{name: getattr(PACIFICA, name) for name in _DIMENSIONS},
         cog_position_from_rear_axle=1.67,
-        wheel_base=PACIFICA.wheel_base,
         vehicle_name="pacifica",
         vehicle_type="gen1",
-        height=PACIFICA.height,
     )
 
 
 class OrientedBoxPointType(IntEnum):
     """Points of a box."""
 
-    FRONT_BUMPER = 1
-    REAR_BUMPER = 2
-    FRONT_LEFT = 3
-    FRONT_RIGHT = 4
-    REAR_LEFT = 5
-    REAR_RIGHT = 6
-    CENTER = 7
-    LEFT = 8
-    RIGHT = 9
+    FRONT_BUMPER, REAR_BUMPER, FRONT_LEFT, FRONT_RIGHT = range(1, 5)
+    REAR_LEFT, REAR_RIGHT, CENTER, LEFT, RIGHT = range(5, 10)
 
 
 # half lengths forward and half widths to the left of the centre
@@ -148,10 +131,7 @@ class OrientedBox(_Halves):
     width = part("dimensions.width", "Width [m].")
     height = part("dimensions.height", "Height [m].")
 
-    @property
-    def half_height(self) -> float:
-        """Half the height [m]."""
-        return float(self.height / 2.0)
+    half_height = derived(lambda self: float(self.height / 2.0), "Half the height [m].")
 
     def corner(self, point: OrientedBoxPointType) -> Point2D:
         """One point of the box."""
@@ -215,15 +195,11 @@ class CarFootprint(OrientedBox):
         distance = vehicle_parameters.rear_axle_to_center - ahead
         return cls(translate_longitudinally(cog_pose, distance), vehicle_parameters)
 
-    @property
-    def oriented_box(self) -> OrientedBox:
-        """The box itself."""
-        return self
-
-    @property
-    def rear_axle_to_center_dist(self) -> float:
-        """From the rear axle forward to the centre [m]."""
-        return float(self.vehicle_parameters.rear_axle_to_center)
+    oriented_box = derived(lambda self: self, "The box itself.")
+    rear_axle_to_center_dist = derived(
+        lambda self: float(self.vehicle_parameters.rear_axle_to_center),
+        "From the rear axle forward to the centre [m].",
+    )
 
     @cached_property
     def rear_axle(self) -> StateSE2:

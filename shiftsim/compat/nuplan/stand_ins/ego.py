@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -121,24 +121,19 @@ def get_acceleration_shifted(
     return StateVector2D(*(ref_accel.array + shift))
 
 
+@dataclass(eq=False, repr=False)
 class DynamicCarState:
     """Velocities and accelerations of a car, in its own frame."""
 
-    def __init__(
-        self,
-        rear_axle_to_center_dist: float,
-        rear_axle_velocity_2d: StateVector2D,
-        rear_axle_acceleration_2d: StateVector2D,
-        angular_velocity: float = 0.0,
-        angular_acceleration: float = 0.0,
-        tire_steering_rate: float = 0.0,
-    ) -> None:
+    rear_axle_to_center_dist: InitVar[float]
+    rear_axle_velocity_2d: StateVector2D
+    rear_axle_acceleration_2d: StateVector2D
+    angular_velocity: float = 0.0
+    angular_acceleration: float = 0.0
+    tire_steering_rate: float = 0.0
+
+    def __post_init__(self, rear_axle_to_center_dist: float) -> None:
         self._center = StateVector2D(rear_axle_to_center_dist, 0.0)
-        self.rear_axle_velocity_2d = rear_axle_velocity_2d
-        self.rear_axle_acceleration_2d = rear_axle_acceleration_2d
-        self.angular_velocity = angular_velocity
-        self.angular_acceleration = angular_acceleration
-        self.tire_steering_rate = tire_steering_rate
 
     @classmethod
     def build_from_rear_axle(cls, *values: Any, **named: Any) -> "DynamicCarState":
@@ -197,14 +192,9 @@ class EgoState(InterpolatableState):
     ) -> "EgoState":
         """From what is known at the rear axle."""
         footprint = CarFootprint.build_from_rear_axle(rear_axle_pose, vehicle_parameters)
-        motion = DynamicCarState(
-            footprint.rear_axle_to_center_dist,
-            rear_axle_velocity_2d,
-            rear_axle_acceleration_2d,
-            angular_vel,
-            angular_accel,
-            tire_steering_rate,
-        )
+        distance, velocity = footprint.rear_axle_to_center_dist, rear_axle_velocity_2d
+        turning = (angular_vel, angular_accel, tire_steering_rate)
+        motion = DynamicCarState(distance, velocity, rear_axle_acceleration_2d, *turning)
         return cls(footprint, motion, tire_steering_angle, is_in_auto_mode, time_point)
 
     @classmethod
@@ -222,14 +212,11 @@ class EgoState(InterpolatableState):
     ) -> "EgoState":
         """From what is known at the centre of the box."""
         footprint = CarFootprint(center, vehicle_parameters)
-        back = StateVector2D(-footprint.rear_axle_to_center_dist, 0.0)
-        motion = DynamicCarState(
-            footprint.rear_axle_to_center_dist,
-            get_velocity_shifted(back, center_velocity_2d, angular_vel),
-            get_acceleration_shifted(back, center_acceleration_2d, angular_vel, angular_accel),
-            angular_vel,
-            angular_accel,
-        )
+        distance, turning = footprint.rear_axle_to_center_dist, (angular_vel, angular_accel)
+        back = StateVector2D(-distance, 0.0)
+        velocity = get_velocity_shifted(back, center_velocity_2d, angular_vel)
+        accel = get_acceleration_shifted(back, center_acceleration_2d, *turning)
+        motion = DynamicCarState(distance, velocity, accel, *turning)
         return cls(footprint, motion, tire_steering_angle, is_in_auto_mode, time_point)
 
     @property
@@ -240,9 +227,8 @@ class EgoState(InterpolatableState):
     @cached_property
     def waypoint(self) -> Waypoint:
         """The box, with the velocity of the rear axle."""
-        return Waypoint(
-            self.time_point, self.car_footprint, self.dynamic_car_state.rear_axle_velocity_2d
-        )
+        velocity = self.dynamic_car_state.rear_axle_velocity_2d
+        return Waypoint(self.time_point, self.car_footprint, velocity)
 
     @cached_property
     def agent(self) -> AgentState:
@@ -312,14 +298,10 @@ class KinematicBicycleModel:
         step_bicycle(row, accel, rate, self._vehicle.wheel_base, sampling_time.time_s, row)
         x, y, heading, vx, vy, ax, ay, steering, *turning = row.tolist()
         steering_rate, yaw_rate, yaw_accel = turning
+        pose, velocity = StateSE2(x, y, heading), StateVector2D(vx, vy)
+        reached = StateVector2D(ax, ay)
+        now = TimePoint(time + sampling_time.time_us)
+        turn = (yaw_rate, yaw_accel, steering_rate)
         return EgoState.build_from_rear_axle(
-            StateSE2(x, y, heading),
-            StateVector2D(vx, vy),
-            StateVector2D(ax, ay),
-            steering,
-            TimePoint(time + sampling_time.time_us),
-            self._vehicle,
-            angular_vel=yaw_rate,
-            angular_accel=yaw_accel,
-            tire_steering_rate=steering_rate,
+            pose, velocity, reached, steering, now, self._vehicle, True, *turn
         )

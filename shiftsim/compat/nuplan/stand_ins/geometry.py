@@ -1,7 +1,7 @@
 """Times, points, poses and vectors."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -14,6 +14,20 @@ from shiftsim.arrays import FloatArray
 def part(path: str, doc: str) -> Any:
     """A property that is an attribute of a part: `part("center.x", "Of the centre [m].")`."""
     return property(attrgetter(path), doc=doc)
+
+
+def derived(function: Callable[[Any], Any], doc: str) -> Any:
+    """A property that follows from the others."""
+    return property(function, doc=doc)
+
+
+def _component(index: int, doc: str) -> Any:
+    """A property that is one number of a vector, which can be changed."""
+
+    def change(vector: "StateVector2D", value: float) -> None:
+        vector.array[index] = value
+
+    return property(lambda vector: float(vector.array[index]), change, doc=doc)
 
 
 @dataclass(init=False, order=True, unsafe_hash=True, repr=False, slots=True)
@@ -42,15 +56,9 @@ class TimeDuration:
         """A span in seconds, cut to whole microseconds."""
         return cls.from_us(int(t_s * 1_000_000))
 
-    @property
-    def time_ms(self) -> float:
-        """The span [ms]."""
-        return self.time_us / 1e3
-
-    @property
-    def time_s(self) -> float:
-        """The span [s]."""
-        return self.time_us / 1e6  # nuPlan rule 571: a division here, a product in TimePoint
+    time_ms = derived(lambda self: self.time_us / 1e3, "The span [ms].")
+    # nuPlan rule 571: a division here, a product in TimePoint
+    time_s = derived(lambda self: self.time_us / 1e6, "The span [s].")
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, TimeDuration):
@@ -92,10 +100,7 @@ class TimePoint:
     def __post_init__(self) -> None:
         assert self.time_us >= 0, f"a time point is not negative: {self.time_us} us"
 
-    @property
-    def time_s(self) -> float:
-        """Seconds since the epoch."""
-        return self.time_us * 1e-6
+    time_s = derived(lambda self: self.time_us * 1e-6, "Seconds since the epoch.")
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, (TimeDuration, TimePoint)):
@@ -125,10 +130,7 @@ class Point2D:
     def __iter__(self) -> Iterator[float]:
         return iter((self.x, self.y))
 
-    @property
-    def array(self) -> FloatArray:
-        """(2,) x [m], y [m]."""
-        return np.array((self.x, self.y), np.float64)
+    array = derived(lambda self: np.array((self.x, self.y), np.float64), "(2,) x [m], y [m].")
 
 
 @dataclass(eq=False, slots=True)
@@ -137,10 +139,7 @@ class StateSE2(Point2D):
 
     heading: float
 
-    @property
-    def point(self) -> Point2D:
-        """The position."""
-        return Point2D(self.x, self.y)
+    point = derived(lambda self: Point2D(self.x, self.y), "The position.")
 
     def as_matrix(self) -> FloatArray:
         """(3, 3) homogeneous transform from this pose's frame to the map's."""
@@ -217,7 +216,6 @@ class TemporalStateSE2(StateSE2):
     time_point: TimePoint
 
     time_us = part("time_point.time_us", "Microseconds since the epoch.")
-
     time_seconds = part("time_point.time_s", "Seconds since the epoch.")
 
 
@@ -229,23 +227,8 @@ class StateVector2D:
     def __init__(self, x: float, y: float) -> None:
         self.array: FloatArray = np.array((x, y), np.float64)
 
-    @property
-    def x(self) -> float:
-        """First component."""
-        return float(self.array[0])
-
-    @x.setter
-    def x(self, x: float) -> None:
-        self.array[0] = x
-
-    @property
-    def y(self) -> float:
-        """Second component."""
-        return float(self.array[1])
-
-    @y.setter
-    def y(self, y: float) -> None:
-        self.array[1] = y
+    x = _component(0, "First component.")
+    y = _component(1, "Second component.")
 
     def magnitude(self) -> float:
         """Length of the vector."""

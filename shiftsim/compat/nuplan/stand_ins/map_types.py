@@ -12,25 +12,10 @@ from shiftsim.compat.nuplan.stand_ins.geometry import Point2D
 class SemanticMapLayer(IntEnum):
     """Layers of a map."""
 
-    LANE = 0
-    INTERSECTION = 1
-    STOP_LINE = 2
-    TURN_STOP = 3
-    CROSSWALK = 4
-    DRIVABLE_AREA = 5
-    YIELD = 6
-    TRAFFIC_LIGHT = 7
-    STOP_SIGN = 8
-    EXTENDED_PUDO = 9
-    SPEED_BUMP = 10
-    LANE_CONNECTOR = 11
-    BASELINE_PATHS = 12
-    BOUNDARIES = 13
-    WALKWAYS = 14
-    CARPARK_AREA = 15
-    PUDO = 16
-    ROADBLOCK = 17
-    ROADBLOCK_CONNECTOR = 18
+    LANE, INTERSECTION, STOP_LINE, TURN_STOP, CROSSWALK, DRIVABLE_AREA, YIELD = range(7)
+    TRAFFIC_LIGHT, STOP_SIGN, EXTENDED_PUDO, SPEED_BUMP, LANE_CONNECTOR = range(7, 12)
+    BASELINE_PATHS, BOUNDARIES, WALKWAYS, CARPARK_AREA, PUDO = range(12, 17)
+    ROADBLOCK, ROADBLOCK_CONNECTOR = 17, 18
 
     @classmethod
     def deserialize(cls, layer: str) -> "SemanticMapLayer":
@@ -57,10 +42,7 @@ IntersectionType = IntEnum(
 class TrafficLightStatusType(IntEnum):
     """What a traffic light shows."""
 
-    GREEN = 0
-    YELLOW = 1
-    RED = 2
-    UNKNOWN = 3
+    GREEN, YELLOW, RED, UNKNOWN = range(4)
 
     def serialize(self) -> str:
         """Its name."""

@@ -42,21 +42,13 @@ STATIC_OBJECT_TYPES = {*_TYPES[3:7]}
 
 @dataclass(frozen=True)
 class SceneObjectMetadata:
-    """Where an object comes from.
+    """Where an object comes from."""
 
-    Attributes:
-        timestamp_us: When it was seen [us].
-        token: Id of this object in this sample.
-        track_id: Number of its track.
-        track_token: Id of its track.
-        category_name: Name of its type in the data.
-    """
-
-    timestamp_us: int
-    token: str
-    track_id: int | None
-    track_token: str | None
-    category_name: str | None = None
+    timestamp_us: int  # when it was seen [us]
+    token: str  # of this object in this sample
+    track_id: int | None  # number of its track
+    track_token: str | None  # id of its track
+    category_name: str | None = None  # name of its type in the data
 
     @property
     def timestamp_s(self) -> float:
@@ -89,11 +81,9 @@ class SceneObject:
     ) -> "SceneObject":
         """A generic object; `size` is width, length, height [m]."""
         width, length, height = size
-        return SceneObject(
-            TrackedObjectType.GENERIC_OBJECT,
-            OrientedBox(center, length, width, height),
-            SceneObjectMetadata(timestamp_us, token, track_id, track_token),
-        )
+        box = OrientedBox(center, length, width, height)
+        metadata = SceneObjectMetadata(timestamp_us, token, track_id, track_token)
+        return SceneObject(TrackedObjectType.GENERIC_OBJECT, box, metadata)
 
     box = part("_box", "Its box.")
     center = part("_box.center", "Pose of the box's centre.")
@@ -122,12 +112,9 @@ class AgentState(SceneObject):
     @classmethod
     def from_new_pose(cls, agent: "AgentState", pose: StateSE2) -> "AgentState":
         """The same agent elsewhere."""
+        kind, box = agent.tracked_object_type, OrientedBox.from_new_pose(agent.box, pose)
         return AgentState(
-            agent.tracked_object_type,
-            OrientedBox.from_new_pose(agent.box, pose),
-            agent.velocity,
-            replace(agent.metadata),
-            agent.angular_velocity,
+            kind, box, agent.velocity, replace(agent.metadata), agent.angular_velocity
         )
 
 
@@ -196,13 +183,8 @@ class Agent(AgentTemporalState, AgentState):
     @classmethod
     def from_agent_state(cls, agent: AgentState) -> "Agent":
         """An agent without past and future."""
-        return cls(
-            agent.tracked_object_type,
-            agent.box,
-            agent.velocity,
-            agent.metadata,
-            agent.angular_velocity,
-        )
+        kind, turning = agent.tracked_object_type, agent.angular_velocity
+        return cls(kind, agent.box, agent.velocity, agent.metadata, turning)
 
 
 TrackedObject: TypeAlias = Any
@@ -219,12 +201,9 @@ class TrackedObjects:
     @classmethod
     def from_oriented_boxes(cls, boxes: Sequence[OrientedBox]) -> "TrackedObjects":
         """Generic objects, numbered."""
+        kind = TrackedObjectType.GENERIC_OBJECT
         return cls(
-            SceneObject(
-                TrackedObjectType.GENERIC_OBJECT,
-                box,
-                SceneObjectMetadata(number, str(number), None, None),
-            )
+            SceneObject(kind, box, SceneObjectMetadata(number, str(number), None, None))
             for number, box in enumerate(boxes)
         )
 
@@ -236,11 +215,8 @@ class TrackedObjects:
         self, tracked_object_types: Iterable[TrackedObjectType]
     ) -> list[TrackedObject]:
         """The objects of some types, type after type."""
-        return [
-            item
-            for wanted in tracked_object_types
-            for item in self.get_tracked_objects_of_type(wanted)
-        ]
+        each = map(self.get_tracked_objects_of_type, tracked_object_types)
+        return [item for found in each for item in found]
 
     def get_agents(self) -> list[Any]:
         """Vehicles, pedestrians, bicycles."""

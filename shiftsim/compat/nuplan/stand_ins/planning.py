@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.compat.nuplan.stand_ins.ego import EgoState, InterpolatableState, SplitState
-from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, TimePoint, part
+from shiftsim.compat.nuplan.stand_ins.geometry import StateSE2, TimePoint, derived, part
 from shiftsim.compat.nuplan.stand_ins.map_types import AbstractMap, TrafficLightStatusData
 from shiftsim.compat.nuplan.stand_ins.objects import Observation
 from shiftsim.compat.nuplan.stand_ins.transforms import AngularInterpolator, interpolate_linearly
@@ -33,15 +33,12 @@ class AbstractTrajectory(ABC):
     def end_time(self) -> TimePoint:
         """Its last moment."""
 
-    @property
-    def duration(self) -> float:
-        """How long it lasts [s]."""
-        return self.end_time.time_s - self.start_time.time_s
-
-    @property
-    def duration_us(self) -> int:
-        """How long it lasts [us]."""
-        return int(self.end_time.time_us - self.start_time.time_us)
+    duration = derived(
+        lambda self: self.end_time.time_s - self.start_time.time_s, "How long it lasts [s]."
+    )
+    duration_us = derived(
+        lambda self: int(self.end_time.time_us - self.start_time.time_us), "How long it lasts [us]."
+    )
 
     @abstractmethod
     def get_state_at_time(self, time_point: TimePoint) -> Any:
@@ -85,15 +82,8 @@ class InterpolatedTrajectory(AbstractTrajectory):
         angles = AngularInterpolator(times, [part.angular_states for part in parts])
         return times, linear, angles, parts[0].fixed_states
 
-    @property
-    def start_time(self) -> TimePoint:
-        """Moment of the first state."""
-        return self._trajectory[0].time_point
-
-    @property
-    def end_time(self) -> TimePoint:
-        """Moment of the last state."""
-        return self._trajectory[-1].time_point
+    start_time = derived(lambda self: self._trajectory[0].time_point, "Moment of the first state.")
+    end_time = derived(lambda self: self._trajectory[-1].time_point, "Moment of the last state.")
 
     def get_state_at_time(self, time_point: TimePoint) -> Any:
         """The state at a moment of its span."""
@@ -123,17 +113,11 @@ class InterpolatedTrajectory(AbstractTrajectory):
 
 @dataclass(eq=False)
 class TrajectorySampling:
-    """How a trajectory is sampled; the third value follows from two.
+    """How a trajectory is sampled; the third value follows from two."""
 
-    Attributes:
-        num_poses: States beyond the present one.
-        time_horizon: From now to the last state [s].
-        interval_length: Between states [s].
-    """
-
-    num_poses: int | None = None
-    time_horizon: float | None = None
-    interval_length: float | None = None
+    num_poses: int | None = None  # states beyond the present one
+    time_horizon: float | None = None  # from now to the last state [s]
+    interval_length: float | None = None  # between states [s]
 
     def __post_init__(self) -> None:
         count, horizon, interval = self.num_poses, self.time_horizon, self.interval_length
@@ -186,10 +170,10 @@ class PredictedTrajectory:
     probability: float
     waypoints: list[Any]
 
-    @property
-    def valid_waypoints(self) -> list[Any]:
-        """The waypoints that are known."""
-        return [waypoint for waypoint in self.waypoints if waypoint]
+    valid_waypoints = derived(
+        lambda self: [waypoint for waypoint in self.waypoints if waypoint],
+        "The waypoints that are known.",
+    )
 
     @cached_property
     def trajectory(self) -> AbstractTrajectory:
@@ -240,37 +224,28 @@ class SimulationHistoryBuffer:
         sample_interval: float | None = None,
     ) -> "SimulationHistoryBuffer":
         """A buffer that keeps the last `buffer_size` samples."""
-        return cls(
-            deque(ego_states, buffer_size), deque(observations, buffer_size), sample_interval
-        )
+        egos, seen = deque(ego_states, buffer_size), deque(observations, buffer_size)
+        return cls(egos, seen, sample_interval)
 
-    @property
-    def size(self) -> int:
-        """How many samples there are."""
-        return len(self.ego_state_buffer)
+    size = derived(lambda self: len(self.ego_state_buffer), "How many samples there are.")
 
     def __len__(self) -> int:
         return self.size
 
-    @property
-    def duration(self) -> float | None:
-        """Samples times interval [s]."""
-        return self.sample_interval * self.size if self.sample_interval else None
-
-    @property
-    def current_state(self) -> tuple[EgoState, Observation]:
-        """The present ego state and observation."""
-        return self.ego_state_buffer[-1], self.observation_buffer[-1]
-
-    @property
-    def ego_states(self) -> list[EgoState]:
-        """Ego states, the present one last."""
-        return list(self.ego_state_buffer)
-
-    @property
-    def observations(self) -> list[Observation]:
-        """Observations, the present one last."""
-        return list(self.observation_buffer)
+    duration = derived(
+        lambda self: self.sample_interval * self.size if self.sample_interval else None,
+        "Samples times interval [s].",
+    )
+    current_state = derived(
+        lambda self: (self.ego_state_buffer[-1], self.observation_buffer[-1]),
+        "The present ego state and observation.",
+    )
+    ego_states = derived(
+        lambda self: list(self.ego_state_buffer), "Ego states, the present one last."
+    )
+    observations = derived(
+        lambda self: list(self.observation_buffer), "Observations, the present one last."
+    )
 
     def append(self, ego_state: EgoState, observation: Observation) -> None:
         """Add a sample; the oldest one may go."""
@@ -286,32 +261,20 @@ class SimulationHistoryBuffer:
 
 @dataclass(frozen=True)
 class PlannerInitialization:
-    """What a planner is given before the first step.
+    """What a planner is given before the first step."""
 
-    Attributes:
-        route_roadblock_ids: Roadblocks from start to goal.
-        mission_goal: Where the drive leads to in the end, or None.
-        map_api: The map.
-    """
-
-    route_roadblock_ids: list[str]
-    mission_goal: StateSE2
+    route_roadblock_ids: list[str]  # roadblocks from start to goal
+    mission_goal: StateSE2  # where the drive leads to in the end, or None
     map_api: AbstractMap
 
 
 @dataclass(frozen=True)
 class PlannerInput:
-    """What a planner is given at a step.
-
-    Attributes:
-        iteration: Number and moment of the step.
-        history: The last samples.
-        traffic_light_data: Lights of this step.
-    """
+    """What a planner is given at a step."""
 
     iteration: SimulationIteration
-    history: SimulationHistoryBuffer
-    traffic_light_data: list[TrafficLightStatusData] | None = None
+    history: SimulationHistoryBuffer  # the last samples
+    traffic_light_data: list[TrafficLightStatusData] | None = None  # of this step
 
 
 @dataclass(frozen=True)
