@@ -94,10 +94,7 @@ def _heights(rows: Source | None) -> dict[tuple[int, str], float]:
 
 
 def _compare_objects(
-    key: tuple[str, ...],
-    log: SimulationLog,
-    objects: Groups,
-    heights: dict[tuple[int, str], float],
+    key: tuple[str, ...], log: SimulationLog, objects: Groups, heights: dict[tuple[int, str], float]
 ) -> None:
     tracks = log.tracks
     orders = [order_observed(tracks.kinds, row) for row in tracks.valid]

@@ -13,12 +13,7 @@ from shiftsim.sim.observation import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation
-from shiftsim.verify.pdm.steps import (
-    STEP_TOLERANCE,
-    Planned,
-    compare_scores,
-    step_arrays,
-)
+from shiftsim.verify.pdm.steps import STEP_TOLERANCE, Planned, compare_scores, step_arrays
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
