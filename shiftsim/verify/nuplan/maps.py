@@ -126,27 +126,24 @@ def attributes_of(road: VectorMap, layer: str, index: int) -> dict[str, Any]:
     edges, blocks = road.edges, road.blocks
     if layer in ("LANE", "LANE_CONNECTOR"):
         limit = float(road.speed_limits[index])
-        own: dict[str, Any] = {
-            "has_traffic_lights": bool(road.has_traffic_lights[index]),
-            "stop_lines": _names(road.stop_polygons, road.stop_lines.at(index)),
-        }
-        if layer == "LANE":
-            own = {
-                "index": int(road.lane_index[index]),
-                "left_lane": _name(edges, road.left_lane[index]),
-                "right_lane": _name(edges, road.right_lane[index]),
-            }
-        return {
+        out: dict[str, Any] = {
             "roadblock_id": _name(blocks, road.block_of[index]),
             "speed_limit_mps": None if np.isnan(limit) else limit,
             "incoming": _names(edges, road.incoming.at(index)),
             "outgoing": _names(edges, road.outgoing.at(index)),
             "baseline_length": road.baselines.length(index),
-            **own,
         }
+        if layer == "LANE":
+            out["index"] = int(road.lane_index[index])
+            out["left_lane"] = _name(edges, road.left_lane[index])
+            out["right_lane"] = _name(edges, road.right_lane[index])
+        else:
+            out["has_traffic_lights"] = bool(road.has_traffic_lights[index])
+            out["stop_lines"] = _names(road.stop_polygons, road.stop_lines.at(index))
+        return out
     if layer in ("ROADBLOCK", "ROADBLOCK_CONNECTOR"):
         inside = road.block_edges.at(index)
-        out: dict[str, Any] = {
+        out = {
             "incoming": _names(blocks, road.block_incoming.at(index)),
             "outgoing": _names(blocks, road.block_outgoing.at(index)),
             "interior": _names(edges, inside),

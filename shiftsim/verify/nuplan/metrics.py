@@ -24,13 +24,13 @@ _TABLES = {
 # coordinates near 4e6 are spaced 5e-10
 _RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
 _CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
-# how the devkit files each metric: those of each category, the units of scores that have one
+# how the devkit files each metric: the category of those that are not of Planning, and the units
+# of scores that have one
 _CATEGORIES = {
-    "Violations": ("speed_limit_compliance", "ego_is_comfortable"),
-    "Dynamics": (
-        *("ego_jerk", "ego_lat_acceleration", "ego_lon_acceleration", "ego_lon_jerk"),
-        *("ego_yaw_acceleration", "ego_yaw_rate", "no_ego_at_fault_collisions"),
-    ),
+    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
+    **dict.fromkeys(("ego_jerk", "ego_lon_jerk", "ego_yaw_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_yaw_rate", "no_ego_at_fault_collisions"), "Dynamics"),
 }
 _UNITS = {
     **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
@@ -112,16 +112,13 @@ def _compare_run(
 ) -> None:
     """Compare what no threshold enters: routes and collisions."""
     samples = range(len(measured.time_us))
-    corners = {
-        column: [",".join(measured.corners.ids(road, i, corner)) for i in samples]
-        for corner, column in enumerate(_CORNERS)
-    }
     ours = {
         "iteration": np.arange(len(samples)),
         "center": [",".join(measured.route.ids(road, i)) for i in samples],
         "in_common_or_connected": measured.is_common,
-        **corners,
     }
+    for corner, column in enumerate(_CORNERS):
+        ours[column] = [",".join(measured.corners.ids(road, i, corner)) for i in samples]
     tables["route"].match(run, ours)
     found = measured.collisions
     contacts = {
@@ -145,10 +142,7 @@ def _compare_profile(
     rows = tables["metrics"][key]
     labels = {
         "metric": list(scores),
-        "category": [
-            next((kind for kind, names in _CATEGORIES.items() if name in names), "Planning")
-            for name in scores
-        ],
+        "category": [_CATEGORIES.get(name, "Planning") for name in scores],
         "unit": [_UNITS.get(name) for name in scores],
     }
     if rows.match(where, labels):
