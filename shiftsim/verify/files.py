@@ -113,14 +113,8 @@ class Source:
     ) -> bool:
         """Compare values of ours with those of the same names; a missing one is a mismatch.
 
-        Args:
-            where: Which case.
-            ours: Our value by name.
-            atol: Tolerances.
-            quantity: Begins the names of the quantities, instead of the name of the file.
-
-        Returns:
-            Whether all agree.
+        `quantity` begins the names of the quantities, instead of the name of the file. Returns
+        whether all agree.
         """
         prefix, agree = self.name if quantity is None else quantity, True
         for name, value in ours.items():
@@ -129,8 +123,7 @@ class Source:
             if name in self:
                 agree &= self.report.compare(label, where, value, self[name], atol=bound)
             else:
-                self.report.fail(label, where, f"no {self.what} {name!r}")
-                agree = False
+                agree = self.report.fail(label, where, f"no {self.what} {name!r}")
         return agree
 
     def match_rows(
@@ -186,57 +179,35 @@ def read_json(path: Path) -> Any:
         raise DataError(f"{path}: not readable JSON: {error}") from error
 
 
-class Groups:
-    """The rows of a `.parquet` by key, and which of them were asked for."""
+class Groups(dict[tuple[str, ...], Source]):
+    """The rows of a `.parquet` by key, and which of them were asked for; other keys have no rows.
+
+    A file that does not exist is named as not covered.
+    """
 
     def __init__(self, path: Path, report: Report, key: tuple[str, ...] = RUN_KEY) -> None:
-        """A file that does not exist is named as not covered, and has no rows."""
-        self._groups: dict[tuple[str, ...], Source] = {}
         self._asked: set[tuple[str, ...]] = set()
         if path.is_file():
             self.table = read_table(path, report)
-            self._groups = self.table.groups(*key)
+            super().__init__(self.table.groups(*key))
         else:
             self.table = Source(path.stem, "column", {}, report)
             report.skip(f"{path.name} is missing")
 
-    def __iter__(self) -> Iterator[tuple[str, ...]]:
-        return iter(self._groups)
-
-    def __len__(self) -> int:
-        return len(self._groups)
-
-    def get(self, *key: str) -> Source | None:
-        """The rows of a key, if there are any."""
-        self._asked.add(key)
-        return self._groups.get(key)
-
     def __getitem__(self, key: tuple[str, ...]) -> Source:
-        if (rows := self.get(*key)) is None:
-            raise DataError(f"{self.table.name}: no rows of {' '.join(key)}")
-        return rows
+        self._asked.add(key)
+        return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
-    def match(
-        self,
-        key: tuple[str, ...],
-        ours: Mapping[str, Any],
-        atol: Tolerances = EXACT,
-        *,
-        quantity: str | None = None,
-    ) -> bool:
-        """`Source.match` for the rows of a key; where there are none, ours must have none."""
-        rows, where = self.get(*key), " ".join(key)
-        if rows is None:
-            count = len(next(iter(ours.values())))
-            return self.table.report.compare(f"{self.table.name} rows", where, count, 0)
-        return rows.match(where, ours, atol, quantity=quantity)
+    def match(self, key: tuple[str, ...], *args: Any, **options: Any) -> bool:
+        """`Source.match` for the rows of a key."""
+        return self[key].match(" ".join(key), *args, **options)
 
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
-        for key in self._groups:
+        for key in self:
             if key not in self._asked and (mode is None or mode in key):
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
-        if self._asked & set(self._groups):
+        if self._asked & set(self):
             self.table.finish()
 
 
@@ -245,19 +216,15 @@ def verify_files(
 ) -> None:
     """Give every file of a folder to the part whose pattern is the first to match its name.
 
-    Args:
-        folder: The folder.
-        report: Receives what no part takes, and as a mismatch what a part raises.
-        parts: By glob pattern what compares such a file or sub-folder; None for one that need not
-            be compared, as `README*` never need be.
+    A part compares such a file or sub-folder, and what it raises is a mismatch; it is None where
+    nothing need be compared. A file that no pattern matches is not covered, but for `README*`.
     """
     for path in sorted(folder.iterdir()):
-        pattern = next((p for p in (*parts, "README*") if fnmatch(path.name, p)), None)
-        part = None if pattern is None else parts.get(pattern)
-        if pattern is None:
-            report.skip(f"file {path.name}")
-        elif part is None:
-            report.note(f"{path.name} (for reading)")
-        else:
+        found = [part for pattern, part in parts.items() if fnmatch(path.name, pattern)]
+        if found and (part := found[0]):
             with report.attempt(path.stem, path.name):
                 part(path)
+        elif found or path.name.startswith("README"):
+            report.note(f"{path.name} (for reading)")
+        else:
+            report.skip(f"file {path.name}")

@@ -11,7 +11,6 @@ from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.files import Source, read_fields
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, make_scenario, read_map, read_objects
-from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights
 
@@ -72,15 +71,6 @@ def _make_scenario(world: Source) -> Scenario:
     ego = ego_states(dict(zip(EGO_COLUMNS[: VY + 1], frames, strict=True)))
     tracks = read_objects(sorted(things, key=lambda o: AgentKind[o["type"]]), len(time_us))
     out = make_scenario(str(world.values["world"]), road, time_us, ego, tracks)
-    return replace(out, traffic_lights=_make_lights(world["lights"], road))
-
-
-def _make_lights(lights: list[dict[str, str]], road: VectorMap) -> TrafficLights:
-    ids = tuple(sorted({name for row in lights for name in row}))
-    for name in ids:
-        road.edge(name)
-    status = np.full((len(lights), len(ids)), LightStatus.ABSENT, np.int8)
-    for row, listed in enumerate(lights):
-        for name, word in listed.items():
-            status[row, ids.index(name)] = LightStatus[word]
-    return TrafficLights(ids, status)
+    ids = tuple(sorted({name for row in world["lights"] for name in row}))
+    status = [[LightStatus[row.get(name, "ABSENT")] for name in ids] for row in world["lights"]]
+    return replace(out, traffic_lights=TrafficLights(ids, np.array(status, np.int8)))

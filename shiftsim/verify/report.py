@@ -6,7 +6,7 @@ label, or a value that by the folder's README need not be compared).
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 from zipfile import BadZipFile
@@ -55,28 +55,21 @@ class Report:
         atol: ArrayLike = 0.0,
         angle: bool = False,
     ) -> bool:
-        """Compare one case; NaN equals NaN, infinities must agree, other shapes differ.
+        """Compare one case; returns whether ours is as expected.
 
-        Args:
-            quantity: What is compared; cases of one quantity are tallied together.
-            where: Which case: file, scene, run.
-            actual: Ours: a scalar, string, array or list, also of lists of several lengths.
-            expected: The reference value of the same form; None among numbers is NaN.
-            atol: Absolute tolerance, of all values or of each (it is broadcast to them); 0 demands
-                equality. Strings, booleans and integers are always compared exactly.
-            angle: Whether the values are angles [rad], which are equal up to whole turns.
-
-        Returns:
-            Whether they agree.
+        Values are scalars, strings, arrays or lists, also of lists of several lengths. NaN (None in
+        references) equals NaN, infinities must agree, other shapes differ; `angle`s [rad] are equal
+        up to whole turns. `atol`, of all values or of each, is the absolute tolerance of floats:
+        strings, booleans and integers are compared exactly.
         """
-        tally = self.quantities.setdefault(quantity, Quantity())
-        tally.cases += 1
+        tally = self._count(quantity)
         tally.tolerance = max(tally.tolerance, float(np.max(atol)))
         ours, theirs = _array(actual), _array(expected)
         if ours.shape != theirs.shape:
-            return self._differ(tally, quantity, where, f"shape {ours.shape}, not {theirs.shape}")
+            return self._differ(quantity, where, f"shape {ours.shape}, not {theirs.shape}")
         if ours.dtype.kind == "f" and theirs.dtype.kind == "O":
-            theirs = _numbers(theirs)
+            with suppress(TypeError, ValueError):  # not numbers
+                theirs = theirs.astype(np.float64)
         kinds = ours.dtype.kind + theirs.dtype.kind
         if set(kinds) <= set("fiub") and "f" in kinds:
             left, right = ours.astype(np.float64), theirs.astype(np.float64)
@@ -97,18 +90,22 @@ class Report:
         got, want = (np.asarray(np.atleast_1d(side)[first]).tolist() for side in (ours, theirs))
         at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
         count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
-        return self._differ(tally, quantity, where, f"{got!r}, not {want!r}{at}{count}")
+        return self._differ(quantity, where, f"{got!r}, not {want!r}{at}{count}")
 
-    def _differ(self, tally: Quantity, quantity: str, where: str, what: str) -> bool:
-        tally.mismatches += 1
+    def _count(self, quantity: str) -> Quantity:
+        tally = self.quantities.setdefault(quantity, Quantity())
+        tally.cases += 1
+        return tally
+
+    def _differ(self, quantity: str, where: str, what: str) -> bool:
+        self.quantities[quantity].mismatches += 1
         self.mismatches.append(f"{quantity}: {where}: {what}")
         return False
 
-    def fail(self, quantity: str, where: str, why: str) -> None:
-        """Count one case as differing because it could not be computed."""
-        tally = self.quantities.setdefault(quantity, Quantity())
-        tally.cases += 1
-        self._differ(tally, quantity, where, why)
+    def fail(self, quantity: str, where: str, why: str) -> bool:
+        """Count one case as differing because it could not be computed; False."""
+        self._count(quantity)
+        return self._differ(quantity, where, why)
 
     @contextmanager
     def attempt(self, quantity: str, where: str) -> Iterator[None]:
@@ -167,10 +164,3 @@ def _array(value: Any) -> np.ndarray[Any, Any]:
         for index, item in enumerate(value):
             out[index] = item
         return out
-
-
-def _numbers(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    try:
-        return array.astype(np.float64)
-    except (TypeError, ValueError):
-        return array

@@ -10,16 +10,10 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import Source
+from shiftsim.world import state
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    AgentKind,
-    Tracks,
-    TrafficLights,
-    center_poses,
-)
+from shiftsim.world.state import AgentKind, Tracks, TrafficLights
 
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
@@ -28,12 +22,16 @@ EGO_COLUMNS = (
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
 BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
+_IS_CONNECTOR = {  # by kind of an edge or block
+    **{"lane": False, "roadblock": False},
+    **{"connector": True, "roadblock_connector": True},
+}
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
 def ego_states(columns: Mapping[str, Any]) -> FloatArray:
     """(R, 11) ego states from columns by name; what has no column is 0."""
-    out = np.zeros((len(next(iter(columns.values()))), NUM_STATE))
+    out = np.zeros((len(next(iter(columns.values()))), state.NUM_STATE))
     for name, values in columns.items():
         out[:, EGO_COLUMNS.index(_SHORT.get(name, name))] = values
     return out
@@ -41,7 +39,7 @@ def ego_states(columns: Mapping[str, Any]) -> FloatArray:
 
 def ego_columns(states: FloatArray) -> dict[str, FloatArray]:
     """Columns of the official tables by name, from (R, 11) ego states: rear axle and centre."""
-    columns = np.concatenate([states, center_poses(states[:, :3])], axis=1)
+    columns = np.concatenate([states, state.center_poses(states[:, :3])], axis=1)
     return dict(zip((*EGO_COLUMNS, *CENTER_COLUMNS), columns.T, strict=True))
 
 
@@ -50,7 +48,7 @@ def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str,
     kinds = tracks.kinds[index]
     # the official table shows static objects, which have no velocity, as standing
     moves = tracks.velocities[rows, index]
-    moves = np.where(kinds[:, None] > LAST_AGENT_KIND, np.nan_to_num(moves), moves)
+    moves = np.where(kinds[:, None] > state.LAST_AGENT_KIND, np.nan_to_num(moves), moves)
     values = [tracks.poses[rows, index], moves, tracks.sizes[rows, index]]
     return {
         "iteration": rows,
@@ -67,20 +65,13 @@ def make_tracks(
     kinds: Sequence[str],
     tokens: Sequence[str],
 ) -> Tracks:
-    """Dense tracks from what is known of them at some rows.
+    """Dense tracks of a shape (rows, tracks), with names of their types and their tokens.
 
-    Args:
-        shape: Rows and tracks.
-        where: Row and track of each value; `...` where the values are dense.
-        values: (..., 7) x, y, heading, vx, vy, length, width; NaN where a track is absent.
-        kinds: Names of the types of the tracks.
-        tokens: Their tokens.
+    `values` (..., 7) are x, y, heading, vx, vy, length, width at the rows and tracks `where` (`...`
+    where they are dense); NaN where a track is absent.
     """
     dense = np.full((*shape, 7), np.nan)
     dense[where] = values
-    for name in kinds:
-        if name.upper() not in AgentKind.__members__:
-            raise DataError(f"unknown type {name!r}")
     return Tracks(
         valid=~np.isnan(dense[..., 0]),
         poses=np.ascontiguousarray(dense[..., :3]),
@@ -103,16 +94,10 @@ def read_objects(objects: Sequence[Source], count: int) -> Tracks:
 
 
 def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
-    """The map of a world.
+    """The map of a world; `DataError` if an id names nothing.
 
-    Args:
-        world: Holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`.
-        fields: Fields of an edge besides those that every edge has, as named in `EdgeSpec`; the
-            block is `roadblock`.
-        stop_lines: Polygons of stop lines by id.
-
-    Raises:
-        DataError: A kind is unknown, or an id names nothing.
+    The world holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`; its edges
+    also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
     """
     blocks = world["roadblocks"] if "roadblocks" in world else {}
     road = build_map(
@@ -120,7 +105,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         edges=[
             EdgeSpec(
                 id=edge["id"],
-                is_connector=_is_connector(edge["kind"], "lane", "connector"),
+                is_connector=_IS_CONNECTOR[edge["kind"]],
                 polygon=shapely.Polygon(edge["polygon"]),
                 baseline=np.array(edge["baseline"], np.float64),
                 block_id=edge["roadblock"] if blocks else "",
@@ -133,7 +118,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         blocks=[
             BlockSpec(
                 id=name,
-                is_connector=_is_connector(block["kind"], "roadblock", "roadblock_connector"),
+                is_connector=_IS_CONNECTOR[block["kind"]],
                 polygon=shapely.Polygon(block["polygon"]),
             )
             for name, block in blocks.items()
@@ -151,12 +136,6 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
 
 def _areas(rings: Mapping[Any, Any]) -> list[AreaSpec]:
     return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings.items()]
-
-
-def _is_connector(kind: str, plain: str, connector: str) -> bool:
-    if kind not in (plain, connector):
-        raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
-    return kind == connector
 
 
 def make_scenario(

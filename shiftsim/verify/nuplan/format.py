@@ -34,6 +34,11 @@ _TOLERANCES: dict[str, Any] = {
     "goal": _POSE,
     "length": 1e-3,
 }
+# Fields of a lane and of a connector as of `attributes_of`
+_BOTH = {"out": "outgoing", "inc": "incoming"}
+_LANE = {"roadblock": "roadblock_id", "speed": "speed_limit_mps", **_BOTH}
+_LANE |= {"length": "baseline_length", "index": "index"}
+_CONNECTOR = {"rb": "roadblock_id", "lights": "has_traffic_lights", "stop": "stop_lines", **_BOTH}
 # Lists whose order means nothing
 _SETS = {"tagged", "objects", "lights", "lanes_at_point", "out", "inc", "stop", "interior"}
 
@@ -127,23 +132,12 @@ def _map_fields(road: VectorMap, origin: FloatArray) -> dict[str, Any]:
     return {
         "lanes_at_point": [road.edges.ids[index] for index in lanes],
         "lane": {
-            "roadblock": own["roadblock_id"],
-            "speed": own["speed_limit_mps"],
-            "out": own["outgoing"],
-            "inc": own["incoming"],
-            "length": own["baseline_length"],
-            "left": left,
-            "right": right,
-            "index": own["index"],
-            "adjacent": [own["left_lane"], own["right_lane"]],
+            **{name: own[field] for name, field in _LANE.items()},
+            **{"left": left, "right": right, "adjacent": [own["left_lane"], own["right_lane"]]},
         },
         "connector": {
+            **{name: after[field] for name, field in _CONNECTOR.items()},
             "id": road.edges.ids[connector],
-            "lights": after["has_traffic_lights"],
-            "stop": after["stop_lines"],
-            "inc": after["incoming"],
-            "out": after["outgoing"],
-            "rb": after["roadblock_id"],
         },
         "roadblock": {"out": block["outgoing"], "interior": block["interior"]},
         "proximal": {name: len(near_square(road, name, x, y, _NEAR)) for name in near},

@@ -44,12 +44,8 @@ _LAYERS = {  # of nuPlan: layer of ours
     "DRIVABLE_AREA": "drivable_areas",
 }
 _QUERIED = (
-    "LANE",
-    "LANE_CONNECTOR",
-    "ROADBLOCK",
-    "ROADBLOCK_CONNECTOR",
-    "INTERSECTION",
-    "CROSSWALK",
+    *("LANE", "LANE_CONNECTOR", "ROADBLOCK", "ROADBLOCK_CONNECTOR"),
+    *("INTERSECTION", "CROSSWALK"),
 )
 
 
@@ -76,16 +72,6 @@ def verify_maps(expected: Path, maps: dict[str, VectorMap], report: Report) -> N
         table.finish()
 
 
-def _compare_layers(road: VectorMap, city: str, objects: Groups) -> None:
-    for name in _LAYERS:
-        rows = objects.get(city, name)
-        if rows is None:
-            count, report = len(layer_of(road, name)[1]), objects.table.report
-            report.compare("map_objects rows", f"{city} {name}", count, 0)
-        else:
-            _compare_layer(road, name, f"{city} {name}", rows)
-
-
 def _compare_lines(road: VectorMap, city: str, lines: Groups) -> None:
     for edge, edge_id in enumerate(road.edges.ids):
         layer = "LANE" if edge < road.num_lanes else "LANE_CONNECTOR"
@@ -103,26 +89,28 @@ def _compare_queries(road: VectorMap, city: str, queries: Groups) -> None:
     rows.match(city, ours, _QUERY)
 
 
-def _compare_layer(road: VectorMap, name: str, where: str, rows: Source) -> None:
-    (layer, part), report = layer_of(road, name), rows.report
-    # rows may come in another order than in the map; nothing reads the order of this table
-    rows = rows.at(np.argsort(rows["id"].astype(str), kind="stable"))
-    ours = sorted(part, key=lambda index: layer.ids[index])
-    if not rows.match(where, {"id": [layer.ids[index] for index in ours]}):
-        return
-    details = zip(ours, rows["polygon_wkb"], rows["attributes"], strict=True)
-    for index, polygon, attributes in details:
-        at = f"{where} {layer.ids[index]}"
-        with report.attempt("map_objects", at):
-            shape = shapely.from_wkb(polygon)
-            theirs = [np.asarray(r.coords) for r in (shape.exterior, *shape.interiors)]
-            rings = [np.concatenate([ring, ring[:1]]) for ring in layer.rings(index)]
-            report.compare("map_objects rings", at, len(rings), len(theirs))
-            for a, b in zip(rings, theirs, strict=False):
-                report.compare("map_objects ring", at, a, b, atol=METRES)
-            given = Source("map_objects", "attribute", json.loads(attributes), report)
-            given.match(at, attributes_of(road, name, index), {"baseline_length": METRES})
-            given.finish()
+def _compare_layers(road: VectorMap, city: str, objects: Groups) -> None:
+    report = objects.table.report
+    for name in _LAYERS:
+        (layer, part), where, rows = layer_of(road, name), f"{city} {name}", objects[city, name]
+        # rows may come in another order than in the map; nothing reads the order of this table
+        rows = rows.at(np.argsort(rows["id"].astype(str), kind="stable"))
+        ours = sorted(part, key=lambda index: layer.ids[index])
+        if not rows.match(where, {"id": [layer.ids[index] for index in ours]}):
+            continue
+        details = zip(ours, rows["polygon_wkb"], rows["attributes"], strict=True)
+        for index, polygon, attributes in details:
+            at = f"{where} {layer.ids[index]}"
+            with report.attempt("map_objects", at):
+                shape = shapely.from_wkb(polygon)
+                theirs = [np.asarray(r.coords) for r in (shape.exterior, *shape.interiors)]
+                rings = [np.concatenate([ring, ring[:1]]) for ring in layer.rings(index)]
+                report.compare("map_objects rings", at, len(rings), len(theirs))
+                for a, b in zip(rings, theirs, strict=False):
+                    report.compare("map_objects ring", at, a, b, atol=METRES)
+                given = Source("map_objects", "attribute", json.loads(attributes), report)
+                given.match(at, attributes_of(road, name, index), {"baseline_length": METRES})
+                given.finish()
 
 
 def _names(layer: Layer, indices: Any) -> list[str]:
@@ -138,27 +126,24 @@ def attributes_of(road: VectorMap, layer: str, index: int) -> dict[str, Any]:
     edges, blocks = road.edges, road.blocks
     if layer in ("LANE", "LANE_CONNECTOR"):
         limit = float(road.speed_limits[index])
-        own: dict[str, Any] = {
-            "has_traffic_lights": bool(road.has_traffic_lights[index]),
-            "stop_lines": _names(road.stop_polygons, road.stop_lines.at(index)),
-        }
-        if layer == "LANE":
-            own = {
-                "index": int(road.lane_index[index]),
-                "left_lane": _name(edges, road.left_lane[index]),
-                "right_lane": _name(edges, road.right_lane[index]),
-            }
-        return {
+        out: dict[str, Any] = {
             "roadblock_id": _name(blocks, road.block_of[index]),
             "speed_limit_mps": None if np.isnan(limit) else limit,
             "incoming": _names(edges, road.incoming.at(index)),
             "outgoing": _names(edges, road.outgoing.at(index)),
             "baseline_length": road.baselines.length(index),
-            **own,
         }
+        if layer == "LANE":
+            out["index"] = int(road.lane_index[index])
+            out["left_lane"] = _name(edges, road.left_lane[index])
+            out["right_lane"] = _name(edges, road.right_lane[index])
+        else:
+            out["has_traffic_lights"] = bool(road.has_traffic_lights[index])
+            out["stop_lines"] = _names(road.stop_polygons, road.stop_lines.at(index))
+        return out
     if layer in ("ROADBLOCK", "ROADBLOCK_CONNECTOR"):
         inside = road.block_edges.at(index)
-        out: dict[str, Any] = {
+        out = {
             "incoming": _names(blocks, road.block_incoming.at(index)),
             "outgoing": _names(blocks, road.block_outgoing.at(index)),
             "interior": _names(edges, inside),

@@ -7,18 +7,11 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.metrics import Measurements, MetricResult, judge, measure
+from shiftsim.verify import worlds
 from shiftsim.verify.files import EXACT, RUN_KEY, TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import (
-    BOX_COLUMNS,
-    EGO_COLUMNS,
-    ego_columns,
-    ego_states,
-    make_tracks,
-    recorded_log,
-)
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -31,24 +24,19 @@ _TABLES = {
 # coordinates near 4e6 are spaced 5e-10
 _RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
 _CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
-# how the devkit files each metric: category, unit of its score
-_FILED = {
-    "ego_lane_change": ("Planning", None),
-    "ego_jerk": ("Dynamics", None),
-    "ego_lat_acceleration": ("Dynamics", None),
-    "ego_lon_acceleration": ("Dynamics", None),
-    "ego_lon_jerk": ("Dynamics", None),
-    "ego_yaw_acceleration": ("Dynamics", None),
-    "ego_yaw_rate": ("Dynamics", None),
-    "ego_progress_along_expert_route": ("Planning", None),
-    "drivable_area_compliance": ("Planning", "bool"),
-    "corners_in_drivable_area": ("Planning", None),
-    "no_ego_at_fault_collisions": ("Dynamics", "float"),
-    "time_to_collision_within_bound": ("Planning", "bool"),
-    "speed_limit_compliance": ("Violations", "float"),
-    "ego_is_comfortable": ("Violations", "bool"),
-    "ego_is_making_progress": ("Planning", "bool"),
-    "driving_direction_compliance": ("Planning", "bool"),
+# how the devkit files each metric: the category of those that are not of Planning, and the units
+# of scores that have one
+_CATEGORIES = {
+    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
+    **dict.fromkeys(("ego_jerk", "ego_lon_jerk", "ego_yaw_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_yaw_rate", "no_ego_at_fault_collisions"), "Dynamics"),
+}
+_UNITS = {
+    **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
+    **dict.fromkeys(("drivable_area_compliance", "time_to_collision_within_bound"), "bool"),
+    **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
+    "driving_direction_compliance": "bool",
 }
 
 
@@ -73,15 +61,14 @@ def verify_nuplan_metrics(
         if mode not in (None, run[1]):
             continue
         with report.attempt("recorded rollout", " ".join(run)):
-            scene, challenge, _ = run
-            objects = replayed.get(scene, "NR", "*")
-            if challenge == "R":
-                objects = tables["objects"].get(*run)
-            road = scenes.maps[scenes.entries[scene]["map"]]
-            measured = _measure(run, runs[run], objects, experts[scene, "iteration"], road)
+            entry, objects = scenes.entries[run[0]], replayed[run[0], "NR", "*"]
+            if run[1] == "R":
+                objects = tables["objects"][run]
+            road = scenes.maps[entry["map"]]
+            measured = _measure(run, runs[run], objects, experts[run[0], "iteration"], road)
             _compare_run(run, measured, road, tables)
             for thresholds, profile in PROFILES.items():
-                result, entry = judge(measured, profile), scenes.entries[scene]
+                result = judge(measured, profile)
                 _compare_profile((*run, thresholds), result, entry, tables)
             _compare_series(run, judge(measured, "nuplan"), tables["time_series"][run])
     for table in (runs, *tables.values()):
@@ -89,41 +76,35 @@ def verify_nuplan_metrics(
 
 
 def _measure(
-    run: tuple[str, ...], rows: Source, objects: Source | None, expert: Source, road: VectorMap
+    run: tuple[str, ...], rows: Source, objects: Source, expert: Source, road: VectorMap
 ) -> Measurements:
     """Compare what the tables say of the ego itself, and measure the rollout."""
-    where = " ".join(run)
-    ego, logged = (ego_states({n: part[n] for n in EGO_COLUMNS}) for part in (rows, expert))
-    tracks = Tracks.empty(len(ego)) if objects is None else tracks_of(objects, len(ego))
+    ego, logged = (
+        worlds.ego_states({n: part[n] for n in worlds.EGO_COLUMNS}) for part in (rows, expert)
+    )
+    tracks = tracks_of(objects, len(ego))
     stamps = rows["time_us"].astype(np.int64), expert["time_us"].astype(np.int64)
-    log = recorded_log(run[0], stamps[0], ego, tracks, stamps[1], logged)
-    columns, count = ego_columns(ego), len(logged) - 1
+    log = worlds.recorded_log(run[0], stamps[0], ego, tracks, stamps[1], logged)
+    columns, count = worlds.ego_columns(ego), len(logged) - 1
     ours = {"iteration": np.arange(count), "time_us": stamps[1][:count]}
     ours |= {name: columns[name] for name in _RECORDED}
-    rows.match(where, ours, _RECORDED, quantity="recorded")
+    rows.match(" ".join(run), ours, _RECORDED, quantity="recorded")
     return measure(log, road)
 
 
 def tracks_of(rows: Source, count: int) -> Tracks:
-    """Dense tracks over `count` iterations from rows of `objects.parquet`.
-
-    Raises:
-        DataError: An iteration is beyond them, or a track occurs twice, or changes its type.
-    """
-    tokens = list(dict.fromkeys(rows["track_token"].tolist()))
-    index = {token: column for column, token in enumerate(tokens)}
-    track = np.array([index[token] for token in rows["track_token"].tolist()], np.int64)
-    iteration = rows["iteration"].astype(np.int64)
-    kinds = dict(zip(rows["track_token"].tolist(), rows["type"].tolist(), strict=True))
-    if [kinds[token] for token in rows["track_token"].tolist()] != rows["type"].tolist():
-        raise DataError("an object changes its type")
-    if len({*zip(iteration.tolist(), track.tolist(), strict=True)}) != len(track):
+    """Dense tracks over `count` iterations from rows of `objects.parquet`."""
+    names, iteration = rows["track_token"].tolist(), rows["iteration"].astype(np.int64)
+    kinds = dict(zip(names, rows["type"].tolist(), strict=True))
+    column = {token: index for index, token in enumerate(kinds)}
+    track = [column[token] for token in names]
+    if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
         raise DataError("an object occurs twice at one iteration")
-    if iteration.min() < 0 or iteration.max() >= count:
-        raise DataError(f"objects at iteration {iteration.max()}, ego at {count} iterations")
-    values = np.column_stack([rows[name].astype(np.float64) for name in BOX_COLUMNS])
-    listed = [kinds[token] for token in tokens]
-    return make_tracks((count, len(tokens)), (iteration, track), values, listed, tokens)
+    if [kinds[token] for token in names] != rows["type"].tolist():
+        raise DataError("an object changes its type")
+    values = np.column_stack([rows[name].astype(np.float64) for name in worlds.BOX_COLUMNS])
+    where = iteration, np.array(track, np.int64)
+    return worlds.make_tracks((count, len(kinds)), where, values, list(kinds.values()), list(kinds))
 
 
 def _compare_run(
@@ -131,19 +112,16 @@ def _compare_run(
 ) -> None:
     """Compare what no threshold enters: routes and collisions."""
     samples = range(len(measured.time_us))
-    corners = {
-        column: [",".join(measured.corners.ids(road, i, corner)) for i in samples]
-        for corner, column in enumerate(_CORNERS)
-    }
     ours = {
         "iteration": np.arange(len(samples)),
         "center": [",".join(measured.route.ids(road, i)) for i in samples],
         "in_common_or_connected": measured.is_common,
-        **corners,
     }
-    tables["route"][run].match(" ".join(run), ours)
+    for corner, column in enumerate(_CORNERS):
+        ours[column] = [",".join(measured.corners.ids(road, i, corner)) for i in samples]
+    tables["route"].match(run, ours)
     found = measured.collisions
-    columns: dict[str, list[Any]] = {
+    contacts = {
         "time_us": [c.time_us for c in found],
         "track_token": [c.token for c in found],
         "type": [AgentKind(c.kind).name for c in found],
@@ -152,7 +130,7 @@ def _compare_run(
         "at_fault": [c.at_fault for c in found],
         "timestamp_has_at_fault": [c.time_us in measured.at_fault_times for c in found],
     }
-    tables["collisions"].match(run, columns, TOLERANCE)
+    tables["collisions"].match(run, contacts, TOLERANCE)
 
 
 def _compare_profile(
@@ -164,8 +142,8 @@ def _compare_profile(
     rows = tables["metrics"][key]
     labels = {
         "metric": list(scores),
-        "category": [_FILED[name][0] for name in scores],
-        "unit": [_FILED[name][1] for name in scores],
+        "category": [_CATEGORIES.get(name, "Planning") for name in scores],
+        "unit": [_UNITS.get(name) for name in scores],
     }
     if rows.match(where, labels):
         rows.by("metric", "score").match(where, scores, SCORE_TOLERANCES)
@@ -192,9 +170,8 @@ def _compare_series(run: tuple[str, ...], result: MetricResult, rows: Source) ->
     groups, times = rows.groups("metric"), result.measurements.time_us
     names = sorted(metric for (metric,) in groups)
     rows.report.compare("series present", " ".join(run), sorted(result.series), names)
-    for metric, ours in result.series.items():
-        if (metric,) not in groups:
-            continue  # named by the comparison above
+    for metric in sorted(set(names) & set(result.series)):
+        ours = result.series[metric]
         columns = {
             "unit": [ours.unit or None] * len(times),
             "index": np.arange(len(times)),

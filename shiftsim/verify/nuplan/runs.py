@@ -22,7 +22,7 @@ from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks, Trajectory
+from shiftsim.world.state import AgentKind, Trajectory
 
 EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
 # m, rad, m/s; the README of the folder allows 1e-3 m
@@ -54,50 +54,44 @@ def verify_simulation(
     replayed = Groups(logged / "objects.parquet", report) if logged else objects
     scores = Groups(folder / "scores.parquet", report, PROFILE_KEY)
     for key in dict.fromkeys([*runs, *(key for key in objects if key[1] == "R")]):
-        scene, challenge, planner = key
-        where = " ".join(key)
+        (scene, challenge, planner), where = key, " ".join(key)
         if mode not in (None, challenge):
             continue
         with report.attempt("simulation", where):
             controller, traffic = CHALLENGES[challenge]
-            spec, args = planner.replace("_", "-"), {}
-            if planner.startswith(_SCRIPTED):
-                args = {"file": str(folder.parent / "scripted.parquet")}
-                spec, args["name"] = "scripted", planner.removeprefix(_SCRIPTED)
-            driver = load_planner(spec, args)
+            driver = _load_planner(planner, folder.parent / "scripted.parquet")
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
             samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
             ours = {**samples, **ego_columns(log.ego)}
             runs[key].match(where, ours, EGO_TOLERANCES, quantity="ego")
             if challenge == "R":
-                heights = _heights(replayed.get(scene, "NR", "*"))
-                _compare_objects(key, log, objects, heights)
+                heights = _heights(replayed[scene, "NR", "*"])
+                _compare_objects(where, log, objects[key], heights)
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                found = known_scores(judge(measured, profile))
-                scores[*key, thresholds].match(
-                    f"{where} {thresholds}",
-                    {name: [score] for name, score in found.items()},
-                    TOLERANCE,
-                    quantity="simulated score",
-                )
+                found = known_scores(judge(measured, profile)).items()
+                rows, at = scores[*key, thresholds], f"{where} {thresholds}"
+                rated = {name: [score] for name, score in found}
+                rows.match(at, rated, TOLERANCE, quantity="simulated score")
     if mode in (None, "R"):
         objects.table.finish()
 
 
-def _heights(rows: Source | None) -> dict[tuple[int, str], float]:
+def _load_planner(name: str, scripts: Path) -> Planner:
+    if name.startswith(_SCRIPTED):
+        script = name.removeprefix(_SCRIPTED)
+        return load_planner("scripted", {"file": str(scripts), "name": script})
+    return load_planner(name.replace("_", "-"))
+
+
+def _heights(rows: Source) -> dict[tuple[int, str], float]:
     """Heights of logged objects by iteration and token; shiftsim keeps none."""
-    if rows is None:
-        return {}
     columns = (rows[name].tolist() for name in ("iteration", "track_token", "height"))
     return {(index, token): height for index, token, height in zip(*columns, strict=True)}
 
 
 def _compare_objects(
-    key: tuple[str, ...],
-    log: SimulationLog,
-    objects: Groups,
-    heights: dict[tuple[int, str], float],
+    where: str, log: SimulationLog, rows: Source, heights: dict[tuple[int, str], float]
 ) -> None:
     tracks = log.tracks
     orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
@@ -108,7 +102,7 @@ def _compare_objects(
     first = np.where(tracks.kinds[track] == AgentKind.VEHICLE, 0, iteration).tolist()
     pairs = zip(first, ours["track_token"], strict=True)
     ours["height"] = [heights.get(pair, np.nan) for pair in pairs]
-    objects.match(key, ours, OBJECT_TOLERANCES, quantity="reactive")
+    rows.match(where, ours, OBJECT_TOLERANCES, quantity="reactive")
 
 
 def verify_planners(
@@ -127,8 +121,7 @@ def verify_planners(
             report.skip(f"plans of {name} in {scene}, which is not known")
             continue
         with report.attempt("plan", " ".join(key)):
-            ego = egos[key]
-            seen = Seen(scenes[scene], ego, objects.get(*key), challenge)
+            seen = Seen(scenes[scene], egos[key], objects[key], challenge)
             _plan_again(" ".join(key), load_planner(spec), seen, plans[key])
     plans.finish(mode)
 
@@ -139,13 +132,10 @@ class Seen:
     A run that is not reactive shows the objects of the log.
     """
 
-    def __init__(self, scenario: Scenario, ego: Source, objects: Source | None, challenge: str):
+    def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
         self.scenario = scenario
         self.ego = ego_states({name: ego[name] for name in EGO_COLUMNS})
-        self._tracks = None
-        if challenge == "R":
-            count = len(self.ego)
-            self._tracks = Tracks.empty(count) if objects is None else tracks_of(objects, count)
+        self._tracks = tracks_of(objects, len(self.ego)) if challenge == "R" else None
 
     def at(self, iteration: int) -> Observation:
         """The present alone; the rule-based planners look at nothing else."""
@@ -164,10 +154,7 @@ def _plan_again(where: str, planner: Planner, seen: Seen, rows: Source) -> None:
     for iteration in sorted({0, *recorded.tolist()}):
         plan = planner.plan(seen.at(iteration))
         if iteration in recorded and isinstance(plan, Trajectory):
-            ours = {
-                "index": np.arange(len(plan.time_us)),
-                "time_us": plan.time_us,
-                **dict(zip(PLAN_COLUMNS, plan.states.T[: len(PLAN_COLUMNS)], strict=True)),
-            }
+            ours = {"index": np.arange(len(plan.time_us)), "time_us": plan.time_us}
+            ours |= dict(zip(PLAN_COLUMNS, plan.states.T, strict=False))
             here = rows.at(recorded == iteration)
             here.match(f"{where} iteration {iteration}", ours, TOLERANCE, quantity=f"{name} plan")

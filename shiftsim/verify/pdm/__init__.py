@@ -1,5 +1,7 @@
 """The pdm folder: PDM-Closed and nuPlan's IDM planner, from kernels to closed loops."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from shiftsim.verify.files import verify_files
@@ -16,16 +18,18 @@ def verify_pdm(
 ) -> None:
     """Compare every file of the folder; arguments as for `shiftsim.verify.verify`."""
     known = Scenes(scenes or folder.resolve().parent / "nuplan")
+    loops = partial(verify_loops, mode=mode)
+    parts: dict[str, Callable[[Path, Report, Scenes], object]] = {
+        "routes.json": verify_routes,
+        "idm_calls.json": verify_idm_calls,
+        "loop": loops,
+    }
 
     def with_scenes(path: Path) -> None:
-        if not known:
-            report.skip(f"{path.name}: the logs and maps of the scenes are not at hand")
-        elif path.name == "routes.json":
-            verify_routes(path, report, known)
-        elif path.name == "idm_calls.json":
-            verify_idm_calls(path, report, known)
+        if known:
+            parts[path.name](path, report, known)
         else:
-            verify_loops(path, report, known, mode)
+            report.skip(f"{path.name}: the logs and maps of the scenes are not at hand")
 
-    parts = dict.fromkeys(("routes.json", "idm_calls.json", "loop"), with_scenes)
-    verify_files(folder, report, {"kernels": lambda path: verify_kernels(path, report), **parts})
+    kernels = {"kernels": partial(verify_kernels, report=report)}
+    verify_files(folder, report, {**kernels, **dict.fromkeys(parts, with_scenes)})

@@ -13,12 +13,7 @@ from shiftsim.sim.observation import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation
-from shiftsim.verify.pdm.steps import (
-    STEP_TOLERANCE,
-    Planned,
-    compare_scores,
-    step_arrays,
-)
+from shiftsim.verify.pdm.steps import STEP_TOLERANCE, Planned, compare_scores, step_arrays
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
@@ -26,14 +21,8 @@ from shiftsim.world.scenario import Scenario
 
 PLAN_TOLERANCES = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: stored as 32 bit floats
 _TABLES = (
-    "metrics",
-    "statistics",
-    "time_series",
-    "route",
-    "collisions",
-    "scores",
-    "objects",
-    "ego",
+    *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects", "ego"),
+    *("steps", "proposals"),
 )
 _CALL = ("scene", "challenge")
 _DRIVEN = {  # column of proposals.parquet → index in a state row
@@ -62,7 +51,7 @@ def verify_calls(
     steps = Groups(folder / "steps.parquet", report, _CALL)
     proposals = Groups(folder / "proposals.parquet", report, _CALL)
     static = Source("static.json", "scene", read_json(folder / "static.json"), report)
-    known = {f"{name}.parquet" for name in (*_TABLES, "steps", "proposals")} | {"static.json"}
+    known = {f"{name}.parquet" for name in _TABLES} | {"static.json"}
     for key in egos:
         scene, challenge, _ = key
         where, arrays = f"{scene} {challenge}", folder / f"{scene}_{challenge}.npz"
@@ -73,7 +62,7 @@ def verify_calls(
             report.skip(f"closed loop {where}, whose scene or challenge is not known")
             continue
         with report.attempt("PDM loop", where):
-            seen = Seen(scenes[scene], egos[key], objects.get(*key), challenge)
+            seen = Seen(scenes[scene], egos[key], objects[key], challenge)
             facts = static.each(scene)[0].each(challenge)[0]
             rows, scored = steps[key[:2]], proposals[key[:2]]
             _compare_calls(where, seen, rows, scored, facts, read_arrays(arrays, report, "PDM"))

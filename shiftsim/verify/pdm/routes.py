@@ -7,14 +7,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.geometry.paths import make_path
+from shiftsim.planners.pdm import route as routes
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.route import (
-    current_lane,
-    follow_route,
-    in_index_order,
-    lanes_at,
-    start_route,
-)
 from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.routes.paths import centerline
@@ -45,13 +39,13 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
     road = scenario.map
     ego = np.zeros(NUM_STATE)
     ego[:3] = case["rear_axle"]
-    route = start_route(road, tuple(case["route"]), ego, scenario.token)
+    route = routes.start_route(road, tuple(case["route"]), ego, scenario.token)
     center = center_poses(ego[None, :3])[0]
     selected = select_areas(road, center[0], center[1], DEFAULT.map_radius)
-    under, errors = lanes_at(road, route, selected, ego)
-    ordered = in_index_order(route, selected, under)
-    lane = current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
-    line = centerline(road, follow_route(road, route.corrected, lane).path)
+    under, errors = routes.lanes_at(road, route, selected, ego)
+    ordered = routes.in_index_order(route, selected, under)
+    lane = routes.current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
+    line = centerline(road, routes.follow_route(road, route.corrected, lane).path)
     edge_ids, block_ids = road.edges.ids, road.blocks.ids
     return {
         "start_block": block_ids[route.start.block],

@@ -60,21 +60,17 @@ class Planned(NamedTuple):
 def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
     """Plan one recorded step again and compare everything.
 
-    Args:
-        report: Receives the comparisons.
-        facts: Takes what `step_core_summary.json` lists of the steps, by name of the step.
-        path: The `.json` with its inputs; its outputs are in the `.npz` beside it.
+    The `.json` has its inputs, the `.npz` beside it the outputs; `facts` takes what
+    `step_core_summary.json` lists of the step.
     """
     inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
     planned, collided = _plan(inputs)
-    boxes = planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]]
-    times = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
     ours = {
         "map_tokens": planned.tokens,
         "collided_ids": collided,
-        "map_boxes": boxes,
-        "trajectory_time_us": times,
+        "map_boxes": planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]],
+        "trajectory_time_us": int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1),
         **step_arrays(planned),
     }
     file.match(where, ours, STEP_TOLERANCE)
@@ -88,10 +84,10 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     file.note("compared where the same proposal is chosen", "trajectory_rear")
     inputs.finish()
     file.finish()
-    scores = planned.step.scores
+    step, scores = planned.step, planned.step.scores
     facts[where] = {
-        "best": planned.step.best,
-        "braked": planned.step.braked,
+        "best": step.best,
+        "braked": step.braked,
         "best_score": float(scores.total.max()),
         "n_objects": len(inputs["objects"]),
         "red": len(inputs["red_light_lane_ids"]),
@@ -151,14 +147,8 @@ def step_arrays(planned: Planned) -> dict[str, np.ndarray]:
 def compare_scores(where: str, planned: Planned, theirs: Source, choice: tuple[int, bool]) -> bool:
     """Compare sub-scores, scores, choice and brake decision of one step.
 
-    Args:
-        where: Which step.
-        planned: Ours.
-        theirs: The recorded scores, named as in `SCORE_COLUMNS`.
-        choice: Number of the recorded best proposal, and whether the emergency brake came instead.
-
-    Returns:
-        Whether both chose the same plan, so that plans can be compared.
+    `choice` is the number of the recorded best proposal, and whether the emergency brake came
+    instead. Returns whether both chose the same plan, so that plans can be compared.
     """
     ours, report = _settled(where, planned, theirs), theirs.report
     values = {column: getattr(ours, field) for column, (field, _) in SCORE_COLUMNS.items()}
@@ -182,18 +172,17 @@ def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
     exempt = np.zeros(len(given), np.bool_)
     for row in np.flatnonzero((ours.ttc != given) | (ours.ttc_index != index)).tolist():
         states, others = planned.step.driven.states, planned.forecast.others
-        first = _unstable(states[row], others)
-        if not first:
+        if not (first := _unstable(states[row], others)):
             continue
         ignored: BoolArray = others.ignored.copy()
         ignored[list(first)] = True
         blind = others._replace(ignored=ignored)
         rest = score(states, planned.place, blind, ego_box(PACIFICA), DEFAULT)
-        is_hit = np.isfinite(index[row])
-        if index[row] in {rest.ttc_index[row], *first.values()} and is_hit == (given[row] < 1.0):
-            exempt[row] = True
-            note = "an object exactly ahead or behind"
-            theirs.report.note(f"PDM ttc at {where}, proposal {row}: {note}")
+        explained = index[row] in {rest.ttc_index[row], *first.values()}
+        exempt[row] = explained and np.isfinite(index[row]) == (given[row] < 1.0)
+    for row in np.flatnonzero(exempt).tolist():
+        note = "an object exactly ahead or behind"
+        theirs.report.note(f"PDM ttc at {where}, proposal {row}: {note}")
     ttc = np.where(exempt, given, ours.ttc)
     factor = ours.no_collision * ours.drivable * ours.direction
     return ours._replace(
@@ -204,11 +193,7 @@ def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
 
 
 def _unstable(driven: FloatArray, others: Others) -> dict[int, float]:
-    """Boxes exactly ahead or behind when the projected ego first touches them.
-
-    Returns:
-        Time index of the touch by box.
-    """
+    """Boxes exactly ahead or behind when the projected ego first touches them: its time index."""
     seen = others.ignored.copy()
     size = np.array([PACIFICA.length, PACIFICA.width])
     corners = boxes_to_corners(center_poses(driven[:, :3]), size)
