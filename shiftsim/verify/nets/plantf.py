@@ -92,8 +92,7 @@ def compare_features(
         **{INPUTS[name]: getattr(road, name) for name in OF_MAP},
         **others,
     }
-    stored = loop.stored.below("feature/")
-    stored.match(loop.where, features, FEATURE, quantity=loop.name)
+    loop.match(features, FEATURE, "feature/")
     names = {
         "agent_tokens": ["ego", *(scenario.tracks.tokens[i] for i in agents.tracks.tolist())],
         "map_ids": [ids[row] for row in road.objects.tolist()],
@@ -106,7 +105,7 @@ def compare_features(
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
     there, absent = agents.valid, {"position": origin, "heading": -ego[2]}
     for name in HISTORIES:
-        ours, theirs = getattr(agents, name), stored[f"agent.{name}"]
+        ours, theirs = getattr(agents, name), loop.stored[f"feature/agent.{name}"]
         loop.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)
         rest = np.broadcast_to(absent.get(name, 0.0), theirs.shape)[~there]
         atol = FEATURE + _ROUNDING * float(np.abs(rest).max(initial=0.0))
@@ -291,7 +290,7 @@ def _compare(loop: Loop) -> None:
     loop.compare("motion of the recorded plan", again, theirs[:, 3:], MOTION)
     if not list(loop.stored):
         return
-    features, variant = loop.features, loop.variant
+    features = loop.features
     others = {
         "current_state": features.current_state,
         # the official code gives every agent the category of the ego at inference
@@ -301,7 +300,7 @@ def _compare(loop: Loop) -> None:
     raw = run_network(NAME, loop.planner.network, make_batch([features], "cpu"))
     ours = {name: value[0] for name, value in raw.items()}
     ours |= derived_outputs(ours, None)
-    compare_outputs(loop.stored.below("net/"), loop.where, NAME, variant, ours)
+    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
 
 
 FILES = {
