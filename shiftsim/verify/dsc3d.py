@@ -6,7 +6,7 @@ from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -39,9 +39,6 @@ _STEP_S = 0.05
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
 _SWITCH, _JUMP = 1.0, 10.0  # costs of a lane sequence: to a linked lane, to any other
 _DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
-
-
-Keys: TypeAlias = list[LaneKey]  # OpenDRIVE lanes at a point
 
 
 class LocalMap:
@@ -108,42 +105,41 @@ class LocalMap:
         return _SWITCH if after in self._map.outgoing.at(before) else _JUMP
 
 
-def verify_dsc3d_sample(folder: Path, report: Report) -> None:
-    """Compare reading and resampling with a folder of `expected*` files.
+class Sample(NamedTuple):
+    """The recording of the sample."""
 
-    Args:
-        folder: Holds `data`, `expected.json`, `expected_rows.parquet`, `expected_20hz.parquet`.
-        report: Filled.
-    """
+    site: Site
+    recording: Annotations
+    keys: list[list[LaneKey]]  # OpenDRIVE lanes at every row
+
+
+def verify_dsc3d_sample(folder: Path, report: Report) -> None:
+    """Compare reading and resampling with `expected*` files beside the folder `data`."""
     site = open_site(folder / "data")
     if len(site.recordings) != 1:
         report.skip("recordings beyond the first", len(site.recordings) - 1)
     recording, local = read_recording(site, site.recordings[0]), LocalMap(find_map(site))
     keys = [list(local.keys_at(x, y).values()) for x, y in recording.bottom[:, :2].tolist()]
+    sample = Sample(site, recording, keys)
 
-    def table(
-        compare: Callable[[Source, int, Site, Annotations, list[Keys]], None], path: Path
-    ) -> None:
+    def table(compare: Callable[[Source, int, Sample], None], path: Path) -> None:
         groups = Groups(path, report, ("track_id",))
         for number, track in enumerate(recording.track_ids.tolist()):
-            compare(groups[(str(track),)], number, site, recording, keys)
+            compare(groups[(str(track),)], number, sample)
         groups.finish()
 
     parts: dict[str, Callable[[Path], object]] = {
         "data": lambda path: report.note(_DERIVED),
         "expected_rows.parquet": partial(table, _verify_rows),
         "expected_20hz.parquet": partial(table, _verify_samples),
-        "expected.json": lambda path: _verify_summary(
-            read_fields(path, report), site, recording, keys
-        ),
+        "expected.json": lambda path: _verify_summary(read_fields(path, report), sample),
     }
     verify_files(folder, report, parts)
 
 
-def _verify_rows(
-    table: Source, number: int, site: Site, recording: Annotations, keys: list[Keys]
-) -> None:
+def _verify_rows(table: Source, number: int, sample: Sample) -> None:
     """Compare the rows of a track as recorded."""
+    site, recording, keys = sample
     rows = np.flatnonzero(recording.track == number)
     utm = recording.bottom[rows, :2] + site.offset[:2]
     to_degrees = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True)
@@ -160,17 +156,15 @@ def _verify_rows(
     table.match(f"track {number}", columns, {"utm_x": _UTM, "utm_y": _UTM, "": _EXACT})
 
 
-def _verify_samples(
-    table: Source, number: int, site: Site, recording: Annotations, keys: list[Keys]
-) -> None:
+def _verify_samples(table: Source, number: int, sample: Sample) -> None:
     """Compare a track resampled at 20 Hz."""
+    recording = sample.recording
     runs = find_runs(recording, ConversionConfig().max_hole_s)
     (run,) = np.flatnonzero(runs.track == number)  # of one piece
     rows = slice(runs.first[run], runs.last[run] + 1)
     clock = recording.time[rows]
-    steps = np.arange(
-        np.ceil(clock[0] / _STEP_S - _EXACT), np.floor(clock[-1] / _STEP_S + _EXACT) + 1
-    )
+    ends = np.ceil(clock[0] / _STEP_S - _EXACT), np.floor(clock[-1] / _STEP_S + _EXACT)
+    steps = np.arange(ends[0], ends[1] + 1)
     times = steps * _STEP_S
     samples = sample_runs(recording, runs, np.full(len(steps), run, np.int64), times)
     bottom = [np.interp(times, clock, recording.bottom[rows, axis]) for axis in (0, 1)]
@@ -189,7 +183,8 @@ def _named(names: str, columns: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(names.split(), columns.T, strict=True))
 
 
-def _verify_summary(expected: Source, site: Site, recording: Annotations, keys: list[Keys]) -> None:
+def _verify_summary(expected: Source, sample: Sample) -> None:
+    site, recording, keys = sample
     raw, yaw = _raw_columns(site, recording.name), recording.angles[:, 0]
     order = np.lexsort((raw["frame_id"], raw["track_id"]))
     velocity = np.column_stack([raw[f"velocity_{axis}"] for axis in "xyz"])[order]
@@ -249,11 +244,8 @@ def _stamp(time_us: int) -> str:
 def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> None:
     """Compare windows, verdicts, lane sequences and 20 Hz poses with scripted recordings.
 
-    Args:
-        folder: One recording folder, or one above several.
-        report: Filled.
-        maps: Where the OpenDRIVE files named by `expected.json` lie; by default the folder `maps`
-            beside the one of the references.
+    `folder` is one recording or holds several. Its maps lie in `maps`, or in a folder of that name
+    beside the one of the references.
     """
     if not (folder / "expected.json").is_file():
         part = partial(verify_dsc3d_synthetic, report=report, maps=maps)
@@ -271,11 +263,8 @@ def _verify_scripted(path: Path, report: Report, maps: Path | None) -> None:
     folder, name = path.parent, path.parent.name
     site, expected = open_site(folder / "data"), read_fields(path, report)
     recording, config = read_recording(site, site.recordings[0]), ConversionConfig()
-    ours = {
-        "rate_hz": 1.0 / recording.period,
-        "duration_s": recording.duration,
-        "rows": len(recording.track),
-    }
+    rate, rows = 1.0 / recording.period, len(recording.track)
+    ours = {"rate_hz": rate, "duration_s": recording.duration, "rows": rows}
     expected.match(name, ours, _EXACT, quantity="recording")
     tracks, ids = expected.each("tracks")[0], recording.track_ids.tolist()
     report.compare("track ids", name, ids, sorted(map(int, tracks)))
@@ -289,11 +278,10 @@ def _verify_scripted(path: Path, report: Report, maps: Path | None) -> None:
     for window, theirs in zip(windows, wanted, strict=False):
         where = f"{name} window {window.start_s:g} s"
         theirs.match(where, {"start_s": window.start_s}, _EXACT, quantity="window")
+        judged = zip(window.tracks.tolist(), window.verdicts, window.partners, strict=True)
         verdicts = {
             ids[track]: verdict if partner < 0 else f"{verdict} with {ids[partner]}"
-            for track, verdict, partner in zip(
-                window.tracks.tolist(), window.verdicts, window.partners, strict=True
-            )
+            for track, verdict, partner in judged
         }
         given = {int(track): verdict for track, verdict in theirs["verdict"].items()}
         report.compare("tracks seen", where, sorted(verdicts), sorted(given))
@@ -301,15 +289,16 @@ def _verify_scripted(path: Path, report: Report, maps: Path | None) -> None:
             report.compare("verdict", f"{where} track {track}", verdicts[track], given[track])
         egos = [track for track, verdict in sorted(verdicts.items()) if verdict == EGO]
         report.compare("egos", where, egos, sorted(theirs["egos"]))
-        lanes |= {
-            (f"{theirs['start_s']:.1f}", t): way for t, way in theirs["lanes_from_t0"].items()
-        }
+        begin = f"{theirs['start_s']:.1f}"
+        lanes |= {(begin, track): way for track, way in theirs["lanes_from_t0"].items()}
     expected.used.add("note")
-    map_path = _find_map_file(folder, maps, str(expected["map"]))
-    if map_path is None:
-        report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
+    places = [maps / expected["map"]] if maps is not None else []
+    places += [folder / "data/map/map.xodr"]
+    places += [parent / "maps" / expected["map"] for parent in folder.resolve().parents[:4]]
+    if place := next((place for place in places if place.is_file()), None):
+        _verify_scenarios(folder, site, recording, LocalMap(place), lanes, report)
     else:
-        _verify_scenarios(folder, site, recording, LocalMap(map_path), lanes, report)
+        report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
     expected.finish()
 
 
@@ -346,10 +335,3 @@ def _verify_scenarios(
     for start, track in lanes:
         report.fail("lanes", f"{folder.name} window {start} track {track}", "no such scenario")
     poses.finish()
-
-
-def _find_map_file(folder: Path, maps: Path | None, name: str) -> Path | None:
-    places = [maps / name] if maps is not None else []
-    places += [folder / "data/map/map.xodr"]
-    places += [parent / "maps" / name for parent in folder.resolve().parents[:4]]
-    return next((place for place in places if place.is_file()), None)

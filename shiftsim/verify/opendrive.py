@@ -44,13 +44,9 @@ _CROSSCHECK = "crosscheck_libopendrive.json"
 
 
 def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> None:
-    """Compare our reading of the maps with every reference file of a folder.
+    """Compare our reading of the maps with the files `<map>.<kind>` of a folder.
 
-    Args:
-        folder: Reference files, named `<map>.<kind>`.
-        report: Takes the comparisons.
-        maps: Folder with the .xodr files, at any depth; by default the folder `maps` beside the
-            parent of `folder`.
+    The .xodr files lie at any depth of `maps`, by default of the one beside the parent of `folder`.
     """
     place = maps or folder.resolve().parent.parent / "maps"
     by_name = {path.stem: path for path in sorted(place.rglob("*.xodr"))}
@@ -61,19 +57,18 @@ def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> 
         if name not in by_name:
             report.skip(f"map {name}.xodr not found")
             return
-        file = read_table(path, report) if path.suffix == ".parquet" else _read_json(path, report)
+        if path.suffix == ".parquet":
+            file = read_table(path, report)
+        else:
+            content = read_json(path)
+            content = {"rows": content} if isinstance(content, list) else content
+            file = Source(path.stem, "field", content, report)
         compare(read(by_name[name]), file, by_name[name])
         if path.suffix == ".json" or file.num_rows:
             file.finish()
 
     parts = {f"*.{kind}": partial(part, compare) for kind, compare in KINDS.items()}
     verify_files(folder, report, {_CROSSCHECK: partial(_verify_crosscheck, report), **parts})
-
-
-def _read_json(path: Path, report: Report) -> Source:
-    content = read_json(path)
-    content = {"rows": content} if isinstance(content, list) else content
-    return Source(path.stem, "field", content, report)
 
 
 def _tolerance(line: ReferenceLine, s: FloatArray, cubic: float = CUBIC) -> FloatArray:
@@ -112,8 +107,8 @@ def _verify_lanes(od: OpenDrive, file: Source, path: Path) -> None:
         inner, outer, poses = borders.inner[key.lane], borders.outer[key.lane], line.evaluate(s)
         ours = {"type": [lanes[key].type] * len(s), "t_inner": inner, "t_outer": outer}
         rows.match(where, ours, EXACT, quantity="lane")
-        points = {"c": poses.offset(0.5 * (inner + outer))}
-        points |= {"i": poses.offset(inner), "o": poses.offset(outer)}
+        lines = {"c": 0.5 * (inner + outer), "i": inner, "o": outer}
+        points = {name: poses.offset(t) for name, t in lines.items()}
         columns = {
             f"{p}{axis}": xy[:, i] for p, xy in points.items() for i, axis in enumerate("xy")
         }
@@ -139,9 +134,8 @@ def _verify_topology(od: OpenDrive, file: Source, path: Path) -> None:
     }
     file.report.compare("number of lane links", path.stem, len(links), file.num_rows)
     for link in sorted(ours ^ theirs):
-        file.report.fail(
-            "lane links", path.stem, f"{'missing' if link in theirs else 'too many'}: {link}"
-        )
+        what = "missing" if link in theirs else "too many"
+        file.report.fail("lane links", path.stem, f"{what}: {link}")
 
 
 def _crosswalks(od: OpenDrive) -> list[tuple[Road, RoadObject]]:

@@ -20,12 +20,9 @@ PARTS = {  # sub-folder → module with `FILES`: by glob pattern what is called 
 
 
 def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> None:
-    """Compare every file of the folder.
+    """Compare every file of a folder with sub-folders named as the parts, or of one of these.
 
-    Args:
-        folder: Folder with sub-folders named as the parts, or one of these.
-        report: Filled with the comparisons.
-        scenes: Folder with the logs and maps, by default `nuplan` beside `nets`.
+    `scenes` holds the logs and maps, by default `nuplan` beside `nets`.
     """
     part, home = _part_of(folder), folder.resolve()
     known = Scenes(scenes or (home if part is None else home.parent).parent / "nuplan")

@@ -32,7 +32,7 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta, verify_manifest
+from shiftsim.verify.nets.networks import FEATURE, PROSE, make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
@@ -87,20 +87,19 @@ class KeyedPlanner(DiffusionPlanner):
         return replace(super().features(observation), noise=noise)
 
 
-def _verify_manifest(file: Source, scenes: Scenes) -> None:
-    from shiftsim.planners.learned.diffusion.network import PREFIXES
-
-    last = "decoder.decoder.dit.final_layer.proj.4"
-    others = {
-        "checkpoint": lambda given: {
-            **given,
-            "prefix": PREFIXES[0] + given["prefix"][len(PREFIXES[0]) :],
-            "used_key": re.sub(r"^\w+", "ema_state_dict", given["used_key"]),
+def _manifest(network: Any) -> dict[str, Any]:
+    last, starts = (
+        "decoder.decoder.dit.final_layer.proj.4",
+        {
+            "prefix": re.compile(re.escape(network.PREFIXES[0])),
+            "used_key": re.compile(r"ema_state_dict\b"),
         },
+    )
+    return {
+        "checkpoint": {"file": PROSE, "container": PROSE, **starts},
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
         "noise": _NOISE,
     }
-    verify_manifest(file, NAME, {"parameters": "", "parameters_encoder": "encoder"}, others)
 
 
 def _verify_args(file: Source, scenes: Scenes) -> None:
@@ -116,7 +115,7 @@ def _verify_args(file: Source, scenes: Scenes) -> None:
 def _verify_sampler(file: Source, scenes: Scenes) -> None:
     from shiftsim.planners.learned.diffusion.network import sampler
 
-    made, count = sampler.SCHEDULE, sampler.STEPS
+    made, numbers = sampler.SCHEDULE, np.arange(sampler.STEPS) + 1
     ours = {
         "timesteps": made.times,
         "lambda": made.half_snr,
@@ -126,8 +125,8 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
         "final_denoise_t": sampler.LAST_TIME,
     }
     steps = {
-        "step": np.arange(count) + 1,
-        "order": np.minimum(np.arange(count) + 1, 2),
+        "step": numbers,
+        "order": np.minimum(numbers, 2),
         "t": made.times[1:],
         "h": made.h,
         "c_x": made.c_x,
@@ -256,9 +255,7 @@ def _tracks(file: Source) -> Tracks:
             if kinds.setdefault(int(track), kind) != kind:
                 raise DataError("a track changes its type")
     static = file.take("in.static", -1, 5)
-    static_kinds = [
-        AgentKind[_STATIC[kind]] for kind in file.take("in.static_type", len(static)).tolist()
-    ]
+    types = file.take("in.static_type", len(static)).tolist()
     column = {track: index for index, track in enumerate(kinds)}
     shape = (len(frames), len(column) + len(static))
     values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)
@@ -269,7 +266,7 @@ def _tracks(file: Source) -> Tracks:
     valid[-1, len(column) :] = True
     values[-1, len(column) :, [0, 1, 2, 6, 5]] = static.T
     poses, velocities, sizes = np.split(values, (3, 5), axis=2)
-    codes = np.array([*kinds.values(), *static_kinds], np.int64)
+    codes = np.array([*kinds.values(), *(AgentKind[_STATIC[t]] for t in types)], np.int64)
     return Tracks(valid, poses, velocities, sizes, codes, tuple(map(str, range(shape[1]))))
 
 
@@ -287,13 +284,11 @@ def _verify_lanes(file: Source, scenes: Scenes) -> None:
     point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
     edges = nearest_lanes(np.arange(len(owner)), point, lines, anchor[0], anchor[1], LANES)
     lights = file.take("in.light", len(owner), 4)
-    file.report.compare(
-        f"{NAME} lights", file.name, lights.sum(axis=1), np.ones(len(owner), np.int64)
-    )
+    once = np.ones(len(owner), np.int64)
+    file.report.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
     rows = lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, LANES)
-    on_route = lanes_on_route(
-        lanes.blocks[edges], [index.get(name, -1) for name in file["in.route"].tolist()]
-    )
+    route = [index.get(name, -1) for name in file["in.route"].tolist()]
+    on_route = lanes_on_route(lanes.blocks[edges], route)
     ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), rows, strict=True))
     for name, array in list(ours.items()):
         ours[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
@@ -311,11 +306,11 @@ def _lines(file: Source, name: str) -> Polylines:
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": _verify_manifest,
-    "forward_*.npz": _verify_forward,
-    "closed_loop_*.npz": partial(
-        verify_loop, make=KeyedPlanner, compare=_compare, recorded=(*PLANS, "ego_prediction")
+    "state_dict.json": partial(
+        verify_manifest, NAME, {"parameters": "", "parameters_encoder": "encoder"}, _manifest
     ),
+    "forward_*.npz": _verify_forward,
+    "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare, (*PLANS, "ego_prediction")),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,
 }

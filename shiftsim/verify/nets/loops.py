@@ -14,7 +14,8 @@ import numpy as np
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.observation import HISTORY_SAMPLES, observe_log, past_rows, scene_info
-from shiftsim.verify.files import Source
+from shiftsim.sim.planner import Observation
+from shiftsim.verify.files import Source, Tolerances
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
 
@@ -31,30 +32,23 @@ KNOWN_ERRORS = (  # of official planners, which ours answer with a fallback
 
 
 class Loop:
-    """One closed-loop file, and its iteration that is compared just now.
+    """One closed-loop file, and its iteration that is compared just now."""
 
-    Attributes:
-        file: Its arrays.
-        scenario: The scene.
-        planner: The planner after this iteration.
-        name: Name of the planner.
-        variant: Variant of its weights.
-        ego: (N, 11) recorded ego states, columns of `state.STATE_COLUMNS`.
-        past: (22, 11) ego states up to iteration 0.
-        number: The iteration.
-        stored: What is stored of it alone.
-        seen: What the planner saw.
-        features: What its network read.
-        output: What its network said of them.
-        plan: What it made of that.
-    """
+    number: int  # the iteration
+    stored: Source  # what is stored of it alone
+    seen: Observation  # what the planner saw
+    features: Any  # what its network read
+    output: Any  # what its network said of them
+    plan: Any  # what it made of that
 
     def __init__(self, file: Source, planner: Any, scenes: Scenes) -> None:
-        self.file, self.planner, self.name = file, planner, planner.name
-        self.scenario, self.number = scenes[str(file["meta/scene"])], 0
-        self.variant = str(file["meta/variant"])
+        self.file, self.scenario = file, scenes[str(file["meta/scene"])]
+        self.planner, self.name = planner, planner.name  # the planner after this iteration
+        self.variant = str(file["meta/variant"])  # of its weights
+        # recorded ego states, columns of `state.STATE_COLUMNS`: all, and those up to iteration 0
         self.ego = file.take("ego/current", -1, state.NUM_STATE)
         self.past = file.take("ego/initial_history", HISTORY_SAMPLES, state.NUM_STATE)
+        self.number = 0
         planner.reset(scene_info(self.scenario))
 
     @property
@@ -67,9 +61,14 @@ class Loop:
         report = self.file.report
         report.compare(f"{self.name} {quantity}", self.where, ours, theirs, atol=atol)
 
-    def match(self, ours: Mapping[str, object], atol: float | Mapping[str, float] = 0.0) -> None:
+    def match(self, ours: Mapping[str, object], atol: Tolerances = 0.0, part: str = "") -> None:
         """Compare with the arrays of the same names that are stored of this iteration alone."""
-        self.stored.match(self.where, ours, atol, quantity=self.name)
+        self.stored.below(part).match(self.where, ours, atol, quantity=self.name)
+
+    def match_row(self, ours: Mapping[str, object], atol: Tolerances) -> None:
+        """Compare with the rows for this iteration of arrays of the whole loop."""
+        rows = self.file.below("out/").at(self.number)
+        rows.match(self.where, ours, atol, quantity=self.name)
 
     def recorded(self, name: str) -> Any:
         """The row for this iteration of an array of the whole loop."""
@@ -98,7 +97,7 @@ class Loop:
         sources = scenes.sources(str(meta["scene"]))
         content = [path.read_bytes() for path in sources]
         sums = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
-        made = {
+        made = {  # of which a file has some
             "db_md5": sums[0],
             "map_md5": sums[1],
             "source_files": [path.relative_to(scenes.folder).as_posix() for path in sources],
@@ -123,11 +122,8 @@ class Loop:
 
     def compare_driven(self) -> None:
         """Compare the recorded ego states with what the recorded plans lead to."""
-        command, after, times = (
-            np.empty(2),
-            np.empty(state.NUM_STATE),
-            self.file["ego/current_time_us"],
-        )
+        command, after = np.empty(2), np.empty(state.NUM_STATE)
+        times = self.file["ego/current_time_us"]
         for number in range(len(self.ego) - 1):
             self.number, step = number, (*times[number : number + 2].tolist(), self.ego[number])
             if "out/command" in self.file:
@@ -142,11 +138,11 @@ class Loop:
 
 
 def verify_loop(
-    file: Source,
-    scenes: Scenes,
     make: Callable[[str], Any],
     compare: Callable[[Loop], None],
     recorded: Sequence[str],
+    file: Source,
+    scenes: Scenes,
 ) -> None:
     """Make every step of a closed loop again, and `compare` it.
 

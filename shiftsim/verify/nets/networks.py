@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
@@ -11,7 +11,9 @@ from shiftsim.planners.learned.checkpoint import load_weights
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
 from shiftsim.verify.files import Source
+from shiftsim.verify.scenes import Scenes
 
+PROSE = re.compile("")  # any text
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
 OUTPUT = {"base": 2e-5, "drive": 5e-4}  # outputs that the drive weights scale up, by variant
 
@@ -35,17 +37,22 @@ def match_meta(file: Source, planner: str, ours: Mapping[str, object]) -> None:
 
 
 def verify_manifest(
-    manifest: Source, planner: str, counts: Mapping[str, str], others: Mapping[str, Any]
+    planner: str,
+    counts: Mapping[str, str],
+    make_others: Callable[[Any], Mapping[str, Any]],
+    manifest: Source,
+    scenes: Scenes,
 ) -> None:
-    """Compare the manifest of a network: names, shapes, types, rules and weights.
+    """Compare the manifest `state_dict.json` of a network: names, shapes, types, rules and weights.
 
     Args:
-        manifest: The file `state_dict.json`.
         planner: Name of the planner.
         counts: By field that is the size of all weights, or of the trainable ones if it says so:
             pattern of their names.
-        others: Further fields: our value, a function that makes it from theirs, or None for a text
-            that need not be compared.
+        make_others: Makes further fields from the module of the network: our value, in which a
+            pattern stands for every text that it matches, or None for what need not be compared.
+        manifest: The file.
+        scenes: Not needed.
     """
     report, module = manifest.report, network_module(planner)
     network = module.build_network(None)
@@ -66,12 +73,11 @@ def verify_manifest(
             "rule": rules.get(name) or rule_of(name, built[name].ndim),
             "value": built[name].tolist(),
         }
-        stored = {field: value for field, value in ours.items() if field in entry}
-        entry.match(name, stored, quantity=f"{planner} state")
+        ours = {field: value for field, value in ours.items() if field in entry}
+        entry.match(name, ours, quantity=f"{planner} state")
     (check,) = manifest.each("selfcheck")
     if "first3_raw_z" in check:
-        name = check["name"]
-        shape = built[name].shape
+        name, shape = check["name"], built[check["name"]].shape
         first = keyed_normals(name, shape).ravel()[:3]
         check.match(name, {"shape": shape, "first3_raw_z": first}, quantity=f"{planner} selfcheck")
         check.used.add("note")
@@ -80,13 +86,26 @@ def verify_manifest(
         for name in check:
             first = weights[name].ravel()[: len(check[name])].astype(float)
             report.compare(f"{planner} selfcheck", name, first, check[name])
-    sizes = {field: 0 for field in counts}
-    for field, pattern in counts.items():
-        some = parameters if "trainable" in field else built
-        sizes[field] = sum(built[name].size for name in some if re.match(pattern, name))
-    made = {name: ours(manifest[name]) if callable(ours) else ours for name, ours in others.items()}
-    for name in [name for name, ours in made.items() if ours is None]:
-        manifest.note("description", name)
-        del made[name]
-    manifest.match(manifest.name, sizes | made, quantity=f"{planner} manifest")
+    ours = {
+        field: sum(
+            built[name].size
+            for name in (parameters if "trainable" in field else built)
+            if re.match(pattern, name)
+        )
+        for field, pattern in counts.items()
+    }
+    for name, value in make_others(module).items():
+        if value is None:
+            manifest.note("description", name)
+        else:
+            ours[name] = _filled(value, manifest[name])
+    manifest.match(manifest.name, ours, quantity=f"{planner} manifest")
     manifest.used.add("planner")
+
+
+def _filled(ours: Any, theirs: Any) -> Any:
+    """Ours, with their text in place of each pattern that matches it."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        return {name: _filled(value, theirs.get(name)) for name, value in ours.items()}
+    fits = isinstance(ours, re.Pattern) and isinstance(theirs, str) and ours.match(theirs)
+    return theirs if fits else ours

@@ -17,7 +17,7 @@ from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLAN_COLUMNS, PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import FEATURE, OUTPUT, make_network, verify_manifest
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT, PROSE, make_network, verify_manifest
 from shiftsim.verify.scenes import Scenes
 
 Arrays: TypeAlias = dict[str, np.ndarray]
@@ -27,6 +27,7 @@ MOTION = 1e-5  # m/s, m/s^2: derivatives of the recorded poses
 DERIVED_HEADING = 5e-4  # rad, arctangent of small vectors
 RAW = ("trajectory", "probability", "prediction", "ref_free_trajectory")
 UNSCALED = {"plantf": ("probability", "prediction")}  # the drive weights do not change these
+SIZES = {"total_elements": "", "trainable_parameters": ""}  # fields of the manifests
 LAYERS = np.array(["LANE", "LANE_CONNECTOR", "CROSSWALK"])
 STATE_CHANNELS = 6  # of the current state; the yaw rate behind them is not read
 INPUTS = {  # field of the networks' inputs → array of the files
@@ -91,8 +92,7 @@ def compare_features(
         **{INPUTS[name]: getattr(road, name) for name in OF_MAP},
         **others,
     }
-    stored = loop.stored.below("feature/")
-    stored.match(loop.where, features, FEATURE, quantity=loop.name)
+    loop.match(features, FEATURE, "feature/")
     names = {
         "agent_tokens": ["ego", *(scenario.tracks.tokens[i] for i in agents.tracks.tolist())],
         "map_ids": [ids[row] for row in road.objects.tolist()],
@@ -105,7 +105,7 @@ def compare_features(
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
     there, absent = agents.valid, {"position": origin, "heading": -ego[2]}
     for name in HISTORIES:
-        ours, theirs = getattr(agents, name), stored[f"agent.{name}"]
+        ours, theirs = getattr(agents, name), loop.stored[f"feature/agent.{name}"]
         loop.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)
         rest = np.broadcast_to(absent.get(name, 0.0), theirs.shape)[~there]
         atol = FEATURE + _ROUNDING * float(np.abs(rest).max(initial=0.0))
@@ -176,7 +176,7 @@ def compare_outputs(
         compare(f"{planner} {name} ({variant})", where, value, theirs, atol=atol)
 
 
-def verify_forward(file: Source, scenes: Scenes, planner: str, radius: float, **args: Any) -> None:
+def verify_forward(planner: str, radius: float, file: Source, scenes: Scenes, **args: Any) -> None:
     """Compare the network alone, on synthetic inputs as the official code batched them.
 
     `radius` [m] is that of the features, `args` differ from the network's released ones.
@@ -197,35 +197,22 @@ def verify_forward(file: Source, scenes: Scenes, planner: str, radius: float, **
     file.note("the network does not read the yaw rate, the last value of in/current_state")
 
 
-def verify_vector_manifest(file: Source, scenes: Scenes, planner: str, **builder: object) -> None:
-    """Compare `state_dict.json`; `builder` are the planner's settings of the features."""
-    module = network_module(planner)
+def manifest_of(network: Any, **builder: object) -> dict[str, Any]:
+    """Fields of `state_dict.json`; `builder` are the planner's settings of the features."""
     heads = {
         layer: {"C": len(head.gain), **{name: list(v) for name, v in asdict(head).items()}}
-        for layer, head in module.DRIVE_HEADS.items()
+        for layer, head in network.DRIVE_HEADS.items()
     }
-    features = {
-        "history_horizon": (SAMPLES - 1) * STEP,
-        "future_horizon": STEPS * STEP,
-        "sample_interval": STEP,
-        **builder,
+    scale = getattr(network, "DRIVE_SCALES", {})
+    prose = dict.fromkeys(("container", "loading", "other_entries"), PROSE)
+    history, future = (SAMPLES - 1) * STEP, STEPS * STEP
+    times = {"history_horizon": history, "future_horizon": future, "sample_interval": STEP}
+    return {
+        "checkpoint": {"weights_under": "state_dict", "prefix": network.PREFIXES[0], **prose},
+        "hyper_parameters": network.RELEASED,
+        "feature_builder": times | builder,
+        "drive_overrides": {"meaning": PROSE, "heads": heads, "scale": scale},
     }
-    others = {  # the rest of the checkpoint's description is prose, and so is the meaning of heads
-        "checkpoint": lambda given: {
-            **given,
-            "weights_under": "state_dict",
-            "prefix": module.PREFIXES[0],
-        },
-        "hyper_parameters": module.RELEASED,
-        "feature_builder": features,
-        "drive_overrides": lambda given: {
-            "meaning": given["meaning"],
-            "heads": heads,
-            "scale": getattr(module, "DRIVE_SCALES", {}),
-        },
-    }
-    counts = {"total_elements": "", "trainable_parameters": ""}
-    verify_manifest(file, planner, counts, others)
 
 
 def compare_inputs(file: Source, planner: str, radius: float) -> None:
@@ -303,7 +290,7 @@ def _compare(loop: Loop) -> None:
     loop.compare("motion of the recorded plan", again, theirs[:, 3:], MOTION)
     if not list(loop.stored):
         return
-    features, variant = loop.features, loop.variant
+    features = loop.features
     others = {
         "current_state": features.current_state,
         # the official code gives every agent the category of the ego at inference
@@ -313,13 +300,13 @@ def _compare(loop: Loop) -> None:
     raw = run_network(NAME, loop.planner.network, make_batch([features], "cpu"))
     ours = {name: value[0] for name, value in raw.items()}
     ours |= derived_outputs(ours, None)
-    compare_outputs(loop.stored.below("net/"), loop.where, NAME, variant, ours)
+    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
 
 
 FILES = {
     "state_dict.json": partial(
-        verify_vector_manifest, planner=NAME, radius=RADIUS, max_agents=MAX_AGENTS
+        verify_manifest, NAME, SIZES, partial(manifest_of, radius=RADIUS, max_agents=MAX_AGENTS)
     ),
-    "forward_*.npz": partial(verify_forward, planner=NAME, radius=RADIUS),
-    "closed_loop_*.npz": partial(verify_loop, make=PlanTF, compare=_compare, recorded=PLANS),
+    "forward_*.npz": partial(verify_forward, NAME, RADIUS),
+    "closed_loop_*.npz": partial(verify_loop, PlanTF, _compare, PLANS),
 }

@@ -11,24 +11,18 @@ from shiftsim.planners.learned.pluto.inputs import stack
 from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS, Choice, Pluto, Sight
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, aggregate, nearest_line, score
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.loops import (
-    FILE_COLUMNS,
-    HEADING,
-    PLANS,
-    POSITION,
-    STATE,
-    Loop,
-    verify_loop,
-)
-from shiftsim.verify.nets.networks import FEATURE, OUTPUT
+from shiftsim.verify.nets import loops
+from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
+from shiftsim.verify.nets.networks import FEATURE, OUTPUT, verify_manifest
 from shiftsim.verify.nets.plantf import (
     INPUTS,
+    SIZES,
     compare_features,
     compare_outputs,
     derived_outputs,
+    manifest_of,
     run_network,
     verify_forward,
-    verify_vector_manifest,
 )
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
@@ -59,8 +53,10 @@ def _verify_brake(file: Source, scenes: Scenes) -> None:
     states = np.full((len(egos), 81, NUM_STATE), np.nan)
     for case in np.flatnonzero(must).tolist():
         states[case] = brake(poses[case], egos[case], float(times[case]), PACIFICA)
-    file.match("file", {"columns": list(FILE_COLUMNS)})
-    file.match_rows({"speed": speeds, "braked": must, "states": states}, {"speed": LINE, "": STATE})
+    file.match("file", {"columns": list(loops.FILE_COLUMNS)})
+    file.match_rows(
+        {"speed": speeds, "braked": must, "states": states}, {"speed": LINE, "": loops.STATE}
+    )
 
 
 def _compare(loop: Loop) -> None:
@@ -145,7 +141,7 @@ def _compare_choice(loop: Loop, choice: Choice) -> None:
         if name in stored:
             loop.compare(name, value, stored[name], atol)
             if name in ("cand", "rollout", "agents_pred"):
-                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], HEADING)
+                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], loops.HEADING)
     # what follows from the other stored scores
     progress, rule = aggregate(stored["multi"], stored["weighted"], stored["progress"])
     loop.compare("aggregated progress", progress, stored["weighted"][0], EXACT)
@@ -182,21 +178,12 @@ def _is_near_tie(loop: Loop, ours: int, theirs: int) -> bool:
     return True
 
 
+_BUILDER = {"radius": RADIUS, "max_agents": MAX_AGENTS, "build_reference_line": True}
+_RECORDED = (*PLANS, "best_index", "emergency_brake")
 FILES = {
-    "state_dict.json": partial(
-        verify_vector_manifest,
-        planner=NAME,
-        radius=RADIUS,
-        max_agents=MAX_AGENTS,
-        build_reference_line=True,
-    ),
+    "state_dict.json": partial(verify_manifest, NAME, SIZES, partial(manifest_of, **_BUILDER)),
     # the official code masks the agents of a batch in the wrong order
-    "forward_*.npz": partial(verify_forward, planner=NAME, radius=RADIUS, misordered_masks=True),
-    "closed_loop_*.npz": partial(
-        verify_loop,
-        make=Pluto,
-        compare=_compare,
-        recorded=(*PLANS, "best_index", "emergency_brake"),
-    ),
+    "forward_*.npz": partial(verify_forward, NAME, RADIUS, misordered_masks=True),
+    "closed_loop_*.npz": partial(verify_loop, Pluto, _compare, _RECORDED),
     "emergency_brake.npz": _verify_brake,
 }
