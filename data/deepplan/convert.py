@@ -197,10 +197,7 @@ def _build_map(
 
 
 def _collect(
-    spread: Spread,
-    make: Make,
-    names: Sequence[str],
-    seen: Callable[[str], None],
+    spread: Spread, make: Make, names: Sequence[str], seen: Callable[[str], None]
 ) -> dict[str, Any]:
     """Result by name, in the order of the names, `Broken` where the process died."""
     found = {}

@@ -102,11 +102,7 @@ def nearest_lane(
 ) -> tuple[int, float] | None:
     """The edge an ego can start on, and its distance [m]; None where none is near and along it."""
     edge, distance = _start_edge(
-        road.edges.polygons,
-        road.baselines,
-        pose,
-        config.max_lane_distance,
-        config.max_lane_angle,
+        road.edges.polygons, road.baselines, pose, config.max_lane_distance, config.max_lane_angle
     )
     return None if edge < 0 else (edge, distance)
 
@@ -192,8 +188,7 @@ def _edge_on(road: VectorMap, block: int, pose: FloatArray) -> int:
 def _straightest(road: VectorMap, blocks: list[int]) -> int:
     """The block whose edges turn least."""
     return min(
-        blocks,
-        key=lambda b: (min(abs(_turn(road, e)) for e in road.block_edges.at(b).tolist()), b),
+        blocks, key=lambda b: (min(abs(_turn(road, e)) for e in road.block_edges.at(b).tolist()), b)
     )
 
 

@@ -180,11 +180,7 @@ def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap:
     by_frame = np.lexsort((recording.track, recording.frame))
     frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
     boxes = np.column_stack(
-        [
-            recording.centers[:, :2],
-            recording.angles[:, 0],
-            recording.sizes[recording.track, :2],
-        ]
+        [recording.centers[:, :2], recording.angles[:, 0], recording.sizes[recording.track, :2]]
     )[by_frame]
     asked = candidates[recording.track[by_frame]]
     found = _first_overlaps(np.ascontiguousarray(boxes), frame_ptr, asked, max_overlap)

@@ -68,10 +68,7 @@ _LAYERS: dict[str, tuple[str, str]] = {
         "stop_polygon_type_fid:i lane_group_fid:i lane_fids= lane_connector_fids"
         " traffic_light_fids= crosswalk_fids= precedence_area_fids creator_id",
     ),
-    "traffic_lights": (
-        "POINT",
-        "traffic_light_type_fid:i intersection_fid:i heading:r creator_id",
-    ),
+    "traffic_lights": ("POINT", "traffic_light_type_fid:i intersection_fid:i heading:r creator_id"),
     "walkways": (_POLYGON, "creator_id"),
 }
 _TYPES = {"": ("TEXT", str), "i": ("INTEGER", int), "r": ("REAL", float)}

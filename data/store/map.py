@@ -25,14 +25,7 @@ _LAYERS = (
     "drivable_areas",
 )
 _LINES = ("baselines", "left_boundaries", "right_boundaries")
-_LISTS = (
-    "incoming",
-    "outgoing",
-    "stop_lines",
-    "block_edges",
-    "block_incoming",
-    "block_outgoing",
-)
+_LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
 _ARRAYS = {  # field -> column with its unit
     "speed_limits": "speed_limits_mps",
     "lane_index": "lane_index",

@@ -163,12 +163,7 @@ class StoreWriter:
         content = hashlib.sha256(json.dumps(files).encode()).hexdigest()
         tables.write_json(
             self.path / tables.MANIFEST,
-            {
-                "format": schema.FORMAT,
-                "version": schema.VERSION,
-                "hash": content,
-                "files": files,
-            },
+            {"format": schema.FORMAT, "version": schema.VERSION, "hash": content, "files": files},
         )
 
     def _name(self, path: Path) -> str:
