@@ -169,8 +169,7 @@ def write_geopackage(
             (fid, blob, *(values.get(name, layer.defaults.get(name)) for name in layer.columns))
             for (fid, _, values), blob in zip(layer.rows, _blobs(shapes), strict=True)
         ]
-    no_bounds = (None,) * 5
-    rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *no_bounds))
+    rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *[None] * 5))
     tables["meta"] = f'{_FID}, "key" TEXT, "value" TEXT'
     rows["meta"] = [(i, *item) for i, item in enumerate(meta.items(), 1)]
     header = (f"PRAGMA application_id = {_APPLICATION_ID}", f"PRAGMA user_version = {_VERSION}")
