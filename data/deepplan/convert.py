@@ -181,15 +181,9 @@ def _build_map(
     drive = read_opendrive(find_map(source, map_path))
     _check_georeference(drive, source)
     x, y, *_ = drive.offset or (0.0, 0.0)
+    offset = float(source.offset[0]) - x, float(source.offset[1]) - y  # the header's is applied
     road, report = build_road_map(
-        drive,
-        name=city,
-        offset=(
-            float(source.offset[0]) - x,
-            float(source.offset[1]) - y,
-        ),  # the header's is applied
-        epsg=source.epsg,
-        country=config.country,
+        drive, name=city, offset=offset, epsg=source.epsg, country=config.country
     )
     if road.num_lanes == 0:
         raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")

@@ -42,10 +42,7 @@ class Placement:
 def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> Route | None:
     """The route of an ego, or None where it touches no roadblock.
 
-    Args:
-        road: The map.
-        poses: (R, 3) rear axle from t0 on: x [m], y [m], heading [rad].
-        config: For how far it is extended.
+    `poses` (R, 3) are its rear axle from t0 on: x [m], y [m], heading [rad].
     """
     driven = close_gaps(road, follow_blocks(road, poses[:, :2]))
     if not driven:
@@ -110,10 +107,8 @@ def nearest_lane(
 def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placement:
     """Compare moving vehicles with the drivable area, and look for a better place if need be.
 
-    Args:
-        road: The map.
-        points: (n, 2) box centres of moving vehicles in the frame of the map [m].
-        enough: Share on drivable area at which no better place is looked for.
+    `points` (n, 2) are their box centres in the frame of the map [m]; where the share `enough` is
+    on drivable area, no better place is looked for.
     """
     if len(points) == 0:
         return Placement(1.0, np.zeros(2), 1.0)
