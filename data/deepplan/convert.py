@@ -181,15 +181,9 @@ def _build_map(
     drive = read_opendrive(find_map(source, map_path))
     _check_georeference(drive, source)
     x, y, *_ = drive.offset or (0.0, 0.0)
+    offset = float(source.offset[0]) - x, float(source.offset[1]) - y  # the header's is applied
     road, report = build_road_map(
-        drive,
-        name=city,
-        offset=(
-            float(source.offset[0]) - x,
-            float(source.offset[1]) - y,
-        ),  # the header's is applied
-        epsg=source.epsg,
-        country=config.country,
+        drive, name=city, offset=offset, epsg=source.epsg, country=config.country
     )
     if road.num_lanes == 0:
         raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
@@ -197,10 +191,7 @@ def _build_map(
 
 
 def _collect(
-    spread: Spread,
-    make: Make,
-    names: Sequence[str],
-    seen: Callable[[str], None],
+    spread: Spread, make: Make, names: Sequence[str], seen: Callable[[str], None]
 ) -> dict[str, Any]:
     """Result by name, in the order of the names, `Broken` where the process died."""
     found = {}

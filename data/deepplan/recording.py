@@ -59,14 +59,7 @@ class Converted:
 def convert_recording(
     source: Annotations, road: VectorMap, offset: FloatArray, config: ConversionConfig
 ) -> Converted:
-    """All scenarios of one recording.
-
-    Args:
-        source: The recording.
-        road: Map of the site, in UTM.
-        offset: (2,) UTM of the local origin [m].
-        config: Thresholds.
-    """
+    """All scenarios of one recording; the map is in UTM, as is `offset` (2,) of the origin [m]."""
     return _Conversion(source, road, offset, config).convert()
 
 

@@ -42,10 +42,7 @@ class Placement:
 def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> Route | None:
     """The route of an ego, or None where it touches no roadblock.
 
-    Args:
-        road: The map.
-        poses: (R, 3) rear axle from t0 on: x [m], y [m], heading [rad].
-        config: For how far it is extended.
+    `poses` (R, 3) are its rear axle from t0 on: x [m], y [m], heading [rad].
     """
     driven = close_gaps(road, follow_blocks(road, poses[:, :2]))
     if not driven:
@@ -102,11 +99,7 @@ def nearest_lane(
 ) -> tuple[int, float] | None:
     """The edge an ego can start on, and its distance [m]; None where none is near and along it."""
     edge, distance = _start_edge(
-        road.edges.polygons,
-        road.baselines,
-        pose,
-        config.max_lane_distance,
-        config.max_lane_angle,
+        road.edges.polygons, road.baselines, pose, config.max_lane_distance, config.max_lane_angle
     )
     return None if edge < 0 else (edge, distance)
 
@@ -114,10 +107,8 @@ def nearest_lane(
 def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placement:
     """Compare moving vehicles with the drivable area, and look for a better place if need be.
 
-    Args:
-        road: The map.
-        points: (n, 2) box centres of moving vehicles in the frame of the map [m].
-        enough: Share on drivable area at which no better place is looked for.
+    `points` (n, 2) are their box centres in the frame of the map [m]; where the share `enough` is
+    on drivable area, no better place is looked for.
     """
     if len(points) == 0:
         return Placement(1.0, np.zeros(2), 1.0)
@@ -192,8 +183,7 @@ def _edge_on(road: VectorMap, block: int, pose: FloatArray) -> int:
 def _straightest(road: VectorMap, blocks: list[int]) -> int:
     """The block whose edges turn least."""
     return min(
-        blocks,
-        key=lambda b: (min(abs(_turn(road, e)) for e in road.block_edges.at(b).tolist()), b),
+        blocks, key=lambda b: (min(abs(_turn(road, e)) for e in road.block_edges.at(b).tolist()), b)
     )
 
 

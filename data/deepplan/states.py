@@ -17,6 +17,7 @@ from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 
 _EPS = 1e-9  # s
+_ROW_US = 50_000  # us, as `ROW_S`
 _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second order
 
 
@@ -30,16 +31,10 @@ class Samples:
 
 
 def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatArray) -> Samples:
-    """Boxes at any time, linear between the frames of a run.
+    """Boxes of runs (G,) at times (G,) since the first frame [s], linear between the frames.
 
     Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
     heading. Callers decide how far that is allowed.
-
-    Args:
-        recording: The recording.
-        runs: Its runs.
-        run: (G,) run to sample.
-        time: (G,) since the first frame [s].
     """
     num_frames = len(recording.clock)
     frame = np.searchsorted(recording.clock, time + _EPS, side="right") - 1
@@ -66,12 +61,8 @@ def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatAr
     )
 
 
-def run_rows(recording: Annotations, runs: Runs) -> tuple[IntArray, IntArray]:
-    """(U,) first and last 20 Hz row of every run; a run between two rows has first > last."""
-    return _rows_between(recording.time[runs.first], recording.time[runs.last])
-
-
 def _rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
+    """First and last 20 Hz row of time spans; first > last where one lies between two rows."""
     first = np.ceil(first_s / ROW_S - _EPS).astype(np.int64)
     return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
 
@@ -94,17 +85,12 @@ def resample(
 ) -> Recording:
     """A whole recording at 20 Hz in UTM, every run a track.
 
-    Args:
-        recording: The source.
-        runs: Its runs.
-        log_name: Name in the store.
-        city: Name of the map.
-        offset: (2,) UTM of the local origin [m].
-        padding_s: Rows to make up before the first frame, with constant velocity [s].
+    `offset` (2,) is the UTM of the local origin [m]; the first `padding_s` are made up before the
+    first frame, with constant velocity.
     """
     padding = rows_of(padding_s)
     num_rows = int(np.floor(recording.duration / ROW_S + _EPS)) + 1 + padding
-    first, last = run_rows(recording, runs)
+    first, last = _rows_between(recording.time[runs.first], recording.time[runs.last])
     first = np.where(recording.frame[runs.first] == 0, -padding, first)
     kept = np.flatnonzero(last >= first)
     kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
@@ -129,13 +115,8 @@ def resample(
     moves = (kinds <= LAST_AGENT_KIND)[column]
     tracks.velocities[row[moves], column[moves]] = samples.velocities[moves]
     tracks.sizes[row, column] = recording.sizes[runs.track[kept]][column, :2]
-    times = recording.start_us + (np.arange(num_rows) - padding) * rows_us(1)
+    times = recording.start_us + (np.arange(num_rows) - padding) * _ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
-
-
-def rows_us(rows: int) -> int:
-    """Microseconds between rows."""
-    return rows * 50_000
 
 
 def ego_trace(
@@ -151,27 +132,15 @@ def ego_trace(
 ) -> EgoTrace:
     """States of a run as the ego: the Pacifica's box centre on the recorded one.
 
-    Args:
-        recording: The source.
-        runs: Its runs.
-        run: Which one.
-        log_name: Name of the recording in the store.
-        offset: (2,) UTM of the local origin [m].
-        first_row: First row that is wanted.
-        last_row: One past the last row that is wanted.
-        padding: Rows made up before the first frame; row numbers count from there.
+    `offset` (2,) is the UTM of the local origin [m]. The rows first_row … last_row - 1 are wanted;
+    they count from the first of the `padding` rows made up before the first frame.
     """
     ends = recording.time[[runs.first[run], runs.last[run]]]
     begin, end = _rows_between(ends[:1], ends[1:])
     low = min(int(begin[0]) + padding, first_row)
     high = max(int(end[0]) + 1 + padding, last_row)
-    rows = np.arange(low, high)
-    samples = sample_runs(
-        recording,
-        runs,
-        np.full(len(rows), run, np.int64),
-        (rows - padding).astype(np.float64) * ROW_S,
-    )
+    times = np.arange(low - padding, high - padding).astype(np.float64) * ROW_S
+    samples = sample_runs(recording, runs, np.full(len(times), run, np.int64), times)
     states = ego_states(samples.poses, samples.velocities)
     states[:, :2] += offset
     kept = np.ascontiguousarray(states[first_row - low : last_row - low])
@@ -179,15 +148,11 @@ def ego_trace(
 
 
 def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:
-    """Ego states from box centres at 20 Hz.
+    """Ego states (R, 11) from box centres at 20 Hz.
 
-    Args:
-        centers: (R, 3) box centre x [m], y [m], heading [rad].
-        velocities: (R, 2) of the box centre in the map frame [m/s].
-
-    Returns:
-        (R, 11) states. Steering and yaw rates stay 0 (nuPlan rule 415), so that an exported
-        scenario is the same one.
+    `centers` (R, 3) are x [m], y [m], heading [rad]; `velocities` (R, 2) are in the map frame
+    [m/s]. Steering and yaw rates stay 0 (nuPlan rule 415), so that an exported scenario is the same
+    one.
     """
     states = np.zeros((len(centers), state.NUM_STATE))
     states[:, :3] = state.rear_poses(centers)  # nuPlan rule 453: box centre on box centre
@@ -202,11 +167,9 @@ def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:
 
 
 def slope(values: FloatArray, dt: float) -> FloatArray:
-    """Savitzky-Golay first derivative (second order, 11 samples; the ends by the last fit).
+    """Savitzky-Golay first derivative of values (R,), `dt` seconds apart.
 
-    Args:
-        values: (R,) samples.
-        dt: Time between them [s].
+    Second order, 11 samples; the ends by the last fit.
     """
     half = min(_HALF_WINDOW, (len(values) - 1) // 2)
     if half == 0:

@@ -58,10 +58,8 @@ class ConversionConfig:
         if self.overlap_s >= self.window_s:
             raise ConfigError(f"overlap_s {self.overlap_s!r} must be below window_s")
         if self.window_s - self.history_s < 0.3:
-            raise ConfigError(
-                f"window_s {self.window_s!r} leaves less than 0.3 s after history_s"
-                f" {self.history_s!r}"
-            )
+            less = f"leaves less than 0.3 s after history_s {self.history_s!r}"
+            raise ConfigError(f"window_s {self.window_s!r} {less}")
 
     @property
     def is_short(self) -> bool:
@@ -168,23 +166,15 @@ def judge_windows(
 
 
 def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap: float) -> IntArray:
-    """(A,) a track whose box overlaps the row's at its frame, -1 where none does.
+    """(A,) a track whose box shares more than `max_overlap` [m^2] with the row's, -1 without one.
 
-    nuPlan rule 451: with the recorded sizes, and tracks of all categories.
-
-    Args:
-        recording: The recording.
-        candidates: (N,) tracks whose rows are looked at; the partner may be any track.
-        max_overlap: Area that boxes may share [m^2].
+    nuPlan rule 451: with the recorded sizes, and tracks of all categories. Only rows of the
+    `candidates` (N,) are looked at.
     """
     by_frame = np.lexsort((recording.track, recording.frame))
     frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
     boxes = np.column_stack(
-        [
-            recording.centers[:, :2],
-            recording.angles[:, 0],
-            recording.sizes[recording.track, :2],
-        ]
+        [recording.centers[:, :2], recording.angles[:, 0], recording.sizes[recording.track, :2]]
     )[by_frame]
     asked = candidates[recording.track[by_frame]]
     found = _first_overlaps(np.ascontiguousarray(boxes), frame_ptr, asked, max_overlap)
@@ -220,13 +210,9 @@ def _judge(
         [CATEGORY, PRESENCE, SPEED, OVERLAP],
         EGO,
     )
-    return WindowVerdicts(
-        start,
-        tracks,
-        run[tracks],
-        tuple(verdict[tracks].tolist()),
-        np.where(verdict[tracks] == OVERLAP, hit[tracks], -1),
-    )
+    found = verdict[tracks]
+    partners = np.where(found == OVERLAP, hit[tracks], -1)
+    return WindowVerdicts(start, tracks, run[tracks], tuple(found.tolist()), partners)
 
 
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:

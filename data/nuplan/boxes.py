@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.nuplan.log import Log, as_numbers, read_rows, token_text
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError
@@ -59,10 +59,8 @@ def read_boxes(log: Log, first: int, last: int) -> Boxes:
 
 
 def _check_boxes(log: Log, boxes: Boxes) -> None:
-    finite = np.isfinite(boxes.values[:, :3]).all(axis=1)
-    extended = (boxes.values[:, 5:7] > 0.0).all(axis=1) & np.isfinite(boxes.values[:, 5:7]).all(
-        axis=1
-    )
+    finite, sizes = np.isfinite(boxes.values[:, :3]).all(axis=1), boxes.values[:, 5:7]
+    extended = ((sizes > 0.0) & np.isfinite(sizes)).all(axis=1)
     for good, what in ((finite, "a pose that is not finite"), (extended, "no length or width")):
         if not good.all():
             box = int(np.flatnonzero(~good)[0])
@@ -80,9 +78,12 @@ def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tra
     frame = boxes.row - first
     kinds = np.zeros(len(index), np.int64)
     kinds[track] = boxes.kind
-    order = order_tracks(frame, track, kinds)
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
+    before = np.zeros((len(index), len(index)), np.bool_)  # in a frame, directly before the other
+    next_to = (np.diff(frame) == 0) & (np.diff(boxes.kind) == 0) & (np.diff(track) != 0)
+    before[track[:-1][next_to], track[1:][next_to]] = True
+    first_frame = frame[np.unique(track, return_index=True)[1]]
+    order = sort_tracks(before, kinds, first_frame)
+    place = np.argsort(order)
     shape = (last - first, len(index))
     valid = np.zeros(shape, np.bool_)
     poses, velocities, sizes = (np.full((*shape, n), np.nan) for n in (3, 2, 2))
@@ -95,46 +96,5 @@ def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tra
     velocities[where] = boxes.values[:, 3:5]
     velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan  # nuPlan rule 420
     sizes[where] = boxes.values[:, 5:7]
-    tokens = list(index)
-    return Tracks(
-        valid, poses, velocities, sizes, kinds[order], tuple(tokens[i] for i in order.tolist())
-    )
-
-
-def order_tracks(frame: IntArray, track: IntArray, kinds: IntArray) -> IntArray:
-    """As `order_of_columns`, of tracks given box by box.
-
-    Args:
-        frame: (B,) frame of each box, ascending.
-        track: (B,) track of each box, in the order in which its frame lists the boxes.
-        kinds: (N,) type of each track.
-
-    Returns:
-        (N,) indices of the tracks in their new order.
-    """
-    num = len(kinds)
-    before = np.zeros((num, num), np.bool_)
-    _link(frame, track, kinds, before)
-    return sort_tracks(before, kinds, _first_frames(frame, track, num))
-
-
-@kernel
-def _link(frame: IntArray, track: IntArray, kinds: IntArray, before: BoolArray) -> None:
-    """Mark neighbours of one kind in a frame: `before[a, b]` when b directly follows a."""
-    last = np.full(16, -1)
-    for box in range(len(frame)):
-        if box == 0 or frame[box] != frame[box - 1]:
-            for kind in range(len(last)):
-                last[kind] = -1
-        kind = kinds[track[box]]
-        if last[kind] >= 0 and last[kind] != track[box]:
-            before[last[kind], track[box]] = True
-        last[kind] = track[box]
-
-
-@kernel
-def _first_frames(frame: IntArray, track: IntArray, num: int) -> IntArray:
-    first = np.full(num, np.iinfo(np.int64).max)
-    for box in range(len(frame)):
-        first[track[box]] = min(first[track[box]], frame[box])
-    return first
+    tokens = tuple(np.array(list(index), object)[order].tolist())
+    return Tracks(valid, poses, velocities, sizes, kinds[order], tokens)

@@ -88,13 +88,14 @@ def _choice(
     tokens: Iterable[str] | None, types: Iterable[str] | None, filter_file: Path | None
 ) -> ScenarioFilter:
     chosen = ScenarioFilter() if filter_file is None else read_filter(Path(filter_file))
-    if tokens is not None:
-        given = frozenset(tokens)
-        chosen = replace(chosen, tokens=given if chosen.tokens is None else given & chosen.tokens)
-    if types is not None:
-        named = frozenset(types)
-        chosen = replace(chosen, types=named if chosen.types is None else named & chosen.types)
-    return chosen
+    both = _common(tokens, chosen.tokens), _common(types, chosen.types)
+    return replace(chosen, tokens=both[0], types=both[1])
+
+
+def _common(given: Iterable[str] | None, listed: frozenset[str] | None) -> frozenset[str] | None:
+    if given is None or listed is None:
+        return listed if given is None else frozenset(given)
+    return listed & frozenset(given)
 
 
 def _log_files(logs: Path, chosen: ScenarioFilter) -> list[Path]:
@@ -145,12 +146,8 @@ class _Conversion:
         if chosen.maps is not None and log.map_name not in chosen.maps:
             return
         windows: list[Window] = []
-        for entry in offered(
-            log,
-            tokens=chosen.tokens,
-            types=chosen.types,
-            remove_invalid_goals=chosen.remove_invalid_goals,
-        ):
+        with_goals = chosen.remove_invalid_goals
+        for entry in offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals):
             self.found.add(entry.token)
             try:
                 window = cut_window(log, entry.token, self.mapping)
@@ -196,15 +193,8 @@ class _Conversion:
         self.writer.add_ego(ego)
         for window in windows:
             flaws["unknown route ids"] += sum(block not in blocks for block in window.route)
-            self.writer.add_window(
-                replace(
-                    window,
-                    log_name=name,
-                    ego=EGO,
-                    first_row=window.first_row - first,
-                    last_row=window.last_row - first,
-                    iteration_rows=window.iteration_rows - first,
-                )
-            )
+            names = ("first_row", "last_row", "iteration_rows")
+            rows = {name: getattr(window, name) - first for name in names}
+            self.writer.add_window(replace(window, log_name=name, ego=EGO, **rows))
             report.converted.append(window.token)
         report.flaws.update({f"log {log.name}: {what}": n for what, n in (+flaws).items()})

@@ -63,11 +63,8 @@ def export_nuplan(
 ) -> ExportReport:
     """Write scenarios and their maps in nuPlan's formats. The same input gives the same bytes.
 
-    Args:
-        store: The store.
-        out: Folder that is written to; maps that are there already stay listed.
-        tokens: Only these scenarios; all where None.
-        progress: Called with scenarios done, scenarios in all, and the log's name.
+    Maps that are in the folder already stay listed. Only the scenarios `tokens` are written, all
+    where None; `progress` is called with scenarios done, scenarios in all, and the log's name.
 
     Raises:
         DataError: The store is damaged, or holds something that the formats have no place for.
@@ -76,11 +73,8 @@ def export_nuplan(
     windows = {token: store.window(token) for token in chosen}
     cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
     names = _log_names(windows, cities)
-    report = ExportReport(
-        logs=out / "nuplan-v1.1" / "splits" / _plain(store.path.resolve().name),
-        maps=out / "maps",
-        token_file=out / "tokens.txt",
-    )
+    logs = out / "nuplan-v1.1" / "splits" / _plain(store.path.resolve().name)
+    report = ExportReport(logs, maps=out / "maps", token_file=out / "tokens.txt")
     report.cities = sorted({cities[token] for token in chosen})
     _write_maps(store, report)
     for done, token in enumerate(chosen):
@@ -91,8 +85,7 @@ def export_nuplan(
         report.tokens[token] = log_token(token).hex()
         report.mappings[scenario.scenario_type, mapping] += 1
     progress(len(chosen), len(chosen), "")
-    lines = sorted(report.tokens.values())
-    report.token_file.write_text("\n".join(lines) + "\n", "utf-8")
+    report.token_file.write_text("\n".join(sorted(report.tokens.values())) + "\n", "utf-8")
     return report
 
 
@@ -117,9 +110,8 @@ def _write_maps(store: ScenarioStore, report: ExportReport) -> None:
         listed = json.loads(index.read_text("utf-8")) if index.is_file() else {}
         versions = {name: entry["version"] for name, entry in listed.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConversionError(
-            f"{index}: not an index of maps: {error!r}", hint="choose another folder"
-        ) from error
+        what = f"{index}: not an index of maps: {error!r}"
+        raise ConversionError(what, hint="choose another folder") from error
     for city in report.cities:
         if versions.get(city, MAP_VERSION) != MAP_VERSION:
             raise ConversionError(
@@ -128,9 +120,8 @@ def _write_maps(store: ScenarioStore, report: ExportReport) -> None:
             )
         if city in (".", "..") or "/" in city:
             raise ConversionError(f"map {city!r} cannot be a folder", hint="rename the site")
-        write_nuplan_map(
-            report.maps / city / MAP_VERSION / "map.gpkg", store.map(city), MAP_VERSION
-        )
+        path = report.maps / city / MAP_VERSION / "map.gpkg"
+        write_nuplan_map(path, store.map(city), MAP_VERSION)
         layers = {"drivable_area": _RASTER, "Intensity": _RASTER}
         listed[city] = {"version": MAP_VERSION, "layers": layers}
     write_json(index, listed)

@@ -68,12 +68,8 @@ _TABLES = {
 }
 _INDEXES = tuple(
     f"CREATE INDEX {table}_{column}_idx ON {table} ({column})"
-    for table, column in (
-        ("lidar_pc", "timestamp"),
-        ("lidar_box", "lidar_pc_token"),
-        ("scenario_tag", "lidar_pc_token"),
-        ("traffic_light_status", "lidar_pc_token"),
-    )
+    for table, column in [("lidar_pc", "timestamp")]
+    + [(t, "lidar_pc_token") for t in ("lidar_box", "scenario_tag", "traffic_light_status")]
 )
 
 
@@ -118,35 +114,22 @@ def log_token(text: str) -> bytes:
 def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
     """Write one scenario as a log: five scenes, of which the middle one holds all rows.
 
-    Args:
-        path: The file; its name is the log's.
-        scenario: The scenario.
-        epsg: Code of the coordinate system of its map.
-
-    Returns:
-        Duration [s], offset [s] and subsample ratio that cut the scenario out again.
+    The file's name is the log's. Returns the mapping that cuts the scenario out again.
 
     Raises:
         ConversionError: A light belongs to a connector without an integer id, or the iterations
             are not evenly spaced rows.
     """
-    rows: dict[str, Rows] = {}
     log = _Log(path.stem, scenario, epsg)
-    rows["log"] = log.header()
-    rows["lidar"] = [
-        (
-            log.lidar,
-            log.token,
-            LIDAR_CHANNEL,
-            "none",
-            pickle.dumps([0.0, 0.0, 0.0], _PICKLE),
-            pickle.dumps([1.0, 0.0, 0.0, 0.0], _PICKLE),
-        )
-    ]
-    rows["ego_pose"] = log.ego_poses()
-    rows["scene"] = log.scene_rows()
-    rows["lidar_pc"] = log.lidar_pcs()
-    rows["category"] = [(t, k.name.lower(), k.name.lower()) for k, t in log.categories.items()]
+    place = (pickle.dumps(values, _PICKLE) for values in ([0.0] * 3, [1.0, 0.0, 0.0, 0.0]))
+    rows: dict[str, Rows] = {
+        "log": log.header(),
+        "lidar": [(log.lidar, log.token, LIDAR_CHANNEL, "none", *place)],
+        "ego_pose": log.ego_poses(),
+        "scene": log.scene_rows(),
+        "lidar_pc": log.lidar_pcs(),
+        "category": [(t, k.name.lower(), k.name.lower()) for k, t in log.categories.items()],
+    }
     rows["track"], rows["lidar_box"] = log.boxes()
     if scenario.scenario_type != UNKNOWN_TYPE:
         anchor = log_token(scenario.token)
@@ -226,9 +209,8 @@ class _Log:
         own: list[bytes | None] = [prefix + i.to_bytes(4, "big") for i in range(len(row))]
         own.append(None)  # number -1: no neighbour
         velocities = np.nan_to_num(tracks.velocities[row, track])
-        values = np.column_stack(
-            [tracks.poses[row, track], tracks.sizes[row, track], velocities]
-        ).tolist()
+        boxes = [tracks.poses[row, track], tracks.sizes[row, track], velocities]
+        values = np.column_stack(boxes).tolist()
         lines: Rows = []
         for i, (at, who) in enumerate(zip(row.tolist(), track.tolist(), strict=True)):
             x, y, heading, length, width, vx, vy = values[i]
@@ -237,40 +219,32 @@ class _Log:
             sizes = (width, length, height)
             lines.append((*links, x, y, height / 2.0, *sizes, vx, vy, 0.0, heading, 1.0))
         first = np.argmax(tracks.valid, axis=0) if len(names) else np.zeros(0, np.int64)
-        sizes_of = tracks.sizes[first, np.arange(len(names))].tolist()
-        kinds = [self.categories[AgentKind(kind)] for kind in tracks.kinds.tolist()]
-        listed: Rows = [
-            (name, kind, width, length, height)
-            for name, kind, (length, width), height in zip(
-                names, kinds, sizes_of, heights, strict=True
-            )
-        ]
+        listed: Rows = []
+        for who, name in enumerate(names):
+            length, width = tracks.sizes[first[who], who].tolist()
+            kind = self.categories[AgentKind(tracks.kinds[who])]
+            listed.append((name, kind, width, length, heights[who]))
         return listed, lines
 
     def _track_tokens(self) -> list[bytes]:
         """A number becomes the token of that value, so that it can be read."""
+        names = self.scenario.tracks.tokens
         out = [
             int(name).to_bytes(8, "big") if name.isdecimal() and len(name) < 16 else log_token(name)
-            for name in self.scenario.tracks.tokens
+            for name in names
         ]
-        if len(set(out)) == len(out):
-            return out
-        return [self.make(f"track {name}") for name in self.scenario.tracks.tokens]
+        return out if len(set(out)) == len(out) else [self.make(f"track {name}") for name in names]
 
     def lights(self) -> Rows:
         lights = self.scenario.traffic_lights
         row, connector = np.nonzero(lights.status != LightStatus.ABSENT)
         codes = lights.status[row, connector].tolist()
         names = [self._integer(name) for name in lights.connector_ids]
-        return [
-            (
-                self.make(f"light {at} {which}"),
-                self.samples[at],
-                names[which],
-                LightStatus(code).name.lower(),
-            )
-            for at, which, code in zip(row.tolist(), connector.tolist(), codes, strict=True)
-        ]
+        out: Rows = []
+        for at, which, code in zip(row.tolist(), connector.tolist(), codes, strict=True):
+            token, status = self.make(f"light {at} {which}"), LightStatus(code).name.lower()
+            out.append((token, self.samples[at], names[which], status))
+        return out
 
     def _integer(self, name: str) -> int:
         try:

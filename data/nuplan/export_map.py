@@ -1,6 +1,6 @@
 """VectorMap -> nuPlan's map.gpkg."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 
@@ -15,64 +15,38 @@ from shiftsim.world.map import NONE, VectorMap
 
 # A map in a local frame goes to the origin of this zone: only metres matter, and they stay.
 LOCAL_EPSG = 32632
-_HINT = "nuPlan's format has integer ids, and lane - connector - lane, always"
 
-_POLYGON, _LINE = "POLYGON", "LINESTRING"
-# Layers with their columns; `name` is text, `name:i` an integer, `name:r` a real; `=` and what is
-# written everywhere; else it is NULL.
-_LAYERS: dict[str, tuple[str, str]] = {
-    "baseline_paths": (
-        _LINE,
-        "path_type_fid:i=0 creator_id lane_fid:i lane_connector_fid:i dubins_node_fids",
-    ),
-    "boundaries": (
-        _LINE,
-        "boundary_segment_fids= has_reflectors:i=0 boundary_type_fid:i=2 creator_id",
-    ),
-    "carpark_areas": (_POLYGON, "heading:r=0.0 creator_id"),
-    "crosswalks": (_POLYGON, "intersection_fids= lane_fids= creator_id is_marked:i=1"),
-    "dubins_nodes": ("POINT", "radius:r heading:r creator_id"),
-    "gen_lane_connectors_scaled_width_polygons": (
-        _POLYGON,
-        "baseline_path_fid:i lane_connector_fid:i from_edge_fid:i to_edge_fid:i"
-        " left_boundary_fid:i right_boundary_fid:i",
-    ),
-    "generic_drivable_areas": (_POLYGON, "creator_id"),
-    "intersections": (_POLYGON, "creator_id intersection_type_fid:i is_mini:i=0"),
-    "lane_connectors": (
-        _LINE,
-        "exit_lane_group_fid:i exit_lane_fid:i entry_lane_group_fid:i lane_group_connector_fid:i"
-        " entry_lane_fid:i intersection_fid:i turn_type_fid:i bulb_fids="
-        " traffic_light_stop_line_fids overlap:i=0 creator_id left_has_reflectors:i=0"
-        " right_has_reflectors:i=0 speed_limit_mps:r",
-    ),
-    "lane_group_connectors": (
-        _POLYGON,
-        "intersection_fid:i from_lane_group_fid:i to_lane_group_fid:i creator_id from_edge_fid:i"
-        " to_edge_fid:i left_boundary_fid:i right_boundary_fid:i",
-    ),
-    "lane_groups_polygons": (
-        _POLYGON,
-        "creator_id left_boundary_fid:i right_boundary_fid:i from_edge_fid:i to_edge_fid:i",
-    ),
-    "lanes_polygons": (
-        _POLYGON,
-        "lane_group_fid:i lane_fid:i lane_index:i creator_id name road_type_fid:i=1 lane_type_fid:i"
-        " width:i left_offset:r right_offset:r min_speed:r max_speed:r stops:i"
-        " left_boundary_fid:i right_boundary_fid:i speed_limit_mps:r left_has_reflectors:i=0"
-        " right_has_reflectors:i=0 from_edge_fid:i to_edge_fid:i",
-    ),
-    "road_segments": (_POLYGON, "lane_group_fids="),
-    "stop_polygons": (
-        _POLYGON,
-        "stop_polygon_type_fid:i lane_group_fid:i lane_fids= lane_connector_fids"
-        " traffic_light_fids= crosswalk_fids= precedence_area_fids creator_id",
-    ),
-    "traffic_lights": (
-        "POINT",
-        "traffic_light_type_fid:i intersection_fid:i heading:r creator_id",
-    ),
-    "walkways": (_POLYGON, "creator_id"),
+# Layers with their geometry and columns; `name` is text, `name:i` an integer, `name:r` a real; `=`
+# and what is written everywhere; else it is NULL.
+_LAYERS = {
+    "baseline_paths": "LINESTRING path_type_fid:i=0 creator_id lane_fid:i lane_connector_fid:i"
+    " dubins_node_fids",
+    "boundaries": "LINESTRING boundary_segment_fids= has_reflectors:i=0 boundary_type_fid:i=2"
+    " creator_id",
+    "carpark_areas": "POLYGON heading:r=0.0 creator_id",
+    "crosswalks": "POLYGON intersection_fids= lane_fids= creator_id is_marked:i=1",
+    "dubins_nodes": "POINT radius:r heading:r creator_id",
+    "gen_lane_connectors_scaled_width_polygons": "POLYGON baseline_path_fid:i lane_connector_fid:i"
+    " from_edge_fid:i to_edge_fid:i left_boundary_fid:i right_boundary_fid:i",
+    "generic_drivable_areas": "POLYGON creator_id",
+    "intersections": "POLYGON creator_id intersection_type_fid:i is_mini:i=0",
+    "lane_connectors": "LINESTRING exit_lane_group_fid:i exit_lane_fid:i entry_lane_group_fid:i"
+    " lane_group_connector_fid:i entry_lane_fid:i intersection_fid:i turn_type_fid:i bulb_fids="
+    " traffic_light_stop_line_fids overlap:i=0 creator_id left_has_reflectors:i=0"
+    " right_has_reflectors:i=0 speed_limit_mps:r",
+    "lane_group_connectors": "POLYGON intersection_fid:i from_lane_group_fid:i to_lane_group_fid:i"
+    " creator_id from_edge_fid:i to_edge_fid:i left_boundary_fid:i right_boundary_fid:i",
+    "lane_groups_polygons": "POLYGON creator_id left_boundary_fid:i right_boundary_fid:i"
+    " from_edge_fid:i to_edge_fid:i",
+    "lanes_polygons": "POLYGON lane_group_fid:i lane_fid:i lane_index:i creator_id name"
+    " road_type_fid:i=1 lane_type_fid:i width:i left_offset:r right_offset:r min_speed:r"
+    " max_speed:r stops:i left_boundary_fid:i right_boundary_fid:i speed_limit_mps:r"
+    " left_has_reflectors:i=0 right_has_reflectors:i=0 from_edge_fid:i to_edge_fid:i",
+    "road_segments": "POLYGON lane_group_fids=",
+    "stop_polygons": "POLYGON stop_polygon_type_fid:i lane_group_fid:i lane_fids="
+    " lane_connector_fids traffic_light_fids= crosswalk_fids= precedence_area_fids creator_id",
+    "traffic_lights": "POINT traffic_light_type_fid:i intersection_fid:i heading:r creator_id",
+    "walkways": "POLYGON creator_id",
 }
 _TYPES = {"": ("TEXT", str), "i": ("INTEGER", int), "r": ("REAL", float)}
 
@@ -83,17 +57,12 @@ def epsg_of(road: VectorMap) -> int:
 
 
 def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
-    """Write a map in nuPlan's layers. Ids stay as they are.
-
-    Args:
-        path: The file `map.gpkg`.
-        road: The map.
-        version: Version of the map.
+    """Write a map in nuPlan's layers as `map.gpkg`. Ids stay as they are.
 
     Raises:
         ConversionError: The map has something that nuPlan's format has no place for.
     """
-    layers = {name: _layer(name, kind, columns) for name, (kind, columns) in _LAYERS.items()}
+    layers = {name: _layer(name, *text.split()) for name, text in _LAYERS.items()}
     _Writer(road, layers).write()
     meta = {
         "map_version": version,
@@ -103,9 +72,9 @@ def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
     write_geopackage(path, list(layers.values()), epsg=epsg_of(road), meta=meta)
 
 
-def _layer(name: str, kind: str, columns: str) -> FeatureLayer:
+def _layer(name: str, kind: str, *columns: str) -> FeatureLayer:
     layer = FeatureLayer(name, kind, {}, {})
-    for text in columns.split():
+    for text in columns:
         head, has_default, default = text.partition("=")
         column, _, letter = head.partition(":")
         layer.columns[column], number = _TYPES[letter]
@@ -138,7 +107,11 @@ class _Writer:
                 return int(name)
         except ValueError:
             pass
-        raise ConversionError(f"map {self.road.name!r}: id {name!r} cannot be exported", hint=_HINT)
+        raise self._refusal(f"id {name!r} cannot be exported")
+
+    def _refusal(self, what: str) -> ConversionError:
+        hint = "nuPlan's format has integer ids, and lane - connector - lane, always"
+        return ConversionError(f"map {self.road.name!r}: {what}", hint)
 
     def _add(self, layer: str, fid: int, shape: shapely.Geometry, **values: Value) -> None:
         self.layers[layer].rows.append((fid, shape, values))
@@ -157,33 +130,26 @@ class _Writer:
             for stop in road.stop_lines.at(edge).tolist():
                 governed.setdefault(stop, []).append(name)
         for fid, shape, at in self._areas(road.stop_polygons):
-            self._add(
-                "stop_polygons",
-                fid,
-                shape,
-                stop_polygon_type_fid=int(road.stop_kinds[at]),
-                lane_connector_fids=",".join(governed.get(at, [])),
-            )
-        for name, layer in (
-            ("crosswalks", road.crosswalks),
-            ("walkways", road.walkways),
-            ("carpark_areas", road.car_parks),
-        ):
-            for fid, shape, _ in self._areas(layer):
-                self._add(name, fid, shape)
+            kind, owners = int(road.stop_kinds[at]), ",".join(governed.get(at, []))
+            values: dict[str, Value] = {
+                "stop_polygon_type_fid": kind,
+                "lane_connector_fids": owners,
+            }
+            self._add("stop_polygons", fid, shape, **values)
+        self._add_areas("crosswalks", road.crosswalks)
+        self._add_areas("walkways", road.walkways)
+        self._add_areas("carpark_areas", road.car_parks)
         self._drivable()
 
     def _lane(self, edge: int) -> None:
         road, fid = self.road, self.edges[edge]
         for other in (*road.incoming.at(edge), *road.outgoing.at(edge)):
             if not road.is_connector(int(other)):  # nuPlan rule 427
-                raise ConversionError(
-                    f"map {road.name!r}: lane {road.edges.ids[edge]!r} is linked to lane"
-                    f" {road.edges.ids[int(other)]!r} without a connector",
-                    hint=_HINT,
+                raise self._refusal(
+                    f"lane {road.edges.ids[edge]!r} is linked to lane"
+                    f" {road.edges.ids[int(other)]!r} without a connector"
                 )
         self._baseline(edge, "lane_fid")
-        left, right = self._boundaries(edge)
         index = int(road.lane_index[edge])
         self._add(
             "lanes_polygons",
@@ -193,8 +159,7 @@ class _Writer:
             lane_fid=fid,
             lane_index=None if index == NONE else index,
             lane_type_fid=int(road.is_bike[edge]),
-            left_boundary_fid=left,
-            right_boundary_fid=right,
+            **self._boundaries(edge),
             speed_limit_mps=self._speed(edge),
         )
 
@@ -205,7 +170,7 @@ class _Writer:
             for links in (road.incoming, road.outgoing)
         )
         baseline = self._baseline(edge, "lane_connector_fid")
-        left, right = self._boundaries(edge)
+        boundaries = self._boundaries(edge)
         self._add(
             "lane_connectors",
             fid,
@@ -226,17 +191,13 @@ class _Writer:
             road.edges.shape(edge),
             baseline_path_fid=baseline,
             lane_connector_fid=fid,
-            left_boundary_fid=left,
-            right_boundary_fid=right,
+            **boundaries,
         )
 
     def _single(self, name: str, links: list[int]) -> int | None:
         """The lane at one end of a connector."""
         if len(links) > 1 or any(self.road.is_connector(edge) for edge in links):
-            raise ConversionError(
-                f"map {self.road.name!r}: connector {name!r} does not join one lane to one lane",
-                hint=_HINT,
-            )
+            raise self._refusal(f"connector {name!r} does not join one lane to one lane")
         return links[0] if links else None
 
     def _lit_stop_lines(self, edge: int) -> str:
@@ -260,12 +221,12 @@ class _Writer:
         self._add("baseline_paths", fid, line, **{owner: self.edges[edge]})
         return fid
 
-    def _boundaries(self, edge: int) -> list[int | None]:
-        road = self.road
-        pair = zip(
-            road.boundary_ids[edge], (road.left_boundaries, road.right_boundaries), strict=True
-        )
-        return [self._boundary(name, lines, edge) for name, lines in pair]
+    def _boundaries(self, edge: int) -> dict[str, int | None]:
+        road, (left, right) = self.road, self.road.boundary_ids[edge]
+        return {
+            "left_boundary_fid": self._boundary(left, road.left_boundaries, edge),
+            "right_boundary_fid": self._boundary(right, road.right_boundaries, edge),
+        }
 
     def _boundary(self, name: str, lines: Polylines, edge: int) -> int | None:
         if lines.ptr[edge + 1] - lines.ptr[edge] < 2:
@@ -284,14 +245,10 @@ class _Writer:
         if block < road.num_roadblocks:
             self._add("lane_groups_polygons", fid, shape)
             return
-        name = road.blocks.ids[block]
         ends = [links.at(block).tolist() for links in (road.block_incoming, road.block_outgoing)]
         if any(len(end) > 1 or any(b >= road.num_roadblocks for b in end) for end in ends):
-            raise ConversionError(
-                f"map {road.name!r}: roadblock connector {name!r} does not join one roadblock to"
-                " one roadblock",
-                hint=_HINT,
-            )
+            name = f"roadblock connector {road.blocks.ids[block]!r}"
+            raise self._refusal(f"{name} does not join one roadblock to one roadblock")
         members = road.block_edges.at(block).tolist()
         crossings = [int(c) for c in road.intersection_of[members] if c != NONE]
         self._add(
@@ -305,21 +262,18 @@ class _Writer:
 
     def _areas(
         self, layer: Layer, keep: Iterable[int] | None = None
-    ) -> list[tuple[int, shapely.Geometry, int]]:
+    ) -> Iterator[tuple[int, shapely.Geometry, int]]:
         """Id, shape and first position; pieces of one id are one row."""
         pieces: dict[int, list[int]] = {}
         for at in range(len(layer)) if keep is None else keep:
             pieces.setdefault(self._fid(layer.ids[at]), []).append(at)
-        return [
-            (
-                fid,
-                layer.shape(places[0])
-                if len(places) == 1
-                else shapely.MultiPolygon([layer.shape(at) for at in places]),
-                places[0],
-            )
-            for fid, places in pieces.items()
-        ]
+        for fid, places in pieces.items():
+            shapes = [layer.shape(at) for at in places]
+            yield fid, shapes[0] if len(shapes) == 1 else shapely.MultiPolygon(shapes), places[0]
+
+    def _add_areas(self, name: str, layer: Layer, keep: Iterable[int] | None = None) -> None:
+        for fid, shape, _ in self._areas(layer, keep):
+            self._add(name, fid, shape)
 
     def _drivable(self) -> None:
         """What is drivable besides intersections and car parks, which count as such."""
@@ -333,10 +287,8 @@ class _Writer:
         # nuPlan rule 421: road segments, intersections, generic areas and car parks, in this order
         first = next((at for at, owner in enumerate(owners) if owner is not None), len(layer))
         rest = [at for at, owner in enumerate(owners) if owner is None]
-        for fid, shape, _ in self._areas(layer, [at for at in rest if at < first]):
-            self._add("road_segments", fid, shape)
-        for fid, shape, _ in self._areas(layer, [at for at in rest if at > first]):
-            self._add("generic_drivable_areas", fid, shape)
+        self._add_areas("road_segments", layer, [at for at in rest if at < first])
+        self._add_areas("generic_drivable_areas", layer, [at for at in rest if at > first])
 
 
 def _at(fids: Sequence[int], index: int | None = NONE) -> int | None:

@@ -47,13 +47,9 @@ def read_filter(path: Path) -> ScenarioFilter:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not readable: {error}", hint="check the path") from error
     if Path(path).suffix not in (".yaml", ".yml"):
-        return ScenarioFilter(tokens=_token_list(path, text))
+        lines = [line.split("#")[0].strip() for line in text.splitlines()]
+        return ScenarioFilter(tokens=_tokens(path, [line for line in lines if line]))
     return _from_values(path, _read_yaml(path, text))
-
-
-def _token_list(path: Path, text: str) -> frozenset[str]:
-    lines = [line.split("#")[0].strip() for line in text.splitlines()]
-    return _tokens(path, [line for line in lines if line])
 
 
 def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
@@ -127,9 +123,8 @@ def _read_yaml(path: Path, text: str) -> dict[str, Any]:
         values = yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         line = 0 if error.problem_mark is None else error.problem_mark.line + 1
-        raise ConfigError(
-            f"{path}: line {line}: {error.problem}", hint="repair the YAML there"
-        ) from error
+        what = f"{path}: line {line}: {error.problem}"
+        raise ConfigError(what, hint="repair the YAML there") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not YAML: {error}", hint="check the path") from error
     if not isinstance(values, dict):

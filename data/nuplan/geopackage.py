@@ -72,35 +72,27 @@ class GeoPackage:
     def _epsg(self, system: object) -> int:
         name, _, code = str(system).lower().partition(":")
         if name != "epsg" or not code.isdigit():
-            raise DataError(
-                f"{self.path}: table 'meta': projectedCoordSystem is {system!r}, not 'epsg:<code>'",
-                hint=REPAIR,
-            )
+            what = f"projectedCoordSystem is {system!r}, not 'epsg:<code>'"
+            raise DataError(f"{self.path}: table 'meta': {what}", REPAIR)
         return int(code)
 
-    def table(
-        self, name: str, columns: Sequence[str] = (), extra: Sequence[str] = ()
-    ) -> LayerTable:
-        """A layer with the columns named; those in `extra` may be missing.
+    def table(self, name: str, columns: str = "", extra: str = "") -> LayerTable:
+        """A layer with the columns named, separated by blanks; those in `extra` may be missing.
 
         Raises:
             DataError: The layer or a column is missing, or a geometry is broken.
         """
-        raw = self.database.columns(name, ["fid", "geom", *columns], extra)
+        raw = self.database.columns(name, ["fid", "geom", *columns.split()], extra.split())
+        where = f"{self.path}: layer {name!r}"
         bodies = [self._wkb(b, name, f) for f, b in zip(raw["fid"], raw["geom"], strict=True)]
         try:
             shapes = shapely.force_2d(shapely.from_wkb(np.array(bodies, object)))
             xy = shapely.get_coordinates(shapes)
             x, y = self._project.transform(xy[:, 0], xy[:, 1])
         except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
-            raise DataError(
-                f"{self.path}: layer {name!r}: broken geometry: {error}", hint=REPAIR
-            ) from error
+            raise DataError(f"{where}: broken geometry: {error}", REPAIR) from error
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
-            raise DataError(
-                f"{self.path}: layer {name!r}: a coordinate is not finite in epsg:{self.epsg}",
-                hint=REPAIR,
-            )
+            raise DataError(f"{where}: a coordinate is not finite in epsg:{self.epsg}", REPAIR)
         projected = shapely.set_coordinates(shapes, np.column_stack([x, y]))
         ids = [_id(v, name, "fid") for v in raw["fid"]]
         return LayerTable(name, ids, list(projected), raw)
@@ -114,9 +106,7 @@ class GeoPackage:
             raise DataError(f"{where} is empty or of an unknown kind", hint=REPAIR)
         (system,) = struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])
         if system != _WGS84:
-            raise DataError(
-                f"{where} has the coordinate system {system}, not {_WGS84}", hint=REPAIR
-            )
+            raise DataError(f"{where} has the coordinate system {system}, not {_WGS84}", REPAIR)
         return blob[8 + _ENVELOPE_BYTES[envelope] :]
 
 
@@ -137,9 +127,7 @@ def _id(value: object, layer: str, column: str) -> str:
             return str(int(value)) if not isinstance(value, float) else str(int(number))  # type: ignore[call-overload]
     except (TypeError, ValueError, OverflowError):
         pass
-    raise DataError(
-        f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", hint=REPAIR
-    )
+    raise DataError(f"layer {layer!r}: column {column!r} holds {value!r}, not an integer", REPAIR)
 
 
 @dataclass
@@ -157,14 +145,7 @@ class FeatureLayer:
 def write_geopackage(
     path: Path, layers: Sequence[FeatureLayer], *, epsg: int, meta: Mapping[str, str]
 ) -> None:
-    """Write layers in longitude and latitude.
-
-    Args:
-        path: The file; it is replaced.
-        layers: The layers, geometries in metres.
-        epsg: Code of the metric system of the geometries.
-        meta: Content of the table `meta`.
-    """
+    """Write layers in longitude and latitude; `epsg` is the metric system of their geometries."""
     tables = dict(_SYSTEM_TABLES)
     wgs84 = pyproj.CRS(_WGS84).to_wkt("WKT1_GDAL")
     rows: dict[str, list[Sequence[Value]]] = {
@@ -184,13 +165,11 @@ def write_geopackage(
         rows["gpkg_geometry_columns"].append((layer.name, "geom", kind, _WGS84, 0, 0))
         columns = "".join(f', "{name}" {sql}' for name, sql in layer.columns.items())
         tables[layer.name] = f'{_FID}, "geom" {kind}{columns}'
-        blobs = _blobs(shapes)
         rows[layer.name] = [
             (fid, blob, *(values.get(name, layer.defaults.get(name)) for name in layer.columns))
-            for (fid, _, values), blob in zip(layer.rows, blobs, strict=True)
+            for (fid, _, values), blob in zip(layer.rows, _blobs(shapes), strict=True)
         ]
-    no_bounds = (None,) * 5
-    rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *no_bounds))
+    rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *[None] * 5))
     tables["meta"] = f'{_FID}, "key" TEXT, "value" TEXT'
     rows["meta"] = [(i, *item) for i, item in enumerate(meta.items(), 1)]
     header = (f"PRAGMA application_id = {_APPLICATION_ID}", f"PRAGMA user_version = {_VERSION}")
@@ -211,14 +190,7 @@ def _projected(layer: FeatureLayer, epsg: int) -> tuple[np.ndarray, str]:
 
 
 def _blobs(shapes: np.ndarray) -> list[bytes]:
+    envelopes = shapely.bounds(shapes)[:, [0, 2, 1, 3]].tolist()  # low and high x, low and high y
+    head = ("<2sBBi4d", b"GP", 0, _LITTLE_ENDIAN_WITH_ENVELOPE, _WGS84)
     bodies = shapely.to_wkb(shapes, byte_order=1)
-    return [
-        b"GP"
-        + struct.pack(
-            "<BBi4d", 0, _LITTLE_ENDIAN_WITH_ENVELOPE, _WGS84, low_x, high_x, low_y, high_y
-        )
-        + body
-        for (low_x, low_y, high_x, high_y), body in zip(
-            shapely.bounds(shapes).tolist(), bodies, strict=True
-        )
-    ]
+    return [struct.pack(*head, *e) + body for e, body in zip(envelopes, bodies, strict=True)]

@@ -20,31 +20,24 @@ from shiftsim.world.state import NUM_STATE, LightStatus, TrafficLights
 LIDAR_CHANNEL = "MergedPointCloud"
 _REPAIR = "the log is damaged or not a nuPlan log; get it again from its source"
 _TABLES = {
-    "log": ("map_version",),
-    "lidar": ("token", "channel"),
-    "lidar_pc": (
-        "token",
-        "next_token",
-        "ego_pose_token",
-        "lidar_token",
-        "scene_token",
-        "timestamp",
-    ),
-    "ego_pose": (
-        "token", "x", "y", "qw", "qx", "qy", "qz", "vx", "vy", "acceleration_x", "acceleration_y"
-    ),
-    "scene": ("token", "name", "goal_ego_pose_token", "roadblock_ids"),
-    "category": ("token", "name"),
-    "track": ("token", "category_token"),
-    "lidar_box": (
-        "lidar_pc_token", "track_token", "x", "y", "yaw", "vx", "vy", "length", "width", "height"
-    ),
-    "scenario_tag": ("lidar_pc_token", "type"),
-    "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
-}  # fmt: skip
+    "log": "map_version",
+    "lidar": "token channel",
+    "lidar_pc": "token next_token ego_pose_token lidar_token scene_token timestamp",
+    "ego_pose": "token x y qw qx qy qz vx vy acceleration_x acceleration_y",
+    "scene": "token name goal_ego_pose_token roadblock_ids",
+    "category": "token name",
+    "track": "token category_token",
+    "lidar_box": "lidar_pc_token track_token x y yaw vx vy length width height",
+    "scenario_tag": "lidar_pc_token type",
+    "traffic_light_status": "lidar_pc_token lane_connector_id status",
+}
 _LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
 _UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
 _IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
+
+
+def _damaged(path: Path, what: str, kind: type[DataError] = DataError) -> DataError:
+    return kind(f"{path}: {what}", _REPAIR)
 
 
 @dataclass
@@ -79,7 +72,7 @@ def open_log(path: Path) -> Iterator[Log]:
     """
     with open_database(Path(path)) as database:
         for table, columns in _TABLES.items():
-            database.require(table, columns)
+            database.require(table, columns.split())
         yield _read_clock(database)
 
 
@@ -87,7 +80,7 @@ def _read_clock(database: Database) -> Log:
     path = database.path
     maps = database.query("SELECT map_version FROM log", "table 'log'")
     if not maps or not isinstance(maps[0][0], str):
-        raise DataError(f"{path}: table 'log' names no map in map_version", hint=_REPAIR)
+        raise _damaged(path, "table 'log' names no map in map_version")
     lidars = database.query("SELECT token FROM lidar WHERE channel = ?", "lidar", [LIDAR_CHANNEL])
     if not lidars:
         raise DataError(
@@ -101,7 +94,7 @@ def _read_clock(database: Database) -> Log:
         [LIDAR_CHANNEL],
     )
     if not rows:
-        raise DataError(f"{path}: table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}", hint=_REPAIR)
+        raise _damaged(path, f"table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}")
     tokens = [token_text(row[0], path, "lidar_pc") for row in rows]
     time_us = _check_clock(path, tokens, rows)
     tags = dict(  # nuPlan rule 418: the largest of several tags
@@ -128,29 +121,23 @@ def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]])
     try:
         time_us = np.array([row[1] for row in rows], np.int64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            f"{path}: lidar_pc.timestamp is not an integer: {error}", hint=_REPAIR
-        ) from error
+        raise _damaged(path, f"lidar_pc.timestamp is not an integer: {error}") from error
     twice = np.flatnonzero(np.diff(time_us) <= 0)
     if len(twice):
-        token = tokens[int(twice[0]) + 1]
-        raise DataError(
-            f"{path}: lidar_pc {token!r}: time stamp {time_us[twice[0]]} occurs twice", hint=_REPAIR
-        )
+        at = int(twice[0])
+        raise _damaged(path, f"lidar_pc {tokens[at + 1]!r}: time stamp {time_us[at]} occurs twice")
     row_of = {row[0]: index for index, row in enumerate(rows)}
     for index, row in enumerate(rows):
         if row_of.get(row[3], index + 1) <= index:
-            raise DataError(
-                f"{path}: lidar_pc {tokens[index]!r}: its next row has an earlier time stamp",
-                hint=_REPAIR,
-            )
+            what = f"lidar_pc {tokens[index]!r}: its next row has an earlier time stamp"
+            raise _damaged(path, what)
     return time_us
 
 
 def token_text(value: object, path: Path, table: str) -> str:
     """A token of the file as 16 hexadecimal digits."""
     if not isinstance(value, bytes):
-        raise DataError(f"{path}: table {table!r}: token {value!r} is not a blob", hint=_REPAIR)
+        raise _damaged(path, f"table {table!r}: token {value!r} is not a blob")
     return value.hex()
 
 
@@ -159,9 +146,7 @@ def as_numbers(path: Path, what: str, rows: Sequence[Sequence[object]]) -> Float
     try:
         return np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
-        raise DataError(
-            f"{path}: {what} holds something that is no number: {error}", hint=_REPAIR
-        ) from error
+        raise _damaged(path, f"{what} holds something that is no number: {error}") from error
 
 
 def has_goals(log: Log) -> BoolArray:
@@ -183,9 +168,8 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
         [log.scenes[row]],
     )
     if not found:
-        raise ConversionError(
-            f"{log.path}: lidar_pc {log.tokens[row]!r} belongs to an unknown scene", hint=_REPAIR
-        )
+        what = f"lidar_pc {log.tokens[row]!r} belongs to an unknown scene"
+        raise _damaged(log.path, what, ConversionError)
     text, *goal = found[0]
     # nuPlan rule 412: split at blanks
     route = tuple(part for part in str(text or "").split(" ") if part)
@@ -193,9 +177,8 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
         return route, None
     pose = as_numbers(log.path, "ego_pose of a goal", [goal])
     if not np.isfinite(pose).all():
-        raise ConversionError(
-            f"{log.path}: the goal of {log.tokens[row]!r} is not finite", hint=_REPAIR
-        )
+        what = f"the goal of {log.tokens[row]!r} is not finite"
+        raise _damaged(log.path, what, ConversionError)
     return route, np.array([pose[0, 0], pose[0, 1], _yaw(pose[:, 2:])[0]])
 
 
@@ -221,11 +204,9 @@ def read_ego(log: Log, first: int, last: int) -> FloatArray:
         joins="JOIN ego_pose AS e ON pc.ego_pose_token = e.token",
     )
     if [row[0] for row in rows] != log.time_us[first:last].tolist():
-        raise ConversionError(
-            f"{log.path}: between {log.tokens[first]!r} and {log.tokens[last - 1]!r} a row of"
-            " 'lidar_pc' names an unknown ego_pose",
-            hint=_REPAIR,
-        )
+        between = f"between {log.tokens[first]!r} and {log.tokens[last - 1]!r}"
+        what = f"{between} a row of 'lidar_pc' names an unknown ego_pose"
+        raise _damaged(log.path, what, ConversionError)
     values = as_numbers(log.path, "ego_pose", [row[1:] for row in rows])
     with np.errstate(invalid="ignore"):
         heading = _yaw(values[:, 2:6])
@@ -245,13 +226,8 @@ def read_rows(
 ) -> list[tuple[Any, ...]]:
     """Time stamp and columns of what belongs to the rows first … last - 1, ordered by time.
 
-    Args:
-        log: The log.
-        first: First row.
-        last: One past the last row.
-        columns: Columns as SQL has them.
-        joins: Tables besides `lidar_pc` (`pc`) and `lidar` (`l`); the first one is named in errors.
-        order: Column that orders what has one time stamp.
+    `joins` are tables besides `lidar_pc` (`pc`) and `lidar` (`l`), and errors name the first one;
+    the column `order` orders what has one time stamp.
     """
     sql = (
         f"SELECT pc.timestamp, {columns} FROM lidar_pc AS pc"
@@ -277,10 +253,9 @@ def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> Traffic
     connector = [index.setdefault(str(row[1]), len(index)) for row in rows]
     frame = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64)) - first
     status = np.full((last - first, len(index)), int(LightStatus.ABSENT), np.int8)
-    status[frame, np.array(connector, np.int64)] = [
-        int(_LIGHTS.get(row[2], LightStatus.UNKNOWN))  # nuPlan rule 428
-        for row in rows
-    ]
+    # nuPlan rule 428
+    codes = [int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows]
+    status[frame, np.array(connector, np.int64)] = codes
     twice = len(rows) - int((status != LightStatus.ABSENT).sum())
     flaws["traffic light listed twice in a frame: the last one is kept"] += twice
     return TrafficLights(tuple(index), status)

@@ -24,14 +24,9 @@ _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", 
 
 
 def read_map(path: Path, name: str) -> VectorMap:
-    """Read a nuPlan map.
+    """Read a nuPlan map from `map.gpkg`; it is in metres.
 
-    Args:
-        path: The file `map.gpkg`.
-        name: Name of the map (city).
-
-    Returns:
-        The map in metres. Flaws that nuPlan tolerates are counted in its `flaws`.
+    Flaws that nuPlan tolerates are counted in its `flaws`.
 
     Raises:
         DataError: The file, a layer or a column is missing or broken.
@@ -51,18 +46,13 @@ def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
     flaws: Counter[str] = Counter()
     boundaries = _lines(gpkg.table("boundaries"))
     baselines = _baselines(gpkg)
-    intersections = gpkg.table("intersections", extra=["intersection_type_fid"])
-    stops = gpkg.table("stop_polygons", ["stop_polygon_type_fid"])
+    intersections = gpkg.table("intersections", extra="intersection_type_fid")
+    stops = gpkg.table("stop_polygons", "stop_polygon_type_fid")
     connectors = gpkg.table(
         "lane_connectors",
-        [
-            "exit_lane_fid",
-            "entry_lane_fid",
-            "lane_group_connector_fid",
-            "speed_limit_mps",
-            "traffic_light_stop_line_fids",
-        ],
-        ["intersection_fid", "turn_type_fid"],
+        "exit_lane_fid entry_lane_fid lane_group_connector_fid speed_limit_mps"
+        " traffic_light_stop_line_fids",
+        extra="intersection_fid turn_type_fid",
     )
     edges = [
         *_lanes(gpkg, baselines, boundaries, connectors, flaws),
@@ -93,22 +83,17 @@ def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:
 def _lines(table: LayerTable) -> dict[str, FloatArray]:
     for fid, shape in zip(table.ids, table.shapes, strict=True):
         if shape.geom_type != "LineString":
-            raise DataError(
-                f"layer {table.name!r}: geometry of fid {fid} is a {shape.geom_type}", hint=REPAIR
-            )
-    return {
-        fid: shapely.get_coordinates(shape)
-        for fid, shape in zip(table.ids, table.shapes, strict=True)
-    }
+            what = f"geometry of fid {fid} is a {shape.geom_type}"
+            raise DataError(f"layer {table.name!r}: {what}", hint=REPAIR)
+    return dict(zip(table.ids, map(shapely.get_coordinates, table.shapes), strict=True))
 
 
 def _baselines(gpkg: GeoPackage) -> dict[str, FloatArray]:
-    table = gpkg.table("baseline_paths", ["lane_fid", "lane_connector_fid"])
-    lines = _lines(table)
-    out: dict[str, FloatArray] = {}
-    lanes, connectors = table.text_ids("lane_fid"), table.text_ids("lane_connector_fid")
-    for fid, lane, connector in zip(table.ids, lanes, connectors, strict=True):
-        for owner in (lane, connector):
+    table = gpkg.table("baseline_paths", "lane_fid lane_connector_fid")
+    lines, out = _lines(table), dict[str, FloatArray]()
+    owners = table.text_ids("lane_fid"), table.text_ids("lane_connector_fid")
+    for fid, *pair in zip(table.ids, *owners, strict=True):
+        for owner in pair:
             if owner is not None:
                 out.setdefault(owner, lines[fid])
     return out
@@ -123,15 +108,8 @@ def _lanes(
 ) -> list[EdgeSpec]:
     table = gpkg.table(
         "lanes_polygons",
-        [
-            "lane_fid",
-            "lane_group_fid",
-            "lane_index",
-            "left_boundary_fid",
-            "right_boundary_fid",
-            "speed_limit_mps",
-        ],
-        ["lane_type_fid"],
+        "lane_fid lane_group_fid lane_index left_boundary_fid right_boundary_fid speed_limit_mps",
+        extra="lane_type_fid",
     )
     outgoing = _group(connectors.text_ids("exit_lane_fid"), connectors.ids)
     incoming = _group(connectors.text_ids("entry_lane_fid"), connectors.ids)
@@ -148,7 +126,7 @@ def _lanes(
             id=fid,
             is_connector=False,
             polygon=_one_polygon(table, row, flaws),
-            baseline=_find(baselines, fid, "lane", "baseline"),
+            baseline=_find(baselines, fid, "lane"),
             block_id=groups[row] or "",
             incoming=incoming.get(fid, []),
             outgoing=outgoing.get(fid, []),
@@ -173,7 +151,7 @@ def _connectors(
 ) -> list[EdgeSpec]:
     areas = gpkg.table(
         "gen_lane_connectors_scaled_width_polygons",
-        ["lane_connector_fid", "left_boundary_fid", "right_boundary_fid"],
+        "lane_connector_fid left_boundary_fid right_boundary_fid",
     )
     row_of = {fid: row for row, fid in enumerate(table.ids)}
     owners = areas.text_ids("lane_connector_fid")
@@ -193,7 +171,7 @@ def _connectors(
             flaws["polygon of an unknown lane connector"] += 1
             continue
         row = row_of[fid]
-        baseline = _find(baselines, fid, "lane connector", "baseline")
+        baseline = _find(baselines, fid, "lane connector")
         listed = str(table.columns["traffic_light_stop_line_fids"][row] or "")
         out.append(
             EdgeSpec(
@@ -217,33 +195,18 @@ def _connectors(
 
 def _blocks(gpkg: GeoPackage, flaws: Counter[str]) -> list[BlockSpec]:
     roadblocks = gpkg.table("lane_groups_polygons")
-    links = gpkg.table(
-        "lane_group_connectors", ["from_lane_group_fid", "to_lane_group_fid", "intersection_fid"]
-    )
-    start, end = links.text_ids("from_lane_group_fid"), links.text_ids("to_lane_group_fid")
+    ends = ("from_lane_group_fid", "to_lane_group_fid")
+    links = gpkg.table("lane_group_connectors", f"{' '.join(ends)} intersection_fid")
+    start, end = (links.text_ids(name) for name in ends)
     crossings = links.text_ids("intersection_fid")
     outgoing, incoming = _group(start, links.ids), _group(end, links.ids)
-    out = [
-        BlockSpec(
-            fid,
-            False,
-            _one_polygon(roadblocks, row, flaws),
-            incoming.get(fid, []),
-            outgoing.get(fid, []),
-        )
-        for row, fid in enumerate(roadblocks.ids)
-    ]
-    out += [
-        BlockSpec(
-            fid,
-            True,
-            _one_polygon(links, row, flaws),
-            _known(start[row]),
-            _known(end[row]),
-            crossings[row],
-        )
-        for row, fid in enumerate(links.ids)
-    ]
+    out = []
+    for row, fid in enumerate(roadblocks.ids):
+        polygon = _one_polygon(roadblocks, row, flaws)
+        out.append(BlockSpec(fid, False, polygon, incoming.get(fid, []), outgoing.get(fid, [])))
+    for row, fid in enumerate(links.ids):
+        joined = _known(start[row]), _known(end[row]), crossings[row]
+        out.append(BlockSpec(fid, True, _one_polygon(links, row, flaws), *joined))
     return out
 
 
@@ -275,10 +238,10 @@ def _known(fid: str | None) -> list[str]:
     return [] if fid is None else [fid]
 
 
-def _find(lines: dict[str, FloatArray], fid: str, owner: str, what: str) -> FloatArray:
-    if fid not in lines:
-        raise DataError(f"{owner} {fid!r} has no {what}", hint=REPAIR)
-    return lines[fid]
+def _find(baselines: dict[str, FloatArray], fid: str, owner: str) -> FloatArray:
+    if fid not in baselines:
+        raise DataError(f"{owner} {fid!r} has no baseline", hint=REPAIR)
+    return baselines[fid]
 
 
 class _Borders:
@@ -303,10 +266,8 @@ def _speed(table: LayerTable, row: int) -> float | None:
     if value is None:
         return None
     if not isinstance(value, int | float):
-        raise DataError(
-            f"layer {table.name!r}: speed_limit_mps of fid {table.ids[row]} is {value!r}",
-            hint=REPAIR,
-        )
+        what = f"speed_limit_mps of fid {table.ids[row]} is {value!r}"
+        raise DataError(f"layer {table.name!r}: {what}", hint=REPAIR)
     return float(value)
 
 
@@ -320,11 +281,8 @@ def _one_polygon(table: LayerTable, row: int, flaws: Counter[str]) -> shapely.Po
 def _polygons(table: LayerTable, row: int) -> list[shapely.Polygon]:
     parts = list(shapely.get_parts(table.shapes[row]))
     if not parts or any(p.geom_type != "Polygon" or shapely.is_empty(p) for p in parts):
-        kind = table.shapes[row].geom_type
-        raise DataError(
-            f"layer {table.name!r}: geometry of fid {table.ids[row]} is a {kind} without area",
-            hint=REPAIR,
-        )
+        what = f"geometry of fid {table.ids[row]} is a {table.shapes[row].geom_type} without area"
+        raise DataError(f"layer {table.name!r}: {what}", hint=REPAIR)
     return parts
 
 

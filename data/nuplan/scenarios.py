@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,58 +41,44 @@ class ScenarioEntry:
     time_us: int  # time stamp of the anchor [us]
 
 
-def list_scenarios(
-    path: Path,
-    *,
-    tokens: frozenset[str] | None = None,
-    types: frozenset[str] | None = None,
-    remove_invalid_goals: bool = False,
-) -> list[ScenarioEntry]:
-    """The scenarios that nuPlan finds in a log, ordered by time.
-
-    Rows of the first two and of the last two scenes (by name) are not offered.
-
-    Args:
-        path: The log.
-        tokens: Only these; all where None.
-        types: Only these scenario types; all where None.
-        remove_invalid_goals: Leave out scenes without a goal.
+def list_scenarios(path: Path, **choice: Any) -> list[ScenarioEntry]:
+    """As `offered`, of the log in a file.
 
     Raises:
         DataError: The log cannot be read.
     """
     with open_log(path) as log:
-        return offered(log, tokens=tokens, types=types, remove_invalid_goals=remove_invalid_goals)
+        return offered(log, **choice)
 
 
 def offered(
     log: Log,
-    *,
     tokens: frozenset[str] | None = None,
     types: frozenset[str] | None = None,
+    *,
     remove_invalid_goals: bool = False,
 ) -> list[ScenarioEntry]:
-    """As `list_scenarios`, of an open log."""
+    """The scenarios that nuPlan finds in a log, ordered by time; all tokens and types where None.
+
+    Rows of the first two and of the last two scenes (by name) are not offered.
+    `remove_invalid_goals` leaves out scenes without a goal.
+    """
     keep = log.is_offered
     if remove_invalid_goals:
         keep = keep & has_goals(log)
     return [
-        ScenarioEntry(
-            log.tokens[row], log.types[row], log.name, log.map_name, int(log.time_us[row])
+        ScenarioEntry(token, kind, log.name, log.map_name, time_us)
+        for token, kind, time_us, kept in zip(
+            log.tokens, log.types, log.time_us.tolist(), keep, strict=True
         )
-        for row in np.flatnonzero(keep).tolist()
-        if (tokens is None or log.tokens[row] in tokens)
-        and (types is None or log.types[row] in types)
+        if kept and (tokens is None or token in tokens) and (types is None or kind in types)
     ]
 
 
 def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
     """The rows of a scenario; the window counts rows from the start of the log.
 
-    Args:
-        log: The log.
-        token: Token of the anchor row.
-        mapping: Duration [s], offset [s] and subsample ratio; nuPlan's for the type where None.
+    `token` names the anchor row; where `mapping` is None, it is nuPlan's for the type.
 
     Raises:
         ConversionError: The log does not have the token, or too few rows there.
@@ -153,23 +140,17 @@ def read_scenario(
     mapping: Mapping | None = None,
     flaws: Counter[str] | None = None,
 ) -> Scenario:
-    """One scenario of a log.
+    """One scenario of a log (.db), as `cut_window` cuts it out, on the map of the log.
 
-    Args:
-        path: The log (.db).
-        token: Token of the anchor row.
-        road: Map of the log.
-        mapping: Duration [s], offset [s] and subsample ratio; nuPlan's for the type where None.
-        flaws: Counts of what is wrong in the log and tolerated are added here.
+    Counts of what is wrong in the log and tolerated are added to `flaws`.
 
     Raises:
         DataError: The log or the scenario cannot be read.
     """
+    counts = Counter[str]() if flaws is None else flaws
     with open_log(path) as log:
         window = cut_window(log, token, mapping)
-        recording, ego = read_span(
-            log, log.name, window.first_row, window.last_row, Counter() if flaws is None else flaws
-        )
+        recording, ego = read_span(log, log.name, window.first_row, window.last_row, counts)
     return make_scenario(recording, ego, window, road, offset=window.first_row)
 
 
@@ -188,20 +169,13 @@ def find_maps(folder: Path) -> dict[str, Path]:
     out = {}
     for index in indexes:
         try:
-            entries = {name: str(entry["version"]) for name, entry in _load(index).items()}
+            for name, entry in json.loads(index.read_text("utf-8")).items():
+                out[name] = folder / name / str(entry["version"]) / "map.gpkg"
         except (TypeError, KeyError, AttributeError) as error:
             raise DataError(f"{index}: a map has no version", hint="get it again") from error
-        for name, version in entries.items():
-            out[name] = folder / name / version / "map.gpkg"
+        except (OSError, ValueError) as error:
+            raise DataError(f"{index}: not readable JSON: {error}", hint="get it again") from error
     return out
-
-
-def _load(path: Path) -> dict[str, dict[str, object]]:
-    try:
-        content: dict[str, dict[str, object]] = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: not readable JSON: {error}", hint="get it again") from error
-    return content
 
 
 def load_map(maps: dict[str, Path], name: str) -> VectorMap:

@@ -32,9 +32,8 @@ class Database:
         self.path = path
         self._connection = connection
         self._columns: dict[str, list[str]] = {}
-        for name, kind, sql in self.query(
-            "SELECT name, type, sql FROM sqlite_master", "its schema"
-        ):
+        listed = self.query("SELECT name, type, sql FROM sqlite_master", "its schema")
+        for name, kind, sql in listed:
             plain = kind == "table" and not str(sql or "").upper().startswith("CREATE VIRTUAL")
             if plain and isinstance(name, str) and _NAME.match(name):
                 info = self.query(f'PRAGMA table_xinfo("{name}")', f"table {name!r}")
@@ -43,15 +42,10 @@ class Database:
     def query(
         self, sql: str, what: str, parameters: Sequence[object] = ()
     ) -> list[tuple[Any, ...]]:
-        """All rows of a query of ours.
-
-        Args:
-            sql: The query; names in it are ours or were checked by `require`.
-            what: What is read, for the error message.
-            parameters: Values of the question marks.
+        """All rows of a query whose names are ours or were checked by `require`.
 
         Raises:
-            DataError: The file cannot be read.
+            DataError: The file cannot be read; the message says `what` is read.
         """
         try:
             return self._connection.execute(sql, tuple(parameters)).fetchall()
@@ -68,9 +62,7 @@ class Database:
             raise DataError(f"{self.path}: table {table!r} is missing", hint=_REPAIR)
         missing = [name for name in columns if name not in self._columns[table]]
         if missing:
-            raise DataError(
-                f"{self.path}: table {table!r} has no column {missing[0]!r}", hint=_REPAIR
-            )
+            raise DataError(f"{self.path}: table {table!r} has no column {missing[0]!r}", _REPAIR)
 
     def columns(
         self, table: str, required: Sequence[str], optional: Sequence[str] = ()
@@ -106,9 +98,8 @@ def open_database(path: Path) -> Iterator[Database]:
     except sqlite3.Error as error:
         raise DataError(f"{path}: cannot open the file: {error}", hint=_REPAIR) from error
     try:
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA query_only = ON")
-        connection.execute("PRAGMA cell_size_check = ON")
+        for setting in ("trusted_schema = OFF", "query_only = ON", "cell_size_check = ON"):
+            connection.execute(f"PRAGMA {setting}")
         yield Database(path, connection)
     finally:
         connection.close()
@@ -120,14 +111,7 @@ def write_database(
     rows: Mapping[str, Sequence[Sequence[Value]]],
     after: Sequence[str] = (),
 ) -> None:
-    """Write an SQLite file in one step.
-
-    Args:
-        path: The file; it is replaced.
-        tables: Column definitions by table name.
-        rows: Whole rows by table name.
-        after: Statements that end it, such as indexes.
-    """
+    """Write an SQLite file in one step: column definitions and rows by table, then statements."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         whole_file(path) as partial,

@@ -53,11 +53,10 @@ def check_store(path: str | Path) -> list[Problem]:
         where = f"scenario {token}"
         try:
             scene = store.read(token)
+            problems += [Problem(where, what) for what in _check_scenario(scene)]
+            problems += [Problem(where, what, is_error=False) for what in _unusual(scene)]
         except DataError as error:
             problems.append(Problem(where, str(error)))
-            continue
-        problems += [Problem(where, what) for what in _check_scenario(scene)]
-        problems += [Problem(where, what, is_error=False) for what in _unusual(scene)]
     return problems
 
 

@@ -25,26 +25,11 @@ _LAYERS = (
     "drivable_areas",
 )
 _LINES = ("baselines", "left_boundaries", "right_boundaries")
-_LISTS = (
-    "incoming",
-    "outgoing",
-    "stop_lines",
-    "block_edges",
-    "block_incoming",
-    "block_outgoing",
-)
-_ARRAYS = {  # field -> column with its unit
-    "speed_limits": "speed_limits_mps",
-    "lane_index": "lane_index",
-    "left_lane": "left_lane",
-    "right_lane": "right_lane",
-    "block_of": "block_of",
-    "has_traffic_lights": "has_traffic_lights",
-    "intersection_of": "intersection_of",
-    "turn_type": "turn_type",
-    "is_bike": "is_bike",
-    "intersection_kinds": "intersection_kinds",
-    "stop_kinds": "stop_kinds",
+_LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
+_ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its unit
+    name: name
+    for name in "lane_index left_lane right_lane block_of has_traffic_lights intersection_of"
+    " turn_type is_bike intersection_kinds stop_kinds".split()
 }
 _UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
 _WIDTHS = {"xy": 2, "bounds": 4}  # columns of the arrays that have two axes
@@ -97,13 +82,8 @@ def write_map(path: Path, road: VectorMap) -> None:
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
     columns = [_one_row(values[field.name], field.type) for field in SCHEMA]
-    footer = {
-        "name": road.name,
-        "epsg": road.epsg,
-        "num_lanes": road.num_lanes,
-        "num_roadblocks": road.num_roadblocks,
-        "flaws": road.flaws,
-    }
+    notes = ("name", "epsg", "num_lanes", "num_roadblocks", "flaws")
+    footer = {name: getattr(road, name) for name in notes}
     write_blocks(path, [pa.Table.from_arrays(columns, schema=SCHEMA)], footer)
 
 

@@ -39,13 +39,7 @@ class ScenarioStore:
     def __init__(
         self, path: Path, source: str = "", fetch: Callable[[str], None] = lambda name: None
     ) -> None:
-        """Open a store.
-
-        Args:
-            path: Its folder.
-            source: Where others find it; the folder where empty.
-            fetch: Called with the name of a file or folder of the store before it is opened.
-        """
+        """`fetch` is called with the name of a file or folder before it is opened."""
         self.path = path
         self.source = source or str(path.resolve())
         self._fetch = fetch
@@ -108,14 +102,12 @@ class ScenarioStore:
     def read_recorded(self, token: str) -> Scenario:
         """As `read`, without the review."""
         window = self.window(token)
-        stored = self._recording(window.log_name)
         first, last = window.first_row, window.last_row
-        recording = stored.read(first, last)
+        recording = self._recording(window.log_name).read(first, last)
         states = ego_states(self._ego(window.log_name, window.ego), first, last)
         # The span starts at the window's first row, and so do the ego states.
         ego = EgoTrace(window.log_name, window.ego, 0, states)
-        road = self.map(recording.city)
-        return make_scenario(recording, ego, window, road, offset=first)
+        return make_scenario(recording, ego, window, self.map(recording.city), offset=first)
 
     def map(self, city: str) -> VectorMap:
         """A map; kept for the next scenario of that city.
@@ -160,10 +152,7 @@ def _limit(kept: dict[Any, Any]) -> None:
 
 
 def open_store(path: str | Path) -> ScenarioStore:
-    """Open a store.
-
-    Args:
-        path: Its folder, or the URL of one.
+    """Open the store in a folder, or behind the URL of one.
 
     Raises:
         DataError: There is no store, or it is damaged or of another version.
@@ -180,18 +169,13 @@ def window_of(row: dict[str, Any]) -> Window:
     """The window that a row of `schema.SCENARIOS` tells of."""
     goal = row["goal_pose"]
     return Window(
-        token=row["token"],
+        **{name: row[name] for name in schema.SAME},
         scenario_type=row["type"],
         log_name=row["recording"],
-        ego=row["ego"],
-        first_row=row["first_row"],
-        last_row=row["last_row"],
         iteration_rows=np.array(row["iteration_rows"], np.int64),
-        row_step=row["row_step"],
         route=tuple(row["route"]),
         mission_goal=np.array(goal) if goal else None,
         mapping=(row["duration_s"], row["offset_s"], row["subsample_ratio"]),
-        is_short=row["is_short"],
         metadata=json.loads(row["metadata"]),
     )
 

@@ -32,9 +32,8 @@ class RemoteFiles:
         try:
             self._remote, self._root = fs.FileSystem.from_uri(self.url)
         except (pa.ArrowException, OSError, ValueError) as error:
-            raise DataError(
-                f"store {url!r}: {error}", hint="give a URL such as s3://bucket/folder"
-            ) from error
+            hint = "give a URL such as s3://bucket/folder"
+            raise DataError(f"store {url!r}: {error}", hint) from error
         self._files: dict[str, str] = {}
         self.path = self._identify(remote_store_folder())
         self.need(SCENARIOS)

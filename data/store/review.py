@@ -59,26 +59,18 @@ class Reviews(Mapping[str, Review]):
     @property
     def hash(self) -> str:
         """Digest of everything that changes a run: decisions and routes; empty without reviews."""
-        rows = [
-            [token, self[token].decision, self[token].route]
-            for token in self
-            if self[token].decision or self[token].route is not None
-        ]
-        return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
+        said = [self[t] for t in self if self[t].decision or self[t].route is not None]
+        return _digest([[review.token, review.decision, review.route] for review in said])
 
     @property
     def route_hash(self) -> str:
         """Digest of the corrected routes; empty without any."""
-        rows = [[token, self[token].route] for token in self if self[token].route is not None]
-        return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
+        return _digest(
+            [[token, self[token].route] for token in self if self[token].route is not None]
+        )
 
     def usable(self, tokens: Iterable[str], accepted: Iterable[str]) -> tuple[str, ...]:
-        """The scenarios to use: a person's decision goes before the filter's.
-
-        Args:
-            tokens: All scenarios, sorted.
-            accepted: Those that the filter accepted.
-        """
+        """Those of all `tokens` to use: a decision goes before what the filter `accepted`."""
         kept = set(accepted)
         decided = {token: self[token].decision for token in self}
         return tuple(
@@ -90,6 +82,10 @@ class Reviews(Mapping[str, Review]):
     def with_review(self, review: Review) -> "Reviews":
         """The reviews with one replaced, or removed when it says nothing."""
         return Reviews([*(self[t] for t in self if t != review.token), review])
+
+
+def _digest(rows: list[Any]) -> str:
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
 
 
 def read_reviews(store: Path) -> Reviews:
@@ -107,10 +103,8 @@ def read_reviews(store: Path) -> Reviews:
             continue
         review = _review(line, f"{path}: line {number}")
         if review.token in out:
-            raise DataError(
-                f"{path}: line {number}: scenario {review.token!r} is reviewed twice",
-                hint="keep one of the lines",
-            )
+            what = f"{path}: line {number}: scenario {review.token!r} is reviewed twice"
+            raise DataError(what, hint="keep one of the lines")
         out[review.token] = review
     return Reviews(out.values())
 
@@ -134,9 +128,8 @@ def _review(line: str, where: str) -> Review:
             hint="route is a list of roadblock ids or null, everything else a text",
         )
     if values.get("decision", "") not in _DECISIONS:
-        raise DataError(
-            f"{where}: decision {values['decision']!r}", hint="accept, reject, or nothing"
-        )
+        what = f"{where}: decision {values['decision']!r}"
+        raise DataError(what, hint="accept, reject, or nothing")
     return Review(**{**values, "route": None if route is None else tuple(route)})
 
 
@@ -170,10 +163,7 @@ def require_blocks(road: VectorMap, review: Review, where: str) -> None:
 def route_problems(road: VectorMap, route: Sequence[str], start: int | None) -> list[str]:
     """What is wrong with a route, in words; nothing for a good one.
 
-    Args:
-        road: The map.
-        route: Roadblock ids from start to goal.
-        start: Block the ego stands on at the first iteration, None where it is on none.
+    `start` is the block the ego stands on at the first iteration, None where it is on none.
     """
     unknown = [name for name in route if name not in road.blocks.index]
     if unknown:

@@ -46,6 +46,9 @@ SCENARIOS = _schema(
     metadata=pa.string(),  # JSON
 )
 
+# Columns of a scenario that a `Window` has as they are.
+SAME = ("token", "ego", "first_row", "last_row", "row_step", "is_short")
+
 FRAMES = _schema(
     time_us=_I64,  # strictly increasing
     light_status=pa.list_(pa.field("item", pa.int8(), nullable=False)),

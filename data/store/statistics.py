@@ -73,11 +73,7 @@ class StoreStats:
     types: Mapping[str, str]  # scenario type by scenario
 
     def groups(self, by: str = "city") -> dict[str, dict[str, float]]:
-        """Number of scenarios and mean of every column, of each group and of all.
-
-        Args:
-            by: `city` or `type`.
-        """
+        """Number of scenarios and mean of every column, of each group (city or type) and of all."""
         labels = self.cities if by == "city" else self.types
         out = {}
         for name in sorted(set(labels.values())):
@@ -96,12 +92,9 @@ def store_stats(
     *,
     progress: Callable[[int, int, str], None] = lambda done, total, token: None,
 ) -> StoreStats:
-    """Statistics of the scenarios of a store.
+    """Statistics of some scenarios of a store, or of all where `tokens` is None.
 
-    Args:
-        store: The store.
-        tokens: Only these scenarios; all where None.
-        progress: Called with scenarios done, scenarios in all, and a token.
+    `progress` is called with scenarios done, scenarios in all, and a token.
 
     Raises:
         DataError: The store is damaged.
@@ -147,9 +140,8 @@ def _route_length(road: VectorMap, route: Sequence[str]) -> float:
     for name in route:
         edges = road.block_edges.at(road.blocks.index[name]) if name in road.blocks.index else ()
         if len(edges):
-            total += float(
-                np.mean([road.baselines.arc[road.baselines.ptr[e + 1] - 1] for e in edges])
-            )
+            lengths = [road.baselines.arc[road.baselines.ptr[e + 1] - 1] for e in edges]
+            total += float(np.mean(lengths))
     return total
 
 

@@ -20,6 +20,7 @@ PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
 _FOOTER = "shiftsim"
 _COMPRESSION, _LEVEL = "zstd", 1
+_REPEATING = ("length_m", "width_m", "log", "type", "city")  # columns of few values
 
 
 def file_name(name: str) -> str:
@@ -91,7 +92,6 @@ def write_blocks(
     described = blocks[0].schema
     names = described.names
     notes = json.dumps({} if footer is None else footer, sort_keys=True)
-    planes = [name for name in names if name in schema.PLANES]
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         whole_file(path) as partial,
@@ -100,10 +100,8 @@ def write_blocks(
             described,
             compression=_COMPRESSION,
             compression_level=_LEVEL,
-            use_dictionary=[
-                n for n in names if n in ("length_m", "width_m", "log", "type", "city")
-            ],
-            use_byte_stream_split=planes,
+            use_dictionary=[name for name in names if name in _REPEATING],
+            use_byte_stream_split=[name for name in names if name in schema.PLANES],
             write_statistics=False,
             store_schema=False,
         ) as writer,
@@ -137,14 +135,12 @@ class Table:
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:
+            column = f"{path}: column {field.name!r}"
             if found.get_field_index(field.name) < 0:
-                raise DataError(f"{path}: column {field.name!r} is missing", hint=REPAIR)
-            if not found.field(field.name).type.equals(field.type):
-                raise DataError(
-                    f"{path}: column {field.name!r} is {found.field(field.name).type}, not"
-                    f" {field.type}",
-                    hint=REPAIR,
-                )
+                raise DataError(f"{column} is missing", hint=REPAIR)
+            kind = found.field(field.name).type
+            if not kind.equals(field.type):
+                raise DataError(f"{column} is {kind}, not {field.type}", hint=REPAIR)
         self._names = expected.names
         self.footer = self._read_footer()
 

@@ -33,9 +33,8 @@ def write_recording(folder: Path, recording: Recording) -> None:
     }
     write_blocks(folder / FRAMES, _split(frames, schema.FRAME_BLOCK), footer)
     tracks = recording.tracks
-    blocks = [
-        _track_block(tracks, start) for start in range(0, max(len(tracks), 1), schema.BLOCK_ROWS)
-    ]
+    starts = range(0, max(len(tracks), 1), schema.BLOCK_ROWS)
+    blocks = [_track_block(tracks, start) for start in starts]
     footer = {"tokens": list(tracks.tokens), "kinds": tracks.kinds.tolist()}
     write_blocks(folder / TRACKS, blocks, footer)
 
@@ -88,17 +87,11 @@ class StoredRecording:
             DataError: A file is damaged or does not have the rows.
         """
         if not 0 <= first < last <= self.num_rows:
-            raise DataError(
-                f"{self.frames.path}: no rows {first} … {last - 1}, there are {self.num_rows}",
-                hint=REPAIR,
-            )
-        return Recording(
-            log_name=self.log_name,
-            city=self.city,
-            time_us=_rows(self.frames, first, last)["time_us"].to_numpy(),
-            tracks=self._read_tracks(first, last),
-            lights=self._read_lights(first, last),
-        )
+            what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
+            raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
+        time_us = _rows(self.frames, first, last)["time_us"].to_numpy()
+        tracks, lights = self._read_tracks(first, last), self._read_lights(first, last)
+        return Recording(self.log_name, self.city, time_us, tracks, lights)
 
     def _read_lights(self, first: int, last: int) -> TrafficLights:
         shape = (last - first, len(self.connectors))
@@ -138,15 +131,8 @@ def open_recording(folder: Path) -> StoredRecording:
     kinds = np.array(names["kinds"], np.int64)
     if len(kinds) != len(names["tokens"]):
         raise DataError(f"{tracks.path}: kinds and tokens differ in number", hint=REPAIR)
-    return StoredRecording(
-        log_name=head["log"],
-        city=head["city"],
-        frames=frames,
-        tracks=tracks,
-        connectors=tuple(head["connectors"]),
-        tokens=tuple(names["tokens"]),
-        kinds=kinds,
-    )
+    connectors, tokens = tuple(head["connectors"]), tuple(names["tokens"])
+    return StoredRecording(head["log"], head["city"], frames, tracks, connectors, tokens, kinds)
 
 
 def _footer(table: Table, *names: str) -> Mapping[str, Any]:

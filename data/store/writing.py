@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import pyarrow as pa
@@ -22,23 +21,17 @@ from shiftsim.world.map import VectorMap
 def window_row(window: Window, city: str) -> dict[str, Any]:
     """A window as a row of `schema.SCENARIOS`, JSON values only."""
     goal = window.mission_goal
+    cut = zip(("duration_s", "offset_s", "subsample_ratio"), window.mapping, strict=True)
     return {
-        "token": window.token,
+        **{name: getattr(window, name) for name in schema.SAME},
         "type": window.scenario_type,
         "city": city,
         "log": window.log_name.partition("@")[0],
         "recording": window.log_name,
-        "ego": window.ego,
-        "first_row": window.first_row,
-        "last_row": window.last_row,
-        "row_step": window.row_step,
         "iteration_rows": window.iteration_rows.tolist(),
         "route": list(window.route),
         "goal_pose": [] if goal is None else goal.tolist(),
-        "duration_s": window.mapping[0],
-        "offset_s": window.mapping[1],
-        "subsample_ratio": window.mapping[2],
-        "is_short": window.is_short,
+        **dict(cut),
         "metadata": json.dumps(window.metadata, sort_keys=True),
     }
 
@@ -59,26 +52,18 @@ class StoreWriter:
             table = tables.Table(self.path / tables.SCENARIOS, schema.SCENARIOS).read()
             self._rows = {row["token"]: row for row in table.to_pylist()}
             self._cities = {row["recording"]: row["city"] for row in self._rows.values()}
-        elif (
-            self.path.is_dir()
-            and any(self.path.iterdir())
-            and not (self.path / tables.PARTIAL).is_dir()
-        ):
+        self.path.mkdir(parents=True, exist_ok=True)
+        is_partial = (self.path / tables.PARTIAL).is_dir()
+        if not self._files and not is_partial and any(self.path.iterdir()):
             raise DataError(
                 f"{self.path}: the folder is not empty and not a store",
                 hint="give a new folder, or a store to add to",
             )
-        self.path.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> "StoreWriter":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
 
@@ -129,12 +114,7 @@ class StoreWriter:
     def take_recording(self, folder: Path, log_name: str, rows: list[dict[str, Any]]) -> None:
         """Move a recording that was written elsewhere into the store, with all its scenarios.
 
-        What the store has of that recording is replaced.
-
-        Args:
-            folder: Written by `write_recording` and `write_ego`.
-            log_name: Name of the recording.
-            rows: `window_row` of its scenarios.
+        What the store has of it is replaced; `rows` are the `window_row` of its scenarios.
         """
         target = tables.recording_folder(self.path, log_name)
         below = f"{self._name(target)}/"
@@ -161,15 +141,8 @@ class StoreWriter:
         self._note(self.path / tables.SCENARIOS)
         files = dict(sorted(self._files.items()))
         content = hashlib.sha256(json.dumps(files).encode()).hexdigest()
-        tables.write_json(
-            self.path / tables.MANIFEST,
-            {
-                "format": schema.FORMAT,
-                "version": schema.VERSION,
-                "hash": content,
-                "files": files,
-            },
-        )
+        kind = {"format": schema.FORMAT, "version": schema.VERSION}
+        tables.write_json(self.path / tables.MANIFEST, kind | {"hash": content, "files": files})
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.path).as_posix()
