@@ -36,10 +36,7 @@ def load_metric(spec: str | CustomMetric) -> CustomMetric:
 
 
 def add_metrics(
-    result: MetricResult,
-    log: SimulationLog,
-    road: VectorMap,
-    metrics: Sequence[str | CustomMetric],
+    result: MetricResult, log: SimulationLog, road: VectorMap, metrics: Sequence[str | CustomMetric]
 ) -> MetricResult:
     """The same result with the rows of custom metrics in `extra`; the score stays as it is.
 

@@ -23,13 +23,7 @@ from shiftsim.planners.pdm.forecast import (
 )
 from shiftsim.planners.pdm.parameters import FollowingModel, PdmParameters
 from shiftsim.planners.pdm.rollout import Scene
-from shiftsim.planners.pdm.route import (
-    Route,
-    current_lane,
-    follow_route,
-    offset_poses,
-    start_route,
-)
+from shiftsim.planners.pdm.route import Route, current_lane, follow_route, offset_poses, start_route
 from shiftsim.planners.pdm.scorer import Place
 from shiftsim.planners.pdm.step import Step, plan_step
 from shiftsim.planners.proposals.areas import select_areas

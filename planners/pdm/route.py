@@ -47,10 +47,7 @@ def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str
     corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
     lanes = lanes_of(road, corrected)
     if not lanes:
-        raise PlannerError(
-            f"pdm-closed: the route of scenario {token!r} has no lanes",
-            hint=HINT,
-        )
+        raise PlannerError(f"pdm-closed: the route of scenario {token!r} has no lanes", hint=HINT)
     return Route(start, corrected, np.array(lanes), make_areas(road, lanes))
 
 

@@ -45,10 +45,7 @@ def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str
         PlannerError: The route is empty or names a block that the map does not have.
     """
     if not route:
-        raise PlannerError(
-            f"{planner}: the route of scenario {token!r} is empty",
-            hint=HINT,
-        )
+        raise PlannerError(f"{planner}: the route of scenario {token!r} is empty", hint=HINT)
     for name in route:
         if name not in road.blocks.index:
             raise PlannerError(

@@ -7,12 +7,7 @@ rear-right, front-right.
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
-from shiftsim.geometry.rings import (
-    EXTERIOR,
-    convex_intersect,
-    locate_in_ring,
-    segments_intersect,
-)
+from shiftsim.geometry.rings import EXTERIOR, convex_intersect, locate_in_ring, segments_intersect
 
 # rad, bearings from the rear axle that at-fault tests compare with
 BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)

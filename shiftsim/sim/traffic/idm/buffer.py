@@ -98,12 +98,7 @@ def _is_shallow(
 
 @lean_kernel
 def _offset_side(
-    line: FloatArray,
-    distance: float,
-    left: bool,
-    keep: BoolArray,
-    out: FloatArray,
-    count: int,
+    line: FloatArray, distance: float, left: bool, keep: BoolArray, out: FloatArray, count: int
 ) -> int:
     """Append the offset of one side, to the left of the direction walked, and the cap after it."""
     size, step = len(line), 1 if left else -1

@@ -171,11 +171,7 @@ def last_near_run(runs: FloatArray, half_width: float, bounds: FloatArray) -> in
 
 @lean_kernel
 def touches_corridor(
-    line: FloatArray,
-    runs: FloatArray,
-    half_width: float,
-    ring: FloatArray,
-    bounds: FloatArray,
+    line: FloatArray, runs: FloatArray, half_width: float, ring: FloatArray, bounds: FloatArray
 ) -> int:
     """Whether a ring meets the flat-capped buffer of a polyline: APART, MEETING, or UNSURE.
 
@@ -224,12 +220,7 @@ def touches_corridor(
 
 @lean_kernel
 def _touches_segment(
-    px: float,
-    py: float,
-    qx: float,
-    qy: float,
-    half_width: float,
-    ring: FloatArray,
+    px: float, py: float, qx: float, qy: float, half_width: float, ring: FloatArray
 ) -> int:
     inner, outer = half_width * _INNER, half_width * _OUTER
     low_x, high_x = min(px, qx) - outer, max(px, qx) + outer
