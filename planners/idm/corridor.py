@@ -18,7 +18,7 @@ from shiftsim.geometry.corridors import (
     side_of,
     without_repeats,
 )
-from shiftsim.geometry.paths import RUN, bound_runs
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.geometry.rings import point_segment_distance, rings_touch
 
 UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, kernel, lean_kernel
-from shiftsim.geometry.paths import RUN, is_run_within
+from shiftsim.geometry.polylines import RUN, is_run_within
 from shiftsim.geometry.rings import point_segment_distance, ring_segment_distance, rings_touch
 
 CLEAR, HIT, OPEN = 0, 1, 2

@@ -18,9 +18,16 @@ from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.observation import HISTORY_SAMPLES, past_rows, scene_info
 from shiftsim.sim.plan_check import validate_plan
-from shiftsim.sim.planner import BatchPlanner, History, Observation, Planner
+from shiftsim.sim.planner import (
+    HISTORY_SAMPLES,
+    BatchPlanner,
+    History,
+    Observation,
+    Planner,
+    past_rows,
+    scene_info,
+)
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory

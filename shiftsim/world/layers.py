@@ -15,11 +15,11 @@ import shapely
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import MapError
 from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
-from shiftsim.geometry.predicates import orientation
 from shiftsim.geometry.rings import (
     EXTERIOR,
     INTERIOR,
     locate_in_polygon,
+    orientation,
     polygon_distance,
     segments_intersect,
 )

@@ -7,7 +7,7 @@ from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
 from shiftsim.arrays import kernel
-from shiftsim.geometry import boxes, frames, polylines, predicates, rings
+from shiftsim.geometry import boxes, frames, polylines, rings
 
 NUM_PAIRS = 60_000  # twice, at both offsets: more than 1e5 pairs of each kind
 
@@ -171,9 +171,9 @@ def test_projections_on_a_polyline_equal_those_of_shapely(rng, offset):
 def test_orientation_is_exact_on_nearly_collinear_points():
     base = 664_430.0
     tiny = 2.0**-33
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
 
 
 def test_corners_run_front_left_rear_left_rear_right_front_right():

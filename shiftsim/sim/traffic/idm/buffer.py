@@ -9,8 +9,7 @@ belongs to the buffer where the curve winds around it.
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
-from shiftsim.geometry.predicates import orientation
-from shiftsim.geometry.rings import point_segment_distance
+from shiftsim.geometry.rings import orientation, point_segment_distance
 
 QUADRANT_SEGMENTS = 16  # per right angle of a round join; what shapely's method defaults to
 _SIMPLIFY = 0.01  # concave vertices shallower than this share of the distance are left out

@@ -3,15 +3,14 @@
 An outline is one or two rings: a box, and the buffer of a piece of path (`buffer`), whose ring may
 cross itself inside. Their union is meant; touching counts as contact. Rings are searched with
 bounding boxes, and exact predicates decide whether two edges meet. Corridors are searched by the
-runs of segments of their line (`geometry.paths`).
+runs of segments of their line (`geometry.polylines`).
 """
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.paths import RUN
-from shiftsim.geometry.predicates import orientation
-from shiftsim.geometry.rings import point_segment_distance, segments_meet
+from shiftsim.geometry.polylines import RUN
+from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
 
 APART, MEETING, UNSURE = 0, 1, 2
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
