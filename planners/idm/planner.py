@@ -61,13 +61,7 @@ def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[in
 def plan_route(
     road: VectorMap, blocks: list[int], center: FloatArray, vehicle: VehicleParameters
 ) -> Search:
-    """Lanes from the ego to the last block of the route.
-
-    Args:
-        road: The map.
-        blocks: Block indices of the route.
-        center: (3,) ego box centre x [m], y [m], heading [rad].
-        vehicle: Dimensions of the ego.
+    """Lanes from the ego, whose box centre is (3,), to the last block of the route.
 
     Raises:
         PlannerError: The first two blocks of the route have no lanes.
@@ -274,24 +268,15 @@ def _pose(path: Path, progress: float) -> tuple[float, float, float]:
 
 @kernel
 def _roll_on(
-    first: int,
+    first: int,  # row that is known
     path: Path,
     objects: Objects,
     policy: Policy,
-    centers: FloatArray,
-    motion: FloatArray,
-    sides: IntArray,
+    centers: FloatArray,  # (17, 3) box centres x [m], y [m], heading [rad]
+    motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
+    sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
 ) -> tuple[int, int]:
     """Fill the rows behind `first` until the end, or until an OPEN object would be the lead.
-
-    Args:
-        first: Row that is known.
-        path: The path.
-        objects: What may stand in the way.
-        policy: How to drive.
-        centers: (17, 3) box centres x [m], y [m], heading [rad].
-        motion: (17, 2) progress [m] and speed [m/s].
-        sides: (16, M) side of every object at every step, decided as far as needed.
 
     Returns:
         The row and the object to decide, or -1 for the object at the end.

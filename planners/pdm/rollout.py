@@ -115,28 +115,17 @@ def read_pose(path: Path, progress: float, out: FloatArray) -> None:
 
 @kernel
 def _roll(
-    first: int,
-    last: int,
+    first: int,  # first time index to fill; the one before it is filled
+    last: int,  # last time index to fill
     path: Path,
-    corridor: Corridor,
+    corridor: Corridor,  # what stands in its way
     forecast: Forecast,
-    ranks: IntArray,
+    ranks: IntArray,  # (41, M) order of what is around on a forecast map, -1 where not known
     size: EgoBox,
-    model: FollowingModel,
+    model: FollowingModel,  # the longitudinal policy
     rows: Rows,
 ) -> int:
     """Roll the policies of one path on, from time index `first` to `last`.
-
-    Args:
-        first: First time index to fill; the one before it is filled.
-        last: Last time index to fill.
-        path: The path.
-        corridor: What stands in its way.
-        forecast: What is around.
-        ranks: (41, M) order of what is around on a forecast map, -1 where not known.
-        size: Of the ego.
-        model: The longitudinal policy.
-        rows: The policies.
 
     Returns:
         _DONE, or the time index whose ranks are needed to break a tie.

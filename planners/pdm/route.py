@@ -30,13 +30,7 @@ class Route(NamedTuple):
 
 
 def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
-    """Correct a route at the start of a scenario.
-
-    Args:
-        road: The map.
-        ids: Roadblock ids of the route.
-        ego: (11,) ego state.
-        token: Id of the scenario, for messages.
+    """Correct a route, given by roadblock ids, at the start of a scenario, from an ego state (11,).
 
     Raises:
         PlannerError: The route is empty, unknown to the map, or has no lanes.
@@ -54,21 +48,12 @@ def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str
 def current_lane(
     road: VectorMap,
     route: Route,
-    selected: IntArray,
-    ego: FloatArray,
-    center: FloatArray,
+    selected: IntArray,  # drivable areas of this step
+    ego: FloatArray,  # (11,) ego state
+    center: FloatArray,  # (3,) its centre x [m], y [m], heading [rad]
     size: EgoBox,
 ) -> int:
-    """The lane of the route that the ego is on.
-
-    Args:
-        road: The map.
-        route: The corrected route.
-        selected: Drivable areas of this step.
-        ego: (11,) ego state.
-        center: (3,) its centre x [m], y [m], heading [rad].
-        size: Its dimensions.
-    """
+    """The lane of the route that the ego is on."""
     areas, errors = lanes_at(road, route, selected, ego)
     if not areas:
         return lane_at(road, route.lanes, center, size.length, size.width)

@@ -56,23 +56,14 @@ class Step(NamedTuple):
 
 
 def plan_step(
-    ego: FloatArray,
-    targets: FloatArray,
-    scene: Scene,
-    place: Place,
+    ego: FloatArray,  # (11,) ego state
+    targets: FloatArray,  # (F,) target speeds, slowest first [m/s]
+    scene: Scene,  # what the proposals are rolled out in
+    place: Place,  # the map of this step
     vehicle: VehicleParameters,
     params: PdmParameters,
 ) -> Step:
-    """Roll out, drive and score proposals, and choose.
-
-    Args:
-        ego: (11,) ego state.
-        targets: (F,) target speeds, slowest first [m/s].
-        scene: What the proposals are rolled out in.
-        place: The map of this step.
-        vehicle: Dimensions of the ego.
-        params: The planner's numbers.
-    """
+    """Roll out, drive and score proposals, and choose."""
     proposals = start_proposals(scene, ego, targets)
     roll_out(proposals, scene)
     poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)

@@ -51,15 +51,7 @@ def deviation(
 def lane_at(
     road: VectorMap, lanes: IntArray, center: FloatArray, length: float, width: float
 ) -> int:
-    """The first lane that holds the centre of a box, else the one nearest to the box.
-
-    Args:
-        road: The map.
-        lanes: Lanes and connectors that count, at least one.
-        center: (3,) centre of the box x [m], y [m], heading [rad].
-        length: Of the box [m].
-        width: Of the box [m].
-    """
+    """The first lane that holds the centre (3,) of a box, else the one nearest to the box."""
     x, y, heading = center
     bounds = road.edges.polygons.bounds[lanes]
     away_x = np.maximum(np.maximum(bounds[:, 0] - x, x - bounds[:, 2]), 0.0)

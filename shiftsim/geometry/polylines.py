@@ -18,13 +18,7 @@ def project_on_polyline(
 ) -> float:
     """Arc length of the point of a polyline nearest to (x, y); the first one on ties [m].
 
-    Args:
-        xy: (V, 2) vertices of many polylines [m].
-        arc: (V,) arc length at each vertex, from the start of its own polyline [m].
-        start: First vertex of the polyline.
-        stop: One past its last vertex.
-        x: Point [m].
-        y: Point [m].
+    It has the vertices `start` … `stop` - 1 of `xy` (V, 2), with arc lengths `arc` (V,) [m].
     """
     best = np.inf
     found = 0.0
@@ -86,15 +80,9 @@ def vertex_headings(xy: FloatArray) -> FloatArray:
 def nearest_vertex(
     xy: FloatArray, start: int, stop: int, stride: int, x: float, y: float
 ) -> tuple[int, float]:
-    """The vertex nearest to a point and its distance [m]; the first one on ties.
+    """The vertex of a polyline nearest to a point and its distance [m]; the first one on ties.
 
-    Args:
-        xy: (V, 2) vertices of many polylines [m].
-        start: First vertex of the polyline.
-        stop: One past its last vertex.
-        stride: Only every so manieth vertex is looked at.
-        x: Point [m].
-        y: Point [m].
+    Of the vertices `start` … `stop` - 1 of `xy` (V, 2) every `stride`-th is looked at.
     """
     best, found = np.inf, start
     for index in range(start, stop, stride):
@@ -105,12 +93,7 @@ def nearest_vertex(
 
 
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
-    """(V,) arc length at each vertex from the start of its own polyline [m].
-
-    Args:
-        xy: (V, 2) vertices of all polylines [m].
-        ptr: Polyline i has the vertices ptr[i] … ptr[i + 1] - 1.
-    """
+    """(V,) arc length at each vertex from the start of its own polyline, as in `Polylines` [m]."""
     out = np.zeros(len(xy))
     for start, stop in zip(ptr[:-1].tolist(), ptr[1:].tolist(), strict=True):
         if stop > start + 1:
@@ -180,16 +163,9 @@ def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
 
 @lean_kernel
 def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, int]:
-    """The point of the path nearest to (x, y); the first one on ties.
+    """The point of the path nearest to (x, y), the first one on ties: progress, distance [m], run.
 
-    Args:
-        path: The path.
-        x: Point [m].
-        y: Point [m].
-        guess: Run of segments that is probably nearest, such as the result of the last call.
-
-    Returns:
-        Its progress [m], its distance [m] and its run of segments.
+    `guess` is the run that is probably nearest, such as the one of the last call.
     """
     num_runs = len(path.runs)
     guess = min(max(guess, 0), num_runs - 1)

@@ -148,13 +148,7 @@ def ray_crossings(
 ) -> tuple[bool, bool]:
     """Whether a ray from (x, y) to +x crosses a chain an odd number of times, or starts on it.
 
-    Args:
-        xy: (V, 2) vertices [m].
-        before: Vertex the chain starts at; for a whole ring its last one.
-        start: Second vertex of the chain.
-        stop: One past its last vertex.
-        x: Point [m].
-        y: Point [m].
+    The chain goes from the vertex `before` (of a whole ring the last one) to `start` … `stop` - 1.
     """
     parity = False
     px, py = xy[before, 0], xy[before, 1]
@@ -184,13 +178,7 @@ def locate_in_polygon(
 ) -> int:
     """Where a point lies relative to a polygon with holes: INTERIOR, BOUNDARY or EXTERIOR.
 
-    Args:
-        xy: (V, 2) vertices of all rings [m].
-        ring_ptr: Ring r has the vertices ring_ptr[r] … ring_ptr[r + 1] - 1.
-        first: First ring of the polygon (its shell; the others are holes).
-        last: One past its last ring.
-        x: Point [m].
-        y: Point [m].
+    Its rings are `first` (the shell) … `last` - 1, with the vertices from `ring_ptr` on.
     """
     inside = False
     for ring in range(first, last):
@@ -246,13 +234,7 @@ def boundary_distance_below(
 ) -> float:
     """Distance from a point to the edges of a ring, or `limit` where that is not below it [m].
 
-    Args:
-        xy: (V, 2) vertices of all rings [m].
-        start: First vertex of the ring.
-        stop: One past its last vertex.
-        x: Point [m].
-        y: Point [m].
-        limit: Distance of interest [m]; edges beyond it cost a comparison each.
+    The ring has the vertices `start` … `stop` - 1. Edges beyond the limit cost a comparison each.
     """
     best = limit
     ax, ay = xy[stop - 1, 0] - x, xy[stop - 1, 1] - y

@@ -128,9 +128,7 @@ class Rollout:
     def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
 
-        Args:
-            plan: The planner's answer; None only under log playback without a planner.
-            seconds: How long it took [s].
+        The plan took `seconds`; it is None only under log playback without a planner.
         """
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
@@ -241,9 +239,7 @@ def simulate(
 def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
     """Drive several scenarios in lock step, so that their planners share one forward pass.
 
-    Args:
-        rollouts: Fresh rollouts, each with a planner of its own; the planners are forks of one
-            `BatchPlanner`.
+    The rollouts are fresh, and their planners forks of one `BatchPlanner`.
 
     Returns:
         Per rollout its log, or the error that ended it; the others go on.

@@ -111,14 +111,7 @@ def parse_noise(name: str) -> NoiseModel:
 def sample_noise(
     model: NoiseModel | str, *, seed: int, token: str, num_steps: int, dt: float = 0.1
 ) -> FloatArray:
-    """The noise of a whole rollout.
-
-    Args:
-        model: Kind and strength, or a name for `parse_noise`.
-        seed: Seed of the run.
-        token: Id of the scenario.
-        num_steps: T, number of steps.
-        dt: Nominal step [s].
+    """The noise of a whole rollout of T steps, `dt` [s] long each.
 
     Returns:
         (T, 2) added to the acceleration [m/s^2] and to the steering rate [rad/s]; exactly 0 where

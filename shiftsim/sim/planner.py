@@ -155,20 +155,14 @@ def observe_log(
     scenario: Scenario,
     iteration: int,
     *,
+    # (H, 11) ego states of the samples, or (11,) of a single one; the recorded ones if None
     ego: FloatArray | None = None,
-    tracks: Tracks | None = None,
+    tracks: Tracks | None = None,  # tracks over the H samples; the recorded ones if None
+    # how many samples to look back on, the present included; 1 is the present alone. A recording
+    # that begins later gives fewer: H of them
     samples: int = HISTORY_SAMPLES,
 ) -> Observation:
-    """What a planner would see where the ego is as recorded, or in given states.
-
-    Args:
-        scenario: The scenario.
-        iteration: Its iteration.
-        ego: (H, 11) ego states of the samples, or (11,) of a single one; the recorded ones if None.
-        tracks: Tracks over the H samples; the recorded ones if None.
-        samples: How many samples to look back on, the present included; 1 is the present alone. A
-            recording that begins later gives fewer: H of them.
-    """
+    """What a planner would see where the ego is as recorded, or in given states."""
     rows = past_rows(scenario, iteration, samples)
     now = int(scenario.iteration_rows[iteration])
     history = History(

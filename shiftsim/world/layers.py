@@ -164,16 +164,9 @@ def project_on_line(lines: Polylines, line: int, x: float, y: float) -> float:
 
 @lean_kernel
 def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
-    """Write the polygons that hold a point in their interior into `out`, ascending.
+    """Write the polygons that hold a point in their interior into `out`, ascending; their number.
 
-    Args:
-        polygons: The layer.
-        x: Point [m].
-        y: Point [m].
-        out: Room for the indices; those that do not fit are counted but not written.
-
-    Returns:
-        How many polygons hold the point.
+    Those that do not fit are counted but not written.
     """
     fx = np.floor((x - polygons.grid[0]) / polygons.grid[2])
     fy = np.floor((y - polygons.grid[1]) / polygons.grid[2])

@@ -28,13 +28,9 @@ def curve_capacity(num_points: int) -> int:
 
 @lean_kernel
 def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
-    """Outline of a polyline buffered with flat caps and round joins.
+    """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
-    Args:
-        line: (K, 2) vertices, at least 2 [m].
-        distance: Half width of the buffer [m].
-        keep: (K,) scratch.
-        out: (V, 2) receives the curve [m].
+    `keep` (K,) is scratch; `out` (V, 2) receives the curve.
 
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.

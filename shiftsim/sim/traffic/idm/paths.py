@@ -42,12 +42,7 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
 def finish_path(path: FloatArray, size: int) -> int:
     """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
 
-    Args:
-        path: (K, 4) raw vertices; their progress is written.
-        size: How many of them count.
-
-    Returns:
-        How many vertices are left, at the start of `path`.
+    The first `size` vertices of `path` (K, 4) count. Returns how many are left, at its start.
     """
     progress = 0.0
     kept = 0

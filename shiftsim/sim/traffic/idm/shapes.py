@@ -174,14 +174,8 @@ def touches_corridor(
 ) -> int:
     """Whether a ring meets the flat-capped buffer of a polyline: APART, MEETING, or UNSURE.
 
-    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps.
-
-    Args:
-        line: (K, 2) vertices, at least 2 [m].
-        runs: (R, 4) bounds of its runs [m].
-        half_width: Distance of the buffer [m].
-        ring: (V, 2) the ring [m].
-        bounds: (4,) bounding box of the ring [m].
+    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps. The line (K, 2)
+    has runs with bounds (R, 4), the ring (V, 2) the bounds (4,).
     """
     reach = half_width * _OUTER
     low_x, low_y = bounds[0] - reach, bounds[1] - reach

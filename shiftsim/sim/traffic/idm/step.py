@@ -19,14 +19,10 @@ _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA
 
 @lean_kernel
 def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) -> tuple[int, int]:
-    """Move every agent by one step and write where it is.
+    """Move every agent by one step, `span` [s] long, and write where it is.
 
-    Args:
-        scene: The traffic; its lights are those at the end of the step.
-        ego: (11,) ego state at the beginning of the step.
-        row: Holds the replayed tracks at the end of the step.
-        span: Length of the step [s].
-        first: BEGIN, or the agent that an interrupted step goes on with.
+    The scene has the lights, and the row the replayed tracks, of the end of the step; `ego` (11,)
+    is of its beginning. `first` is BEGIN, or the agent that an interrupted step goes on with.
 
     Returns:
         DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
