@@ -51,17 +51,11 @@ class SceneInfo:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """The last 2.1 s, up to 22 samples, oldest first; the last one is the present.
+    """The last 2.1 s, up to 22 samples, oldest first; the last one is the present."""
 
-    Attributes:
-        time_us: (H,) time stamps [us].
-        ego: (H, 11) ego states, columns of `state.STATE_COLUMNS`.
-        tracks: Tracks over the same H samples.
-    """
-
-    time_us: IntArray
-    ego: FloatArray
-    tracks: Tracks
+    time_us: IntArray  # (H,) time stamps [us]
+    ego: FloatArray  # (H, 11) ego states, columns of `state.STATE_COLUMNS`
+    tracks: Tracks  # tracks over the same H samples
 
 
 @dataclass(frozen=True, slots=True)
