@@ -4,11 +4,11 @@
 number of threshold profiles can be applied to it.
 """
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from shiftsim.errors import ConfigError
+from shiftsim.files import load_attribute
 from shiftsim.metrics.result import Collision, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.score import (
     MULTIPLIERS,
@@ -88,10 +88,7 @@ def load_metric(spec: str | CustomMetric) -> CustomMetric:
     hint = "name it as module:attribute, for example my_package.metrics:min_gap"
     if not module_name or not attribute:
         raise ConfigError(f"metric {spec!r} is not of the form module:attribute", hint)
-    try:
-        metric = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"metric {spec!r} cannot be imported: {error}", hint) from error
+    metric = load_attribute("metric", spec, hint)
     if not callable(metric):
         raise ConfigError(f"metric {spec!r} is not callable but {type(metric).__name__}", hint)
     found: CustomMetric = metric

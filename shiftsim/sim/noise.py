@@ -5,7 +5,6 @@ White noise (`awgn`) is sigma times a standard normal at every step. The Ornstei
 """
 
 import hashlib
-import importlib
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import load_attribute
 
 CHANNELS = ("noise-accel", "noise-steer")
 NOISE_NAMES = ("none", "awgn-low", "awgn-mid", "awgn-high", "ou-low", "ou-mid", "ou-high")
@@ -168,14 +168,8 @@ def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
 
 
 def _load_noise(name: str) -> NoiseModel:
-    module_name, _, attribute = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f"noise {name!r} cannot be imported: {error}",
-            "give module:attribute of a function or NoiseModel on the Python path",
-        ) from error
+    hint = "give module:attribute of a function or NoiseModel on the Python path"
+    found = load_attribute("noise", name, hint)
     if isinstance(found, NoiseModel):
         return found
     if not callable(found):

@@ -5,9 +5,8 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
-from shiftsim.sim.traffic.idm.footprints import move_agent, set_box
 from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
-from shiftsim.sim.traffic.idm.paths import extend_route
+from shiftsim.sim.traffic.idm.paths import extend_route, move_agent, set_box
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY
