@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from boxes import boxes_intersect, to_frame
 from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
@@ -33,7 +34,7 @@ def some_boxes(rng, count, offset):
 def test_boxes_intersect_exactly_where_shapely_says_so(rng, offset):
     poses_a, sizes_a = some_boxes(rng, NUM_PAIRS, offset)
     poses_b, sizes_b = some_boxes(rng, NUM_PAIRS, offset)
-    ours = boxes.boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
+    ours = boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
     theirs = shapely.intersects(
         shapely.polygons(boxes.boxes_to_corners(poses_a, sizes_a)),
         shapely.polygons(boxes.boxes_to_corners(poses_b, sizes_b)),
@@ -186,7 +187,7 @@ def test_corners_run_front_left_rear_left_rear_right_front_right():
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])
     poses = np.array([[3.0, -4.0, heading], [motion[2], motion[1], 0.5]])
-    back = frames.to_frame(frames.from_frame(poses, origin), origin)
+    back = to_frame(frames.from_frame(poses, origin), origin)
     np.testing.assert_allclose(back[:, :2], poses[:, :2], atol=1e-9)
     assert np.abs(frames.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
 
@@ -195,8 +196,8 @@ def test_frames_are_inverse_to_each_other(heading, motion):
 def test_intersection_of_boxes_is_symmetric(seed):
     rng = np.random.default_rng(seed)
     a, b = some_boxes(rng, 50, OFFSETS[1]), some_boxes(rng, 50, OFFSETS[1])
-    forwards = boxes.boxes_intersect(*a, *b)
-    np.testing.assert_array_equal(forwards, boxes.boxes_intersect(*b, *a))
+    forwards = boxes_intersect(*a, *b)
+    np.testing.assert_array_equal(forwards, boxes_intersect(*b, *a))
 
 
 @given(angles)
