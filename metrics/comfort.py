@@ -104,13 +104,10 @@ def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:
 
 def within_bounds(signals: ComfortSignals, thresholds: Thresholds) -> list[bool]:
     """Whether each entry of `BOUNDED_SIGNALS` stays strictly within its bounds throughout."""
+    bounded = (getattr(signals, name) for name in BOUNDED_SIGNALS.values())
     return [
         bool(((low < values) & (values < high)).all())
-        for values, (low, high) in zip(
-            (getattr(signals, name) for name in BOUNDED_SIGNALS.values()),
-            bounds_of(thresholds),
-            strict=True,
-        )
+        for values, (low, high) in zip(bounded, bounds_of(thresholds), strict=True)
     ]
 
 
@@ -118,11 +115,11 @@ def judge(
     signals: ComfortSignals, time_us: IntArray, thresholds: Thresholds
 ) -> tuple[list[MetricPart], MetricPart]:
     """The six unscored signals in the order of `BOUNDED_SIGNALS`, and the comfort score."""
-    parts = []
-    for (metric, signal), bounds in zip(
-        BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True
-    ):
-        parts.append(_judge_signal(metric, getattr(signals, signal), time_us, bounds))
+    bounded = zip(BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True)
+    parts = [
+        _judge_signal(metric, getattr(signals, name), time_us, bounds)
+        for (metric, name), bounds in bounded
+    ]
     broken = [part.row.violation for part in parts if part.row.violation is not None]
     score = float(not broken)
     first = min(broken, key=lambda violation: violation.iteration, default=None)

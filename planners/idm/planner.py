@@ -33,6 +33,13 @@ from shiftsim.world.state import (
     rear_poses,
 )
 
+STEPS = 16
+STEP = 0.5  # s
+STEP_US = 500_000
+HORIZON = STEPS * STEP  # s
+RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
+_EGO_TOKEN = "ego_token"
+
 
 def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
     """Block indices of a route, NONE for ids the map does not have.
@@ -98,14 +105,6 @@ def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
             hint="a path needs at least three different vertices",
         )
     return path
-
-
-STEPS = 16
-STEP = 0.5  # s
-STEP_US = 500_000
-HORIZON = STEPS * STEP  # s
-RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
-_EGO_TOKEN = "ego_token"
 
 
 class Policy(NamedTuple):

@@ -24,6 +24,7 @@ from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus
 
 HINT = "correct the route of the scenario, or leave it out"  # of errors about routes
+SAME_POINT = 1e-8  # m, vertices closer than this are one
 
 
 def lanes_of(road: VectorMap, blocks: Iterable[int]) -> list[int]:
@@ -69,9 +70,6 @@ def lane_at(
         ring = road.edges.rings(lanes[place])[0].copy()  # read-only ones would need a kernel more
         best = min(best, (float(ring_distance(footprint, ring)), place))
     return int(lanes[best[1]])
-
-
-SAME_POINT = 1e-8  # m, vertices closer than this are one
 
 
 class LanePath(NamedTuple):

@@ -11,6 +11,9 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.rings import point_segment_distance
 
+RUN = 8  # segments per bounding box
+_SLACK = 1e-6  # m, more than rounding can change a distance by
+
 
 @lean_kernel
 def project_on_polyline(
@@ -100,10 +103,6 @@ def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
             steps = np.diff(xy[start:stop], axis=0)
             out[start + 1 : stop] = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))
     return out
-
-
-RUN = 8  # segments per bounding box
-_SLACK = 1e-6  # m, more than rounding can change a distance by
 
 
 class Path(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 
+INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
 _SPLITTER = 134217729.0  # 2**27 + 1
 _ERROR_BOUND = 3.3306690738754716e-16  # (3 + 16 eps) eps, eps = 2**-53
 
@@ -76,9 +77,6 @@ def _grow(expansion: FloatArray, size: int, value: float) -> int:
         carry = total
     expansion[size] = carry
     return size + 1
-
-
-INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
 
 
 @lean_kernel

@@ -23,6 +23,9 @@ from shiftsim.world.state import (
     VehicleParameters,
 )
 
+# nuPlan rule 10: 2.1 s and the present, not 2.0 s
+HISTORY_SAMPLES = 22
+
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
@@ -119,10 +122,6 @@ class BatchPlanner(Planner, Protocol):
 
         An exception in place of a plan ends that scenario and no other.
         """
-
-
-# nuPlan rule 10: 2.1 s and the present, not 2.0 s
-HISTORY_SAMPLES = 22
 
 
 def scene_info(scenario: Scenario, seed: int = 0) -> SceneInfo:
