@@ -42,17 +42,9 @@ def judge(
     far = np.any(area.outside & (area.distances >= bound), axis=1)
     furthest = area.distances.max(axis=1)
     score = float(not far.any())
-    compliance = MetricPart(
-        MetricRow(
-            NAME,
-            score,
-            float(furthest.max()),
-            "meters",
-            bound,
-            first_violation(far, furthest, time_us),
-        ),
-        (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),),
-    )
+    first = first_violation(far, furthest, time_us)
+    row = MetricRow(NAME, score, float(furthest.max()), "meters", bound, first)
+    compliance = MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
     outside = np.any(area.outside, axis=1)
     inside = float(not outside.any())
     first = first_violation(outside, furthest, time_us)
