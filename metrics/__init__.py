@@ -4,9 +4,11 @@
 number of threshold profiles can be applied to it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from shiftsim.metrics.custom import CustomMetric, add_metrics, load_metric
+from shiftsim.errors import ConfigError
+from shiftsim.files import load_attribute
 from shiftsim.metrics.result import Collision, MetricRow, Series, Statistic, Violation
 from shiftsim.metrics.score import (
     MULTIPLIERS,
@@ -22,6 +24,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 
 METRIC_VERSION = "1"  # raised with any change of a definition
+CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
 
 __all__ = [
     "DEEPPLAN",
@@ -71,6 +74,56 @@ def compute_metrics(
     """
     result = judge(measure(log, road), thresholds)
     return add_metrics(result, log, road, own) if own else result
+
+
+def load_metric(spec: str | CustomMetric) -> CustomMetric:
+    """The callable that `module:attribute` names, or the callable itself.
+
+    Raises:
+        ConfigError: It cannot be imported, or is not callable.
+    """
+    if not isinstance(spec, str):
+        return spec
+    module_name, _, attribute = spec.partition(":")
+    hint = "name it as module:attribute, for example my_package.metrics:min_gap"
+    if not module_name or not attribute:
+        raise ConfigError(f"metric {spec!r} is not of the form module:attribute", hint)
+    metric = load_attribute("metric", spec, hint)
+    if not callable(metric):
+        raise ConfigError(f"metric {spec!r} is not callable but {type(metric).__name__}", hint)
+    found: CustomMetric = metric
+    return found
+
+
+def add_metrics(
+    result: MetricResult, log: SimulationLog, road: VectorMap, metrics: Sequence[str | CustomMetric]
+) -> MetricResult:
+    """The same result with the rows of custom metrics in `extra`; the score stays as it is.
+
+    Raises:
+        ConfigError: A metric cannot be loaded, or two rows have the same name.
+    """
+    rows = [_run(load_metric(metric), log, road) for metric in metrics]
+    taken = {*result.scores, *SHORT_NAMES}
+    for row in rows:
+        if row.metric in taken:
+            raise ConfigError(f"metric name {row.metric!r} is taken", "rename the custom metric")
+        taken.add(row.metric)
+    return replace(result, extra=tuple(rows))
+
+
+def _run(metric: CustomMetric, log: SimulationLog, road: VectorMap) -> MetricRow:
+    name = getattr(metric, "__name__", type(metric).__name__)
+    value = metric(log, road)
+    if isinstance(value, MetricRow):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"metric {name!r} returned {value!r}", "return a number or a MetricRow"
+        ) from error
+    return MetricRow(name, None, number, "", None, None)
 
 
 if __name__ == "metrics":  # pragma: no cover

@@ -57,14 +57,7 @@ _UNITS = {
 
 
 def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
-    """The seven signals of a driven sequence of states.
-
-    Args:
-        time_us: (K,) time stamps [us].
-        states: (K, 11) rear-axle states, columns of `state.STATE_COLUMNS`.
-
-    Returns:
-        The signals, rounded to 8 decimals as nuPlan does.
+    """The seven signals of states (K, 11) at times (K,) [us], rounded to 8 decimals as nuPlan does.
 
     Raises:
         DataError: There are fewer than 4 samples, or the stamps do not increase.
@@ -111,13 +104,10 @@ def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:
 
 def within_bounds(signals: ComfortSignals, thresholds: Thresholds) -> list[bool]:
     """Whether each entry of `BOUNDED_SIGNALS` stays strictly within its bounds throughout."""
+    bounded = (getattr(signals, name) for name in BOUNDED_SIGNALS.values())
     return [
         bool(((low < values) & (values < high)).all())
-        for values, (low, high) in zip(
-            (getattr(signals, name) for name in BOUNDED_SIGNALS.values()),
-            bounds_of(thresholds),
-            strict=True,
-        )
+        for values, (low, high) in zip(bounded, bounds_of(thresholds), strict=True)
     ]
 
 
@@ -125,11 +115,11 @@ def judge(
     signals: ComfortSignals, time_us: IntArray, thresholds: Thresholds
 ) -> tuple[list[MetricPart], MetricPart]:
     """The six unscored signals in the order of `BOUNDED_SIGNALS`, and the comfort score."""
-    parts = []
-    for (metric, signal), bounds in zip(
-        BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True
-    ):
-        parts.append(_judge_signal(metric, getattr(signals, signal), time_us, bounds))
+    bounded = zip(BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True)
+    parts = [
+        _judge_signal(metric, getattr(signals, name), time_us, bounds)
+        for (metric, name), bounds in bounded
+    ]
     broken = [part.row.violation for part in parts if part.row.violation is not None]
     score = float(not broken)
     first = min(broken, key=lambda violation: violation.iteration, default=None)
@@ -205,13 +195,10 @@ def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
 
 @kernel
 def _filter(values: FloatArray, interior: FloatArray, fit: FloatArray, scale: float) -> FloatArray:
-    """Filter a signal and round it to 8 decimals.
+    """Filter a signal (K,), divide it by `scale`, and round it to 8 decimals.
 
-    Args:
-        values: (K,) the signal.
-        interior: (W,) weights; output n sees the samples from n - (W - 1) // 2 on.
-        fit: (W, W) edge outputs from the first or last W samples, W <= K.
-        scale: What every output is divided by.
+    Output n is the sum of the samples from n - (W - 1) // 2 on, weighted by `interior` (W,); at the
+    edges `fit` (W, W) gives it from the first or last W samples, W <= K.
     """
     count, window = len(values), len(fit)
     half = window // 2

@@ -42,17 +42,9 @@ def judge(
     far = np.any(area.outside & (area.distances >= bound), axis=1)
     furthest = area.distances.max(axis=1)
     score = float(not far.any())
-    compliance = MetricPart(
-        MetricRow(
-            NAME,
-            score,
-            float(furthest.max()),
-            "meters",
-            bound,
-            first_violation(far, furthest, time_us),
-        ),
-        (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),),
-    )
+    first = first_violation(far, furthest, time_us)
+    row = MetricRow(NAME, score, float(furthest.max()), "meters", bound, first)
+    compliance = MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
     outside = np.any(area.outside, axis=1)
     inside = float(not outside.any())
     first = first_violation(outside, furthest, time_us)
@@ -66,23 +58,15 @@ def judge(
 
 @kernel
 def _corner_violations(
-    drivable: Polygons,
-    edges: Polygons,
-    corners: FloatArray,
-    corner_counts: IntArray,
-    route: EdgeLists,
+    drivable: Polygons,  # areas whose union is drivable
+    edges: Polygons,  # areas of lanes and connectors
+    corners: FloatArray,  # (K, 4, 2) [m]
+    corner_counts: IntArray,  # (K, 4) number of edges that hold each corner
+    route: EdgeLists,  # (K, C) edges of the ego centre
+    # written; distances are to the nearest drivable area or edge of the ego centre [m]
     out: DrivableArea,
 ) -> None:
-    """Write how far each corner is from where it may be.
-
-    Args:
-        drivable: Areas whose union is drivable.
-        edges: Areas of lanes and connectors.
-        corners: (K, 4, 2) [m].
-        corner_counts: (K, 4) number of edges that hold each corner.
-        route: (K, C) edges of the ego centre.
-        out: Written; distances are to the nearest drivable area or edge of the ego centre [m].
-    """
+    """Write how far each corner is from where it may be."""
     outside, distances = out.outside, out.distances
     found = np.full(4, -1)  # nearest drivable area of each corner in the sample before
     for i in range(len(corners)):

@@ -133,23 +133,15 @@ def _common(
 
 @kernel
 def _lane_states(
-    corners: EdgeLists,
-    incoming: Lists,
-    outgoing: Lists,
-    most: int,
+    corners: EdgeLists,  # (K, 4, C) edges of each corner
+    incoming: Lists,  # edges that lead into an edge
+    outgoing: Lists,  # edges an edge leads to
+    most: int,  # upper bound on the number of edges common to the corners
+    # (K,) written: number of common or connected edges; 0 entirely outside lanes, -1 none
     states: IntArray,
-    changes: IntArray,
+    changes: IntArray,  # (K, 3) written: opening sample, closing sample, 1 if it failed
 ) -> int:
     """Which samples have all corners in the same or connected lanes, and the lane changes.
-
-    Args:
-        corners: (K, 4, C) edges of each corner.
-        incoming: Edges that lead into an edge.
-        outgoing: Edges an edge leads to.
-        most: Upper bound on the number of edges common to the corners.
-        states: (K,) written: number of common or connected edges; 0 entirely outside lanes,
-            -1 none.
-        changes: (K, 3) written: opening sample, closing sample, 1 if it failed.
 
     Returns:
         Number of lane changes.

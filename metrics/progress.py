@@ -153,23 +153,14 @@ def _project_end(lines: Polylines, line: int, other: int) -> float:
 
 @lean_kernel
 def _progress_along(
-    blocks: Polygons,
-    lines: Polylines,
-    chain_blocks: IntArray,
-    chain_edges: IntArray,
-    poses: FloatArray,
-    out: FloatArray,
+    blocks: Polygons,  # areas of the roadblocks and roadblock connectors
+    lines: Polylines,  # baselines of the edges
+    chain_blocks: IntArray,  # (L,) blocks in order, L >= 1
+    chain_edges: IntArray,  # (L,) edge of each block whose baseline measures progress
+    poses: FloatArray,  # (K, 3) points x [m], y [m]; the third column is not read
+    out: FloatArray,  # (K,) progress [m]; 0 at the first point
 ) -> None:
-    """Write the progress of each point over the one before it, along a chain of roadblocks.
-
-    Args:
-        blocks: Areas of the roadblocks and roadblock connectors.
-        lines: Baselines of the edges.
-        chain_blocks: (L,) blocks in order, L >= 1.
-        chain_edges: (L,) edge of each block whose baseline measures progress.
-        poses: (K, 3) points x [m], y [m]; the third column is not read.
-        out: (K,) progress [m]; 0 at the first point.
-    """
+    """Write the progress of each point over the one before it, along a chain of roadblocks."""
     at, last = 0, len(chain_blocks) - 1
     previous = project_on_line(lines, chain_edges[0], poses[0, 0], poses[0, 1])
     out[0] = 0.0
@@ -205,14 +196,7 @@ def _progress_along(
 def _progress_in_lane(
     lines: Polylines, route: EdgeLists, poses: FloatArray, out: FloatArray
 ) -> None:
-    """Write the progress of the ego along the baseline of the edge it is in.
-
-    Args:
-        lines: Baselines of the edges.
-        route: (K, C) edges of the ego centre.
-        poses: (K, 3) ego centres.
-        out: (K,) progress since the sample before [m].
-    """
+    """Write progress (K,) of centres (K, 3) along the baseline of their edge, by sample [m]."""
     lists, counts = route.edges, route.counts
     edge = lists[0, 0] if counts[0] > 0 else -1
     known, previous = False, 0.0

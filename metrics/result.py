@@ -9,19 +9,12 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 
 
 class Violation(NamedTuple):
-    """Where a bound is broken first.
+    """Where a bound is broken first."""
 
-    Attributes:
-        iteration: Sample.
-        time_us: Its time stamp [us].
-        partner: Token of the other track, or None.
-        value: The value that breaks the bound, in the unit of the metric.
-    """
-
-    iteration: int
-    time_us: int
-    partner: str | None
-    value: float
+    iteration: int  # sample
+    time_us: int  # its time stamp [us]
+    partner: str | None  # token of the other track, or None
+    value: float  # the value that breaks the bound, in the unit of the metric
 
 
 def first_violation(broken: BoolArray, values: FloatArray, time_us: IntArray) -> Violation | None:
@@ -33,23 +26,14 @@ def first_violation(broken: BoolArray, values: FloatArray, time_us: IntArray) ->
 
 
 class MetricRow(NamedTuple):
-    """One metric of one rollout.
+    """One metric of one rollout."""
 
-    Attributes:
-        metric: Devkit metric name.
-        score: In [0, 1]; None for a metric that is not scored.
-        value: The number behind the score.
-        unit: Unit of value and threshold.
-        threshold: Bound on the value; None where there is none.
-        violation: First violation, or None.
-    """
-
-    metric: str
-    score: float | None
-    value: float
-    unit: str
-    threshold: float | None
-    violation: Violation | None
+    metric: str  # devkit metric name
+    score: float | None  # in [0, 1]; None for a metric that is not scored
+    value: float  # the number behind the score
+    unit: str  # unit of value and threshold
+    threshold: float | None  # bound on the value; None where there is none
+    violation: Violation | None  # first violation, or None
 
 
 class Statistic(NamedTuple):
@@ -79,22 +63,12 @@ class MetricPart:
 
 
 class Collision(NamedTuple):
-    """First contact of the ego with a track.
+    """First contact of the ego with a track."""
 
-    Attributes:
-        iteration: Sample.
-        time_us: Its time stamp [us].
-        token: The track.
-        kind: Its AgentKind code.
-        collision_type: One of `COLLISION_TYPES`.
-        delta_v: Change of speed of two equal masses [m/s].
-        at_fault: Whether the ego is to blame.
-    """
-
-    iteration: int
-    time_us: int
-    token: str
-    kind: int
-    collision_type: str
-    delta_v: float
-    at_fault: bool
+    iteration: int  # sample
+    time_us: int  # its time stamp [us]
+    token: str  # the track
+    kind: int  # its AgentKind code
+    collision_type: str  # one of `COLLISION_TYPES`
+    delta_v: float  # change of speed of two equal masses [m/s]
+    at_fault: bool  # whether the ego is to blame

@@ -57,14 +57,7 @@ def empty_lists(map: VectorMap, *shape: int) -> EdgeLists:
 
 
 def driven_route(map: VectorMap, centers: FloatArray) -> EdgeLists:
-    """Edges of a sequence of points, disambiguated over time.
-
-    Args:
-        map: The map.
-        centers: (K, 3) box centres x [m], y [m], heading [rad].
-
-    Returns:
-        (K, C) lists, most relevant edge first.
+    """Edges (K, C) of box centres (K, 3), disambiguated over time, most relevant edge first.
 
     Raises:
         MapError: Several lanes hold one of the points, where nuPlan's own code stops too.
@@ -77,14 +70,7 @@ def driven_route(map: VectorMap, centers: FloatArray) -> EdgeLists:
 
 
 def corner_routes(map: VectorMap, corners: FloatArray) -> EdgeLists:
-    """Edges of the four corners of the ego over time.
-
-    Args:
-        map: The map.
-        corners: (K, 4, 2) front-left, rear-left, rear-right, front-right [m].
-
-    Returns:
-        (K, 4, C) lists.
+    """Edges (K, 4, C) of the corners (K, 4, 2) of the ego over time.
 
     Raises:
         MapError: Several lanes hold one of the corners.

@@ -82,27 +82,17 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class MetricResult:
-    """Everything nuPlan says about one rollout under one threshold profile.
+    """Everything nuPlan says about one rollout under one threshold profile."""
 
-    Attributes:
-        score: Closed-loop score in [0, 1].
-        scores: Score by devkit metric name, None for metrics without one; always the same order.
-        rows: One row per metric, in the same order.
-        statistics: Named statistics, grouped by metric.
-        series: One value per sample, by metric.
-        thresholds: Name of the threshold profile.
-        measurements: Routes, collisions, signals and distances behind the scores.
-        extra: Rows of the user's own metrics; they never enter the score.
-    """
-
-    score: float
+    score: float  # closed-loop score in [0, 1]
+    # score by devkit metric name, None for metrics without one; always the same order
     scores: dict[str, float | None]
-    rows: tuple[MetricRow, ...]
-    statistics: tuple[Statistic, ...]
-    series: dict[str, Series]
-    thresholds: str
-    measurements: Measurements
-    extra: tuple[MetricRow, ...] = ()
+    rows: tuple[MetricRow, ...]  # one row per metric, in the same order
+    statistics: tuple[Statistic, ...]  # named statistics, grouped by metric
+    series: dict[str, Series]  # one value per sample, by metric
+    thresholds: str  # name of the threshold profile
+    measurements: Measurements  # routes, collisions, signals and distances behind the scores
+    extra: tuple[MetricRow, ...] = ()  # rows of the user's own metrics; they never enter the score
 
 
 def measure(log: SimulationLog, map: VectorMap) -> Measurements:

@@ -76,16 +76,10 @@ def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
 
 @lean_kernel
 def _speed_limits(lanes: Lanes, limits: FloatArray, route: EdgeLists, out: FloatArray) -> int:
-    """Write the speed limit that holds at each sample; NaN where there is none.
+    """Write the speed limit (K,) that holds at each sample, NaN where there is none [m/s].
 
-    Args:
-        lanes: The lanes.
-        limits: (E,) limits of the edges, NaN where missing [m/s].
-        route: (K, C) edges of the ego centre.
-        out: (K,) [m/s].
-
-    Returns:
-        -1, or the first sample on connectors that have no neighbour at all.
+    `limits` (E,) are those of the edges, NaN where missing; `route` (K, C) are the edges of the ego
+    centre. Returns -1, or the first sample on connectors that have no neighbour at all.
     """
     lists, counts = route.edges, route.counts
     for i in range(len(counts)):

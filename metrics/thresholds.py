@@ -10,50 +10,30 @@ from shiftsim.errors import one_of
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Every number that a score depends on; the defaults are nuPlan's.
+    """Every number that a score depends on; the defaults are nuPlan's."""
 
-    Attributes:
-        name: Profile name, which travels with every result.
-        max_abs_mag_jerk: Bound on the derivative of the acceleration magnitude [m/s^3].
-        max_abs_lat_accel: Bound on the lateral acceleration [m/s^2].
-        min_lon_accel: Lower bound on the longitudinal acceleration [m/s^2].
-        max_lon_accel: Upper bound on the longitudinal acceleration [m/s^2].
-        max_abs_lon_jerk: Bound on the longitudinal jerk [m/s^3].
-        max_abs_yaw_accel: Bound on the yaw acceleration [rad/s^2].
-        max_abs_yaw_rate: Bound on the yaw rate [rad/s].
-        max_drivable_area_violation: How far a corner may leave the drivable area [m].
-        driving_direction_compliance: Regress within the window up to which the score is 1 [m].
-        driving_direction_violation: Regress from which on the score is 0 [m].
-        driving_direction_horizon: Length of that window [s].
-        least_min_ttc: The time to collision must exceed this at every sample [s].
-        allowed_vru_collisions: At-fault collisions that halve the score instead of zeroing it.
-        allowed_vehicle_collisions: The same for vehicles.
-        allowed_object_collisions: The same for static objects.
-        min_progress: Progress ratio that counts as making progress.
-        score_progress: Progress below this counts as this, for ego and expert alike [m].
-        max_overspeed: Over-speed that costs the whole score when held throughout [m/s].
-        max_lane_change_fail_rate: Share of failed lane changes that still passes; not scored.
-    """
-
-    name: str
-    max_abs_mag_jerk: float = 8.37
-    max_abs_lat_accel: float = 4.89
-    min_lon_accel: float = -4.05
-    max_lon_accel: float = 2.40
-    max_abs_lon_jerk: float = 4.13
-    max_abs_yaw_accel: float = 1.93
-    max_abs_yaw_rate: float = 0.95
-    max_drivable_area_violation: float = 0.3
+    name: str  # profile name, which travels with every result
+    max_abs_mag_jerk: float = 8.37  # bound on the derivative of the acceleration magnitude [m/s^3]
+    max_abs_lat_accel: float = 4.89  # bound on the lateral acceleration [m/s^2]
+    min_lon_accel: float = -4.05  # lower bound on the longitudinal acceleration [m/s^2]
+    max_lon_accel: float = 2.40  # upper bound on the longitudinal acceleration [m/s^2]
+    max_abs_lon_jerk: float = 4.13  # bound on the longitudinal jerk [m/s^3]
+    max_abs_yaw_accel: float = 1.93  # bound on the yaw acceleration [rad/s^2]
+    max_abs_yaw_rate: float = 0.95  # bound on the yaw rate [rad/s]
+    max_drivable_area_violation: float = 0.3  # how far a corner may leave the drivable area [m]
+    # regress within the window up to which the score is 1 [m]
     driving_direction_compliance: float = 2.0
-    driving_direction_violation: float = 6.0
-    driving_direction_horizon: float = 1.0
-    least_min_ttc: float = 0.95
+    driving_direction_violation: float = 6.0  # regress from which on the score is 0 [m]
+    driving_direction_horizon: float = 1.0  # length of that window [s]
+    least_min_ttc: float = 0.95  # the time to collision must exceed this at every sample [s]
+    # at-fault collisions that halve the score instead of zeroing it
     allowed_vru_collisions: int = 0
-    allowed_vehicle_collisions: int = 0
-    allowed_object_collisions: int = 1
-    min_progress: float = 0.2
-    score_progress: float = 2.0
-    max_overspeed: float = 2.23
+    allowed_vehicle_collisions: int = 0  # the same for vehicles
+    allowed_object_collisions: int = 1  # the same for static objects
+    min_progress: float = 0.2  # progress ratio that counts as making progress
+    score_progress: float = 2.0  # progress below this counts as this, for ego and expert alike [m]
+    max_overspeed: float = 2.23  # over-speed that costs the whole score when held throughout [m/s]
+    # share of failed lane changes that still passes; not scored
     max_lane_change_fail_rate: float = 0.3
 
 

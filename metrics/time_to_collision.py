@@ -49,22 +49,12 @@ def time_to_collision(
     ego: Ego,
     tracks: FlatTracks,
     contacts: Contacts,
-    collisions: tuple[Collision, ...],
-    is_common: BoolArray,
+    collisions: tuple[Collision, ...],  # the same contacts with the verdict
+    is_common: BoolArray,  # (K,) whether all corners are in the same or in connected lanes
     map: VectorMap,
-    named: Tracks,
+    named: Tracks,  # for their tokens
 ) -> TimeToCollision:
-    """Smallest time to collision at every sample.
-
-    Args:
-        ego: The driven states.
-        tracks: The others.
-        contacts: First contact with each of them.
-        collisions: The same contacts with the verdict.
-        is_common: (K,) whether all corners are in the same or in connected lanes.
-        map: The map.
-        named: The tracks, for their tokens.
-    """
+    """Smallest time to collision at every sample."""
     num_samples = len(ego.speeds)
     partners = np.full(num_samples, -1)
     for collision in reversed(collisions):
@@ -97,24 +87,14 @@ def judge(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) -> Me
 def _time_to_collision(
     ego: Ego,
     tracks: FlatTracks,
-    first: IntArray,
-    is_common: BoolArray,
+    first: IntArray,  # (N,) sample of the first contact with each track, K where there is none
+    is_common: BoolArray,  # (K,) whether all corners are in the same or connected lanes
     intersections: Polygons,
-    ttc: FloatArray,
+    ttc: FloatArray,  # (K,) written: [s], inf where nothing is hit
+    # (K,) track of an at-fault collision at this sample, else -1; the track that is hit is written
     partners: IntArray,
 ) -> None:
-    """Write the time to collision of every sample.
-
-    Args:
-        ego: The driven states.
-        tracks: The others.
-        first: (N,) sample of the first contact with each track, K where there is none.
-        is_common: (K,) whether all corners are in the same or connected lanes.
-        intersections: The layer.
-        ttc: (K,) written: [s], inf where nothing is hit.
-        partners: (K,) track of an at-fault collision at this sample, else -1; the track that is
-            hit is written.
-    """
+    """Write the time to collision of every sample."""
     speeds, poses, sizes = ego.speeds, tracks.poses, tracks.sizes
     num_samples, num_tracks = tracks.valid.shape
     boxes, steps = np.empty((num_tracks + 1, BOX_SIZE)), np.empty((num_tracks + 1, 2))

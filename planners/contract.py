@@ -15,9 +15,8 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.sim.observation import observe_log, scene_info
 from shiftsim.sim.plan_check import find_fault
-from shiftsim.sim.planner import History, Observation, SceneInfo
+from shiftsim.sim.planner import History, Observation, SceneInfo, observe_log, scene_info
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command, Trajectory
 

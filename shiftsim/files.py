@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -98,6 +99,19 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
         ) from error
+
+
+def load_attribute(what: str, name: str, hint: str) -> Any:
+    """What a user names as `module:attribute`; `what` it is and the hint go into the message.
+
+    Raises:
+        ConfigError: It cannot be imported.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
 
 
 def sources(paths: Iterable[Path]) -> dict[str, bytes]:

@@ -18,7 +18,7 @@ from shiftsim.geometry.corridors import (
     side_of,
     without_repeats,
 )
-from shiftsim.geometry.paths import RUN, bound_runs
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.geometry.rings import point_segment_distance, rings_touch
 
 UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet
@@ -40,12 +40,8 @@ def find_sides(
 ) -> None:
     """Decide which objects touch the corridor, as far as distances can.
 
-    Args:
-        line: (K, 2) or (K, 3) the stretch of path [m].
-        half_width: Radius of the buffer around it [m].
-        footprint: (4, 2) corners of the ego, which belongs to the corridor [m].
-        objects: The polygons.
-        out: (M,) CLEAR, HIT or OPEN is written where UNKNOWN stands.
+    The corridor is the stretch of path (K, 2) or (K, 3), buffered by `half_width` [m], and the
+    `footprint` (4, 2) of the ego. CLEAR, HIT or OPEN is written to `out` (M,) where UNKNOWN stands.
     """
     runs = np.empty(((len(line) - 2) // RUN + 1, 4))
     bound_runs(line, runs)

@@ -9,15 +9,29 @@ from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners
 from shiftsim.geometry.corridors import OPEN
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.paths import Path, pose_at
+from shiftsim.geometry.polylines import Path, pose_at
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, exact_side, find_lead, find_sides
-from shiftsim.planners.idm.route import build_path, plan_route, route_blocks
-from shiftsim.planners.routes.lanes import lanes_of, red_lanes
-from shiftsim.planners.routes.paths import LanePath, sub_path
-from shiftsim.planners.routes.search import Search
+from shiftsim.planners.routes.lanes import (
+    HINT,
+    LanePath,
+    lane_at,
+    lane_path,
+    lanes_of,
+    red_lanes,
+    sub_path,
+)
+from shiftsim.planners.routes.search import Search, search_levels
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, VX, Trajectory, rear_poses
+from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.state import (
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    VX,
+    Trajectory,
+    VehicleParameters,
+    rear_poses,
+)
 
 STEPS = 16
 STEP = 0.5  # s
@@ -25,6 +39,72 @@ STEP_US = 500_000
 HORIZON = STEPS * STEP  # s
 RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
 _EGO_TOKEN = "ego_token"
+
+
+def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
+    """Block indices of a route, NONE for ids the map does not have.
+
+    Raises:
+        PlannerError: The route is too short, or a block that must be known is not.
+    """
+    if len(route) < 2:
+        raise PlannerError(
+            f"idm: the route of scenario {token!r} has {len(route)} roadblocks, at least 2 "
+            "are needed",
+            hint=HINT,
+        )
+    blocks = [road.blocks.index.get(name, NONE) for name in route]
+    # nuPlan rule 151: an unknown id is passed over, except where the planner needs the object
+    for position in (0, 1, len(blocks) - 1):
+        if blocks[position] == NONE:
+            raise PlannerError(
+                f"idm: map {road.name!r} has no roadblock {route[position]!r}, number {position} "
+                f"of the route of scenario {token!r}",
+                hint="the first two and the last roadblock of a route must exist",
+            )
+    return blocks
+
+
+def plan_route(
+    road: VectorMap, blocks: list[int], center: FloatArray, vehicle: VehicleParameters
+) -> Search:
+    """Lanes from the ego, whose box centre is (3,), to the last block of the route.
+
+    Raises:
+        PlannerError: The first two blocks of the route have no lanes.
+    """
+    lanes = lanes_of(road, blocks[:2])
+    if not lanes:
+        raise PlannerError(
+            f"idm: map {road.name!r} has no lanes in the first two roadblocks of the route",
+            hint=HINT,
+        )
+    start = lane_at(road, np.array(lanes), center, vehicle.length, vehicle.width)
+    skipped = 1 if int(road.block_of[start]) == blocks[1] else 0
+    allowed = set(lanes_of(road, blocks))
+    # nuPlan rule 152: the goal must lie exactly as deep as the route is long
+    return search_levels(
+        lambda lane: [after for after in road.outgoing.at(lane).tolist() if after in allowed],
+        start,
+        set(lanes_of(road, blocks[-1:])),
+        len(blocks) - skipped,
+        only_last=True,
+    )
+
+
+def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
+    """The path along the baselines of some lanes.
+
+    Raises:
+        PlannerError: Fewer than two vertices are left.
+    """
+    path = lane_path(road, lanes)
+    if len(path.driven.progress) < 2:
+        raise PlannerError(
+            f"idm: the baselines of {[road.edges.ids[e] for e in lanes]} have too few vertices",
+            hint="a path needs at least three different vertices",
+        )
+    return path
 
 
 class Policy(NamedTuple):
@@ -187,24 +267,15 @@ def _pose(path: Path, progress: float) -> tuple[float, float, float]:
 
 @kernel
 def _roll_on(
-    first: int,
+    first: int,  # row that is known
     path: Path,
     objects: Objects,
     policy: Policy,
-    centers: FloatArray,
-    motion: FloatArray,
-    sides: IntArray,
+    centers: FloatArray,  # (17, 3) box centres x [m], y [m], heading [rad]
+    motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
+    sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
 ) -> tuple[int, int]:
     """Fill the rows behind `first` until the end, or until an OPEN object would be the lead.
-
-    Args:
-        first: Row that is known.
-        path: The path.
-        objects: What may stand in the way.
-        policy: How to drive.
-        centers: (17, 3) box centres x [m], y [m], heading [rad].
-        motion: (17, 2) progress [m] and speed [m/s].
-        sides: (16, M) side of every object at every step, decided as far as needed.
 
     Returns:
         The row and the object to decide, or -1 for the object at the end.

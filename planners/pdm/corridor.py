@@ -17,7 +17,7 @@ from shiftsim.geometry.corridors import (
     side_of,
     without_repeats,
 )
-from shiftsim.geometry.paths import Path, project, window
+from shiftsim.geometry.polylines import Path, project, window
 from shiftsim.geometry.rings import centroid
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
 

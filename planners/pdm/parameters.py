@@ -10,20 +10,13 @@ from shiftsim.planners.proposals.comfort import ComfortBounds
 
 
 class FollowingModel(NamedTuple):
-    """Parameters of the batch IDM policy.
+    """Parameters of the batch IDM policy."""
 
-    Attributes:
-        min_gap: Gap kept at standstill [m].
-        headway: Time gap kept [s].
-        accel_max: Largest acceleration [m/s^2].
-        decel_max: Largest deceleration, positive [m/s^2].
-        exponent: Of the ratio between speed and target speed.
-    """
-
-    min_gap: float = 1.0
-    headway: float = 1.5
-    accel_max: float = 1.5
-    decel_max: float = 3.0
+    min_gap: float = 1.0  # gap kept at standstill [m]
+    headway: float = 1.5  # time gap kept [s]
+    accel_max: float = 1.5  # largest acceleration [m/s^2]
+    decel_max: float = 3.0  # largest deceleration, positive [m/s^2]
+    # of the ratio between speed and target speed
     exponent: float = 10.0  # nuPlan rule 182: its own IDM uses 4
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.paths import Path, make_path
+from shiftsim.geometry.polylines import Path, make_path
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
     Forecast,
@@ -23,21 +23,14 @@ from shiftsim.planners.pdm.forecast import (
 )
 from shiftsim.planners.pdm.parameters import FollowingModel, PdmParameters
 from shiftsim.planners.pdm.rollout import Scene
-from shiftsim.planners.pdm.route import (
-    Route,
-    current_lane,
-    follow_route,
-    offset_poses,
-    start_route,
-)
+from shiftsim.planners.pdm.route import Route, current_lane, follow_route, offset_poses, start_route
 from shiftsim.planners.pdm.scorer import Place
 from shiftsim.planners.pdm.step import Step, plan_step
 from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import known_blocks
-from shiftsim.planners.routes.lanes import red_lanes
-from shiftsim.planners.routes.paths import centerline
+from shiftsim.planners.routes.lanes import centerline, red_lanes
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import NUM_STATE, Trajectory

@@ -12,7 +12,7 @@ from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around
 from shiftsim.geometry.corridors import HIT
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.paths import Path, pose_at, project
+from shiftsim.geometry.polylines import Path, pose_at, project
 from shiftsim.geometry.rings import ring_distance
 from shiftsim.planners.pdm.corridor import Corridor, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks
@@ -115,28 +115,17 @@ def read_pose(path: Path, progress: float, out: FloatArray) -> None:
 
 @kernel
 def _roll(
-    first: int,
-    last: int,
+    first: int,  # first time index to fill; the one before it is filled
+    last: int,  # last time index to fill
     path: Path,
-    corridor: Corridor,
+    corridor: Corridor,  # what stands in its way
     forecast: Forecast,
-    ranks: IntArray,
+    ranks: IntArray,  # (41, M) order of what is around on a forecast map, -1 where not known
     size: EgoBox,
-    model: FollowingModel,
+    model: FollowingModel,  # the longitudinal policy
     rows: Rows,
 ) -> int:
     """Roll the policies of one path on, from time index `first` to `last`.
-
-    Args:
-        first: First time index to fill; the one before it is filled.
-        last: Last time index to fill.
-        path: The path.
-        corridor: What stands in its way.
-        forecast: What is around.
-        ranks: (41, M) order of what is around on a forecast map, -1 where not known.
-        size: Of the ego.
-        model: The longitudinal policy.
-        rows: The policies.
 
     Returns:
         _DONE, or the time index whose ranks are needed to break a tie.

@@ -30,13 +30,7 @@ class Route(NamedTuple):
 
 
 def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
-    """Correct a route at the start of a scenario.
-
-    Args:
-        road: The map.
-        ids: Roadblock ids of the route.
-        ego: (11,) ego state.
-        token: Id of the scenario, for messages.
+    """Correct a route, given by roadblock ids, at the start of a scenario, from an ego state (11,).
 
     Raises:
         PlannerError: The route is empty, unknown to the map, or has no lanes.
@@ -47,31 +41,19 @@ def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str
     corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
     lanes = lanes_of(road, corrected)
     if not lanes:
-        raise PlannerError(
-            f"pdm-closed: the route of scenario {token!r} has no lanes",
-            hint=HINT,
-        )
+        raise PlannerError(f"pdm-closed: the route of scenario {token!r} has no lanes", hint=HINT)
     return Route(start, corrected, np.array(lanes), make_areas(road, lanes))
 
 
 def current_lane(
     road: VectorMap,
     route: Route,
-    selected: IntArray,
-    ego: FloatArray,
-    center: FloatArray,
+    selected: IntArray,  # drivable areas of this step
+    ego: FloatArray,  # (11,) ego state
+    center: FloatArray,  # (3,) its centre x [m], y [m], heading [rad]
     size: EgoBox,
 ) -> int:
-    """The lane of the route that the ego is on.
-
-    Args:
-        road: The map.
-        route: The corrected route.
-        selected: Drivable areas of this step.
-        ego: (11,) ego state.
-        center: (3,) its centre x [m], y [m], heading [rad].
-        size: Its dimensions.
-    """
+    """The lane of the route that the ego is on."""
     areas, errors = lanes_at(road, route, selected, ego)
     if not areas:
         return lane_at(road, route.lanes, center, size.length, size.width)

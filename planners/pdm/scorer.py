@@ -9,7 +9,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing, circle_around
-from shiftsim.geometry.paths import Path, project
+from shiftsim.geometry.polylines import Path, project
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import Areas
 from shiftsim.planners.proposals.comfort import comfort

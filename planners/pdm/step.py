@@ -1,16 +1,47 @@
-"""One planning step of PDM-Closed, from what it sees to the plan."""
+"""One planning step of PDM-Closed, from what it sees to the plan or the emergency brake."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.planners.pdm.brake import brake_poses
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.pdm.rollout import Proposals, Scene, extend, roll_out, start_proposals
 from shiftsim.planners.pdm.scorer import Place, Scores, score
-from shiftsim.planners.proposals.tracker import DT, SCORED, Driven, drive_proposals
-from shiftsim.world.state import VX, VY, VehicleParameters
+from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS, Driven, drive_proposals
+from shiftsim.world.state import (
+    AX,
+    HEADING,
+    VX,
+    VY,
+    YAW_RATE,
+    VehicleParameters,
+    center_poses,
+    rear_poses,
+)
+
+MAX_ACCEL, MIN_ACCEL = 2.40, -4.05  # m/s^2
+STOPPED = 0.2  # m/s
+
+
+def brake_speed(ego: FloatArray, vehicle: VehicleParameters) -> float:
+    """Speed of the reference that makes the tracker brake, usually backwards [m/s]."""
+    speed = float(ego[VX])
+    if speed > STOPPED:
+        return 1.1 * (speed + float(np.clip(-10.0 * speed, MIN_ACCEL, MAX_ACCEL)))
+    # nuPlan rule 194: the centre's acceleration without the angular term
+    accel = float(ego[AX]) + vehicle.rear_axle_to_center * float(ego[YAW_RATE]) ** 2
+    return float(np.clip(-4.0 * speed - accel, MIN_ACCEL, MAX_ACCEL))
+
+
+def brake_poses(ego: FloatArray, vehicle: VehicleParameters) -> FloatArray:
+    """(81, 3) rear-axle poses straight along the heading of an ego state (11,)."""
+    center = center_poses(ego[None, :3], vehicle)[0]
+    travel = brake_speed(ego, vehicle) * DT * np.arange(STEPS + 1)
+    centers = np.tile(center, (STEPS + 1, 1))
+    centers[:, 0] += travel * np.cos(ego[HEADING])
+    centers[:, 1] += travel * np.sin(ego[HEADING])
+    return rear_poses(centers, vehicle)
 
 
 class Step(NamedTuple):
@@ -25,23 +56,14 @@ class Step(NamedTuple):
 
 
 def plan_step(
-    ego: FloatArray,
-    targets: FloatArray,
-    scene: Scene,
-    place: Place,
+    ego: FloatArray,  # (11,) ego state
+    targets: FloatArray,  # (F,) target speeds, slowest first [m/s]
+    scene: Scene,  # what the proposals are rolled out in
+    place: Place,  # the map of this step
     vehicle: VehicleParameters,
     params: PdmParameters,
 ) -> Step:
-    """Roll out, drive and score proposals, and choose.
-
-    Args:
-        ego: (11,) ego state.
-        targets: (F,) target speeds, slowest first [m/s].
-        scene: What the proposals are rolled out in.
-        place: The map of this step.
-        vehicle: Dimensions of the ego.
-        params: The planner's numbers.
-    """
+    """Roll out, drive and score proposals, and choose."""
     proposals = start_proposals(scene, ego, targets)
     roll_out(proposals, scene)
     poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)

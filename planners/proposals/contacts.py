@@ -53,14 +53,7 @@ def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
 
 @kernel
 def near_others(places: Places, others: Others, rows: int, horizon: float) -> IntArray:
-    """Those that can touch an ego box, or its projection, at any time.
-
-    Args:
-        places: Of the proposals.
-        others: The others.
-        rows: Of time, that count.
-        horizon: Of the projection [s].
-    """
+    """Those that can touch an ego box, or its projection over `horizon` [s], in the first rows."""
     states, corners = places.states, places.corners
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
@@ -105,15 +98,9 @@ def hits(
 def is_at_fault(
     state: FloatArray, box: FloatArray, is_off_lane: bool, others: Others, row: int, index: int
 ) -> bool:
-    """Whether the ego causes a collision.
+    """Whether the ego causes a collision with one of the others at a row of time.
 
-    Args:
-        state: (11,) ego state.
-        box: (4, 2) its corners [m].
-        is_off_lane: Whether it is on several lanes or off the road.
-        others: The others.
-        row: Of time.
-        index: The one that is hit.
+    `state` (11,) and `box` (4, 2) are the ego's; `is_off_lane`: on several lanes or off the road.
     """
     if np.hypot(state[VX], state[VY]) <= STOPPED:
         return False
@@ -129,14 +116,10 @@ def is_at_fault(
 def first_faults(
     places: Places, others: Others, near: IntArray, rows: IntArray, forgives: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """At-fault collisions.
+    """At-fault collisions with those of the others that are near.
 
-    Args:
-        places: Of the proposals.
-        others: The others.
-        near: Those that count.
-        rows: (T,) row of time of each time index; -1 where it is not looked at.
-        forgives: Whether a first contact without fault makes all later ones count as such.
+    `rows` (T,) is the row of time of each time index, -1 where it is not looked at. With `forgives`
+    a first contact without fault makes all later ones count as such.
 
     Returns:
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.

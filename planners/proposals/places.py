@@ -44,22 +44,13 @@ def ego_box(vehicle: VehicleParameters) -> EgoBox:
 def find_places(
     states: FloatArray,
     size: EgoBox,
-    areas: Areas,
-    selected: IntArray,
-    limits: FloatArray,
+    areas: Areas,  # all areas of the map
+    selected: IntArray,  # those of this step
+    limits: FloatArray,  # (M,) speed limits of all areas [m/s]
     *,
-    by_center: bool,
+    by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
 ) -> Places:
-    """Places of driven states (P, T, 11).
-
-    Args:
-        states: The states.
-        size: Of the ego.
-        areas: All areas of the map.
-        selected: Those of this step.
-        limits: (M,) speed limits of all areas [m/s].
-        by_center: Whether the ego is on the route where its centre is, not its rear axle.
-    """
+    """Places of driven states (P, T, 11)."""
     shape = states.shape[:2]
     corners, centers = np.empty((*shape, 4, 2)), np.empty((*shape, 2))
     _place_ego(states, size, corners, centers)

@@ -119,13 +119,7 @@ class Driven(NamedTuple):
 def drive_proposals(
     poses: FloatArray, ego: FloatArray, vehicle: VehicleParameters = PACIFICA
 ) -> Driven:
-    """Drive proposals from one ego state.
-
-    Args:
-        poses: (P, T, 3) x [m], y [m], heading [rad]; T > 40.
-        ego: (11,) ego state.
-        vehicle: Dimensions of the ego.
-    """
+    """Drive proposals (P, T, 3), T > 40, from one ego state (11,)."""
     shape = (len(poses), poses.shape[1] - 1)
     driven = Driven(np.empty(shape), np.empty(shape), np.empty((len(poses), SCORED + 1, NUM_STATE)))
     _drive(poses, ego, NUPLAN._replace(wheel_base=vehicle.wheel_base), DT, driven)

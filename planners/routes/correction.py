@@ -33,22 +33,13 @@ class Start(NamedTuple):
 
 
 def known_blocks(road: VectorMap, route: Sequence[str], token: str, planner: str) -> list[int]:
-    """Block indices of a route, each once.
-
-    Args:
-        road: The map.
-        route: Roadblock ids.
-        token: Id of the scenario, for messages.
-        planner: Name of the planner, for messages.
+    """Block indices of a route, given by roadblock ids, each once.
 
     Raises:
         PlannerError: The route is empty or names a block that the map does not have.
     """
     if not route:
-        raise PlannerError(
-            f"{planner}: the route of scenario {token!r} is empty",
-            hint=HINT,
-        )
+        raise PlannerError(f"{planner}: the route of scenario {token!r} is empty", hint=HINT)
     for name in route:
         if name not in road.blocks.index:
             raise PlannerError(
@@ -67,13 +58,7 @@ class RouteCorrector:
     """
 
     def __init__(self, road: VectorMap, blocks: list[int], half_width: float) -> None:
-        """Take a route.
-
-        Args:
-            road: The map.
-            blocks: The route, each block once (`known_blocks`).
-            half_width: Of the square around the rear axle that is searched for the start [m].
-        """
+        """Take a route (`known_blocks`) and half the side of the square to search [m]."""
         self._road, self._blocks, self._half_width = road, blocks, half_width
         self._on_route = set(blocks)
         self._known: dict[tuple[int, ...], tuple[int, ...]] = {}
@@ -99,14 +84,10 @@ def correct_route(road: VectorMap, route: list[int], start: Start) -> list[int]:
 def find_start(
     road: VectorMap, route: Sequence[int], rear_axle: FloatArray, area: FloatArray
 ) -> Start:
-    """The block near the rear axle that fits its heading best, preferably on the route.
+    """The block near the rear axle (3,) that fits its heading best, preferably on the route.
 
-    Args:
-        road: The map.
-        route: Blocks.
-        rear_axle: (3,) x [m], y [m], heading [rad].
-        area: (4, 2) corners of the box that blocks must touch, counter-clockwise [m]; where none
-            does, the nearest of either kind are taken.
+    `area` (4, 2) are the corners, counter-clockwise [m], of the box that blocks must touch; where
+    none does, the nearest of either kind are taken.
 
     Raises:
         PlannerError: The map has no blocks.

@@ -1,19 +1,30 @@
-"""Lanes of a route: which there are, which are red, and which one a pose is on or nearest to."""
+"""Lanes of a route, which of them a pose is on, and nuPlan's interpolated path along them."""
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import nearest_vertex, vertex_heading
+from shiftsim.geometry.polylines import (
+    Path,
+    arc_lengths,
+    make_path,
+    nearest_vertex,
+    pose_at,
+    project_on_polyline,
+    vertex_heading,
+    vertex_headings,
+)
 from shiftsim.geometry.rings import ring_distance
 from shiftsim.world.layers import Polylines, contains
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus
 
 HINT = "correct the route of the scenario, or leave it out"  # of errors about routes
+SAME_POINT = 1e-8  # m, vertices closer than this are one
 
 
 def lanes_of(road: VectorMap, blocks: Iterable[int]) -> list[int]:
@@ -41,15 +52,7 @@ def deviation(
 def lane_at(
     road: VectorMap, lanes: IntArray, center: FloatArray, length: float, width: float
 ) -> int:
-    """The first lane that holds the centre of a box, else the one nearest to the box.
-
-    Args:
-        road: The map.
-        lanes: Lanes and connectors that count, at least one.
-        center: (3,) centre of the box x [m], y [m], heading [rad].
-        length: Of the box [m].
-        width: Of the box [m].
-    """
+    """The first lane that holds the centre (3,) of a box, else the one nearest to the box."""
     x, y, heading = center
     bounds = road.edges.polygons.bounds[lanes]
     away_x = np.maximum(np.maximum(bounds[:, 0] - x, x - bounds[:, 2]), 0.0)
@@ -67,3 +70,61 @@ def lane_at(
         ring = road.edges.rings(lanes[place])[0].copy()  # read-only ones would need a kernel more
         best = min(best, (float(ring_distance(footprint, ring)), place))
     return int(lanes[best[1]])
+
+
+class LanePath(NamedTuple):
+    """The path along some lanes."""
+
+    # (V, 2) all vertices of the lanes' baselines, on which the ego is projected [m]
+    line: FloatArray
+    line_arc: FloatArray  # (V,) arc length at each of them [m]
+    driven: Path  # what poses are read from: without repeated vertices
+
+    @property
+    def end(self) -> float:
+        """Progress at the last vertex [m]."""
+        return float(self.driven.progress[-1])
+
+    def project(self, x: float, y: float) -> float:
+        """Progress of the point of the path nearest to (x, y) [m]."""
+        return float(project_on_polyline(self.line, self.line_arc, 0, len(self.line), x, y))
+
+
+def centerline(road: VectorMap, lanes: Iterable[int]) -> FloatArray:
+    """Poses (K, 3) along the baselines of lanes x [m], y [m], heading [rad]."""
+    lines = [road.baselines.at(lane) for lane in lanes]
+    return np.concatenate([np.column_stack([xy, vertex_headings(xy)]) for xy in lines])
+
+
+def lane_path(road: VectorMap, lanes: Iterable[int]) -> LanePath:
+    """The path along the baselines of some lanes."""
+    poses = centerline(road, lanes)
+    line = np.ascontiguousarray(poses[:, :2])
+    arc = arc_lengths(line, np.array([0, len(line)]))
+    # nuPlan rule 153: of two equal vertices the second stays, and the last of all is always lost
+    kept = np.flatnonzero(np.diff(arc) > SAME_POINT)
+    return LanePath(line, arc, make_path(poses[kept], arc[kept]))
+
+
+@kernel
+def sub_path(path: Path, low: float, high: float) -> FloatArray:
+    """Poses (K', 3) of a path between two progresses, the interpolated ends included.
+
+    Headings are not wrapped. At the ends of the path its two first, or last, vertices are left.
+    """
+    # loops instead of slice assignments, which take numba seconds to compile
+    count = len(path.progress)
+    first = int(np.searchsorted(path.progress, low, side="right"))
+    last = int(np.searchsorted(path.progress, high, side="left"))  # one past the last vertex
+    margin = 1
+    if first == count or last == 0:
+        margin, first, last = 0, 0 if last == 0 else count - 2, 2 if last == 0 else count
+    out = np.empty((max(last - first, 0) + 2 * margin, 3))
+    for vertex in range(first, last):
+        row = out[vertex - first + margin]
+        row[0], row[1], row[2] = path.xy[vertex, 0], path.xy[vertex, 1], path.heading[vertex]
+    if margin > 0:
+        out[0, 0], out[0, 1], out[0, 2] = pose_at(path, low)
+        end = len(out) - 1
+        out[end, 0], out[end, 1], out[end, 2] = pose_at(path, high)
+    return out

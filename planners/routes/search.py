@@ -20,14 +20,9 @@ class Search(NamedTuple):
 def search_levels(
     neighbours: Neighbours, start: int, goals: set[int], max_depth: int, *, only_last: bool = False
 ) -> Search:
-    """Breadth-first search by levels, the start being level 1.
+    """Breadth-first search by levels, the start being level 1 and `max_depth` the last.
 
-    Args:
-        neighbours: What follows a place, in order.
-        start: Where to start.
-        goals: Where to get to.
-        max_depth: The last level.
-        only_last: Goals count on the last level only.
+    With `only_last` goals count on the last level only.
     """
     # nuPlan rule 150: no set of visited places is kept, so a place may be queued many times on one
     # level; its parent is the last one that queued it, the goal is the first one queued, and

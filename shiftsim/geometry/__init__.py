@@ -1,1 +1,1 @@
-"""Kernels that two subsystems need, each once: boxes, rings, polylines, frames, predicates."""
+"""Kernels that two subsystems need, each once: boxes, rings, polylines, frames."""

@@ -1,4 +1,4 @@
-"""Oriented boxes: corners, overlap, and where a point lies as seen from a pose.
+"""Oriented boxes: corners, and where a point lies as seen from a pose.
 
 A box is (x, y, heading, length, width) with its centre pose; its corners run front-left, rear-left,
 rear-right, front-right.
@@ -6,13 +6,8 @@ rear-right, front-right.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
-from shiftsim.geometry.rings import (
-    EXTERIOR,
-    convex_intersect,
-    locate_in_ring,
-    segments_intersect,
-)
+from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.rings import EXTERIOR, locate_in_ring, segments_intersect
 
 # rad, bearings from the rear axle that at-fault tests compare with
 BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)
@@ -80,18 +75,3 @@ def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
         half_width * lat[..., None, :] + half_length * lon[..., None, :]
     )
     return corners
-
-
-def boxes_intersect(
-    poses_a: FloatArray, sizes_a: FloatArray, poses_b: FloatArray, sizes_b: FloatArray
-) -> BoolArray:
-    """(N,) whether box i of one list shares a point with box i of the other; touching counts."""
-    return _pairs_intersect(boxes_to_corners(poses_a, sizes_a), boxes_to_corners(poses_b, sizes_b))
-
-
-@kernel
-def _pairs_intersect(a: FloatArray, b: FloatArray) -> BoolArray:
-    out = np.empty(len(a), np.bool_)
-    for index in range(len(a)):
-        out[index] = convex_intersect(a[index], b[index])
-    return out

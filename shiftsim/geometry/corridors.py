@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, kernel, lean_kernel
-from shiftsim.geometry.paths import RUN, is_run_within
+from shiftsim.geometry.polylines import RUN, is_run_within
 from shiftsim.geometry.rings import point_segment_distance, ring_segment_distance, rings_touch
 
 CLEAR, HIT, OPEN = 0, 1, 2
@@ -44,14 +44,10 @@ def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
 
 @lean_kernel
 def side_of(stretch: Stretch, ring: FloatArray, x: float, y: float, radius: float) -> int:
-    """CLEAR, HIT or OPEN: whether a ring touches the corridor of a stretch.
+    """CLEAR, HIT or OPEN: whether a ring (V, 2) touches the corridor of a stretch.
 
-    Args:
-        stretch: Ends `without_repeats`; OPEN where it has a single vertex.
-        ring: (V, 2) a simple ring [m].
-        x: Centre of a circle around the ring [m].
-        y: Likewise.
-        radius: Of the circle [m].
+    The ring lies in the circle x, y, `radius` [m]. The stretch ends `without_repeats`; OPEN where
+    it has a single vertex.
     """
     xy, begin, end = stretch.xy, stretch.begin, stretch.end
     if end - begin < 2:

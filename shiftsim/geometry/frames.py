@@ -20,15 +20,6 @@ def wrap_angles(angles: FloatArray) -> FloatArray:
     return wrapped
 
 
-def to_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:
-    """Poses (..., 3) of the map frame expressed in the frame of the pose `origin` (3,)."""
-    cos, sin = np.cos(origin[2]), np.sin(origin[2])
-    dx, dy = poses[..., 0] - origin[0], poses[..., 1] - origin[1]
-    return np.stack(
-        [cos * dx + sin * dy, -sin * dx + cos * dy, wrap_angles(poses[..., 2] - origin[2])], -1
-    )
-
-
 def from_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:
     """Poses (..., 3) in the frame of the pose `origin` (3,) expressed in the map frame."""
     cos, sin = np.cos(origin[2]), np.sin(origin[2])

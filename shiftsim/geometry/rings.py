@@ -2,14 +2,81 @@
 
 A ring is a closed or open sequence of vertices (the closing edge is implied). Coordinates may
 be UTM: differences are always taken first.
+
+Every touching-or-not decision rests on the exact `orientation`. The sign of a cross product is
+computed in floating point first; when the rounding error could change it, it is computed again with
+exact expansions (Shewchuk, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
+Predicates", 1997). Decisions are therefore exact at any distance from the origin.
 """
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
-from shiftsim.geometry.predicates import orientation
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 
 INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
+_SPLITTER = 134217729.0  # 2**27 + 1
+_ERROR_BOUND = 3.3306690738754716e-16  # (3 + 16 eps) eps, eps = 2**-53
+
+
+@lean_kernel
+def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
+    """Side of the directed line a -> b on which c lies: 1 left, -1 right, 0 exactly on it."""
+    left = (ax - cx) * (by - cy)
+    right = (ay - cy) * (bx - cx)
+    det = left - right
+    if left == 0.0 or right == 0.0:
+        # a product is zero only where a difference is, and differences have the right sign
+        return 0 if det == 0.0 else (1 if det > 0.0 else -1)
+    if abs(det) > _ERROR_BOUND * (abs(left) + abs(right)):
+        return 1 if det > 0.0 else -1
+    return _exact_orientation(ax, ay, bx, by, cx, cy)
+
+
+@kernel
+def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
+    # det = (ax by - ay bx) + (bx cy - by cx) + (cx ay - cy ax), each product exact
+    expansion = np.zeros(12)
+    size = np.int64(0)  # not a literal, for which kernels would be compiled a second time
+    size = _add_product(expansion, size, ax, by)
+    size = _add_product(expansion, size, -ay, bx)
+    size = _add_product(expansion, size, bx, cy)
+    size = _add_product(expansion, size, -by, cx)
+    size = _add_product(expansion, size, cx, ay)
+    size = _add_product(expansion, size, -cy, ax)
+    # components do not overlap and grow in magnitude: the last non-zero one has the sign
+    for index in range(size - 1, -1, -1):
+        if expansion[index] > 0.0:
+            return 1
+        if expansion[index] < 0.0:
+            return -1
+    return 0
+
+
+@lean_kernel
+def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
+    high = a * b
+    a_big = _SPLITTER * a
+    a_high = a_big - (a_big - a)
+    a_low = a - a_high
+    b_big = _SPLITTER * b
+    b_high = b_big - (b_big - b)
+    b_low = b - b_high
+    low = a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
+    size = _grow(expansion, size, low)
+    return _grow(expansion, size, high)
+
+
+@lean_kernel
+def _grow(expansion: FloatArray, size: int, value: float) -> int:
+    carry = value
+    for index in range(size):
+        other = expansion[index]
+        total = carry + other
+        virtual = total - carry
+        expansion[index] = (carry - (total - virtual)) + (other - virtual)
+        carry = total
+    expansion[size] = carry
+    return size + 1
 
 
 @lean_kernel
@@ -79,13 +146,7 @@ def ray_crossings(
 ) -> tuple[bool, bool]:
     """Whether a ray from (x, y) to +x crosses a chain an odd number of times, or starts on it.
 
-    Args:
-        xy: (V, 2) vertices [m].
-        before: Vertex the chain starts at; for a whole ring its last one.
-        start: Second vertex of the chain.
-        stop: One past its last vertex.
-        x: Point [m].
-        y: Point [m].
+    The chain goes from the vertex `before` (of a whole ring the last one) to `start` … `stop` - 1.
     """
     parity = False
     px, py = xy[before, 0], xy[before, 1]
@@ -115,13 +176,7 @@ def locate_in_polygon(
 ) -> int:
     """Where a point lies relative to a polygon with holes: INTERIOR, BOUNDARY or EXTERIOR.
 
-    Args:
-        xy: (V, 2) vertices of all rings [m].
-        ring_ptr: Ring r has the vertices ring_ptr[r] … ring_ptr[r + 1] - 1.
-        first: First ring of the polygon (its shell; the others are holes).
-        last: One past its last ring.
-        x: Point [m].
-        y: Point [m].
+    Its rings are `first` (the shell) … `last` - 1, with the vertices from `ring_ptr` on.
     """
     inside = False
     for ring in range(first, last):
@@ -177,13 +232,7 @@ def boundary_distance_below(
 ) -> float:
     """Distance from a point to the edges of a ring, or `limit` where that is not below it [m].
 
-    Args:
-        xy: (V, 2) vertices of all rings [m].
-        start: First vertex of the ring.
-        stop: One past its last vertex.
-        x: Point [m].
-        y: Point [m].
-        limit: Distance of interest [m]; edges beyond it cost a comparison each.
+    The ring has the vertices `start` … `stop` - 1. Edges beyond the limit cost a comparison each.
     """
     best = limit
     ax, ay = xy[stop - 1, 0] - x, xy[stop - 1, 1] - y

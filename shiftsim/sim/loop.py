@@ -18,9 +18,16 @@ from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.observation import HISTORY_SAMPLES, past_rows, scene_info
 from shiftsim.sim.plan_check import validate_plan
-from shiftsim.sim.planner import BatchPlanner, History, Observation, Planner
+from shiftsim.sim.planner import (
+    HISTORY_SAMPLES,
+    BatchPlanner,
+    History,
+    Observation,
+    Planner,
+    past_rows,
+    scene_info,
+)
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory
@@ -121,9 +128,7 @@ class Rollout:
     def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
 
-        Args:
-            plan: The planner's answer; None only under log playback without a planner.
-            seconds: How long it took [s].
+        The plan took `seconds`; it is None only under log playback without a planner.
         """
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
@@ -234,9 +239,7 @@ def simulate(
 def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
     """Drive several scenarios in lock step, so that their planners share one forward pass.
 
-    Args:
-        rollouts: Fresh rollouts, each with a planner of its own; the planners are forks of one
-            `BatchPlanner`.
+    The rollouts are fresh, and their planners forks of one `BatchPlanner`.
 
     Returns:
         Per rollout its log, or the error that ended it; the others go on.

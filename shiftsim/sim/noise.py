@@ -5,7 +5,6 @@ White noise (`awgn`) is sigma times a standard normal at every step. The Ornstei
 """
 
 import hashlib
-import importlib
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import load_attribute
 
 CHANNELS = ("noise-accel", "noise-steer")
 NOISE_NAMES = ("none", "awgn-low", "awgn-mid", "awgn-high", "ou-low", "ou-mid", "ou-high")
@@ -111,14 +111,7 @@ def parse_noise(name: str) -> NoiseModel:
 def sample_noise(
     model: NoiseModel | str, *, seed: int, token: str, num_steps: int, dt: float = 0.1
 ) -> FloatArray:
-    """The noise of a whole rollout.
-
-    Args:
-        model: Kind and strength, or a name for `parse_noise`.
-        seed: Seed of the run.
-        token: Id of the scenario.
-        num_steps: T, number of steps.
-        dt: Nominal step [s].
+    """The noise of a whole rollout of T steps, `dt` [s] long each.
 
     Returns:
         (T, 2) added to the acceleration [m/s^2] and to the steering rate [rad/s]; exactly 0 where
@@ -175,14 +168,8 @@ def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
 
 
 def _load_noise(name: str) -> NoiseModel:
-    module_name, _, attribute = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f"noise {name!r} cannot be imported: {error}",
-            "give module:attribute of a function or NoiseModel on the Python path",
-        ) from error
+    hint = "give module:attribute of a function or NoiseModel on the Python path"
+    found = load_attribute("noise", name, hint)
     if isinstance(found, NoiseModel):
         return found
     if not callable(found):

@@ -23,12 +23,7 @@ class Fault(NamedTuple):
 
 
 def validate_plan(plan: object, now_us: int, next_us: int) -> None:
-    """Accept a trajectory or command that can be executed from one iteration to the next.
-
-    Args:
-        plan: What the planner returned.
-        now_us: Time stamp of the iteration it was asked at [us].
-        next_us: Time stamp of the next iteration [us].
+    """Accept a trajectory or command that can be executed from one iteration to the next [us].
 
     Raises:
         InvalidTrajectoryError: It cannot be executed; the message says why.

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -20,6 +22,9 @@ from shiftsim.world.state import (
     Trajectory,
     VehicleParameters,
 )
+
+# nuPlan rule 10: 2.1 s and the present, not 2.0 s
+HISTORY_SAMPLES = 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +54,11 @@ class SceneInfo:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """The last 2.1 s, up to 22 samples, oldest first; the last one is the present.
+    """The last 2.1 s, up to 22 samples, oldest first; the last one is the present."""
 
-    Attributes:
-        time_us: (H,) time stamps [us].
-        ego: (H, 11) ego states, columns of `state.STATE_COLUMNS`.
-        tracks: Tracks over the same H samples.
-    """
-
-    time_us: IntArray
-    ego: FloatArray
-    tracks: Tracks
+    time_us: IntArray  # (H,) time stamps [us]
+    ego: FloatArray  # (H, 11) ego states, columns of `state.STATE_COLUMNS`
+    tracks: Tracks  # tracks over the same H samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,3 +122,46 @@ class BatchPlanner(Planner, Protocol):
 
         An exception in place of a plan ends that scenario and no other.
         """
+
+
+def scene_info(scenario: Scenario, seed: int = 0) -> SceneInfo:
+    """What a planner is told before the first step; `seed` is that of the task."""
+    return SceneInfo(
+        map=scenario.map,
+        route=scenario.route,
+        goal=scenario.mission_goal,
+        dt=float(np.diff(scenario.iteration_times).mean() * 1e-6),
+        token=scenario.token,
+        expert=scenario,
+        seed=seed,
+    )
+
+
+def past_rows(scenario: Scenario, iteration: int, samples: int = HISTORY_SAMPLES) -> IntArray:
+    """(H,) rows of the log that an iteration looks back on, itself last; those it has."""
+    row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
+    rows = np.arange(row - (samples - 1) * step, row + 1, step)
+    return rows[rows >= 0]
+
+
+def observe_log(
+    scenario: Scenario,
+    iteration: int,
+    *,
+    # (H, 11) ego states of the samples, or (11,) of a single one; the recorded ones if None
+    ego: FloatArray | None = None,
+    tracks: Tracks | None = None,  # tracks over the H samples; the recorded ones if None
+    # how many samples to look back on, the present included; 1 is the present alone. A recording
+    # that begins later gives fewer: H of them
+    samples: int = HISTORY_SAMPLES,
+) -> Observation:
+    """What a planner would see where the ego is as recorded, or in given states."""
+    rows = past_rows(scenario, iteration, samples)
+    now = int(scenario.iteration_rows[iteration])
+    history = History(
+        scenario.time_us[rows],
+        scenario.ego[rows] if ego is None else np.atleast_2d(ego),
+        scenario.tracks.rows(rows) if tracks is None else tracks,
+    )
+    lights = scenario.traffic_lights.rows(slice(now, now + 1))
+    return Observation(iteration, int(scenario.time_us[now]), history, lights)

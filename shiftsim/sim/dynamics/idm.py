@@ -12,28 +12,18 @@ EXPONENT = 4.0  # of the free-road term, nuPlan
 
 @lean_kernel
 def idm_acceleration(
-    speed: float,
+    speed: float,  # own speed [m/s]
+    # free distance to the lead's rear, own progress and the lead's rear length taken off; less than
+    # `min_gap` counts as `min_gap` [m]
     gap: float,
-    lead_speed: float,
-    target_speed: float,
-    min_gap: float,
-    headway: float,
-    accel_max: float,
-    decel_max: float,
+    lead_speed: float,  # speed of the lead along the own direction, may be negative [m/s]
+    target_speed: float,  # speed on a free road [m/s]
+    min_gap: float,  # gap kept at standstill [m]
+    headway: float,  # time gap kept [s]
+    accel_max: float,  # largest acceleration [m/s^2]
+    decel_max: float,  # comfortable deceleration, positive [m/s^2]
 ) -> float:
-    """Unclipped IDM acceleration [m/s^2].
-
-    Args:
-        speed: Own speed [m/s].
-        gap: Free distance to the lead's rear, own progress and the lead's rear length taken off;
-            less than `min_gap` counts as `min_gap` [m].
-        lead_speed: Speed of the lead along the own direction, may be negative [m/s].
-        target_speed: Speed on a free road [m/s].
-        min_gap: Gap kept at standstill [m].
-        headway: Time gap kept [s].
-        accel_max: Largest acceleration [m/s^2].
-        decel_max: Comfortable deceleration, positive [m/s^2].
-    """
+    """Unclipped IDM acceleration [m/s^2]."""
     # nuPlan rule 21: the desired gap is not clamped at zero, it is squared
     desired = (
         min_gap

@@ -216,21 +216,13 @@ def fit_profiles(
 
 @kernel
 def reference(
-    now_us: int,
-    state: FloatArray,
-    traj_time_us: IntArray,
-    traj_states: FloatArray,
+    now_us: int,  # time stamp of the current iteration [us]
+    state: FloatArray,  # (11,) ego state
+    traj_time_us: IntArray,  # (H,) strictly increasing time stamps of the plan [us]
+    traj_states: FloatArray,  # (H, 11) states of the plan; only the poses are read
     params: LqrParameters,
 ) -> Reference:
-    """Errors of the ego against the plan, and the speeds and curvatures to aim at.
-
-    Args:
-        now_us: Time stamp of the current iteration [us].
-        state: (11,) ego state.
-        traj_time_us: (H,) strictly increasing time stamps of the plan [us].
-        traj_states: (H, 11) states of the plan; only the poses are read.
-        params: Parameters of the tracker.
-    """
+    """Errors of the ego against the plan, and the speeds and curvatures to aim at."""
     curvature = np.zeros(params.horizon)
     target = np.empty(NUM_STATE)
     if not interpolate(traj_time_us, traj_states, now_us, target):
@@ -319,28 +311,17 @@ def track(
 
 @lean_kernel
 def track_and_step(
-    now_us: int,
-    next_us: int,
-    state: FloatArray,
-    traj_time_us: IntArray,
-    traj_states: FloatArray,
-    noise_accel: float,
-    noise_rate: float,
-    out_state: FloatArray,
-    out_command: FloatArray,
+    now_us: int,  # time stamp of `state` [us]
+    next_us: int,  # time stamp of the next iteration [us]
+    state: FloatArray,  # (11,) ego state
+    traj_time_us: IntArray,  # (H,) strictly increasing time stamps of the plan [us]
+    traj_states: FloatArray,  # (H, 11) states of the plan; only the poses are read
+    noise_accel: float,  # added to the acceleration, unless exactly 0 [m/s^2]
+    noise_rate: float,  # added to the steering rate, unless exactly 0 [rad/s]
+    out_state: FloatArray,  # (11,) receives the next state
+    out_command: FloatArray,  # (2,) receives the clean command, before noise
 ) -> int:
     """One closed-loop step with nuPlan's parameters: tracker, noise, kinematic bicycle.
-
-    Args:
-        now_us: Time stamp of `state` [us].
-        next_us: Time stamp of the next iteration [us].
-        state: (11,) ego state.
-        traj_time_us: (H,) strictly increasing time stamps of the plan [us].
-        traj_states: (H, 11) states of the plan; only the poses are read.
-        noise_accel: Added to the acceleration, unless exactly 0 [m/s^2].
-        noise_rate: Added to the steering rate, unless exactly 0 [rad/s].
-        out_state: (11,) receives the next state.
-        out_command: (2,) receives the clean command, before noise.
 
     Returns:
         TRACKED, or why nothing was written (see `raise_for_status`).
@@ -360,11 +341,6 @@ def track_and_step(
 
 def raise_for_status(status: int, now_us: int, traj_time_us: IntArray) -> None:
     """Turn a status of the kernels into an error.
-
-    Args:
-        status: TRACKED, NOT_COVERED or TOO_SHORT.
-        now_us: Time stamp of the current iteration [us].
-        traj_time_us: (H,) time stamps of the plan [us].
 
     Raises:
         InvalidTrajectoryError: The status is not TRACKED.

@@ -57,16 +57,10 @@ def segment_end(traj_time_us: IntArray, query_us: int) -> int:
 def interpolate(
     traj_time_us: IntArray, traj_states: FloatArray, query_us: int, out: FloatArray
 ) -> bool:
-    """State of a trajectory at one time.
+    """Write the state of a trajectory at one time; steering rate, yaw rate and acceleration are 0.
 
-    Args:
-        traj_time_us: (H,) strictly increasing time stamps, H >= 2 [us].
-        traj_states: (H, 11) columns of `state.STATE_COLUMNS`.
-        query_us: Time stamp [us].
-        out: (11,) receives the state; steering rate, yaw rate and yaw acceleration are 0.
-
-    Returns:
-        False, and `out` is untouched, when the trajectory does not cover the query.
+    The trajectory has states (H, 11) at strictly increasing times (H,) [us]. False, and `out` (11,)
+    is untouched, where it does not cover the query.
     """
     count = len(traj_time_us)
     if count < 2 or query_us < traj_time_us[0] or query_us > traj_time_us[count - 1]:
@@ -104,12 +98,7 @@ def sample_poses(
 
 
 def follow_perfectly(plan: Trajectory, next_us: int, out: FloatArray) -> None:
-    """Put the ego where the plan wants it at the next iteration.
-
-    Args:
-        plan: The plan, with log time stamps.
-        next_us: Time stamp of the next iteration [us].
-        out: (11,) receives the state.
+    """Put the ego where the plan, in log time, wants it at the next iteration: into `out` (11,).
 
     Raises:
         InvalidTrajectoryError: The plan does not cover the next iteration.

@@ -7,12 +7,12 @@ rewrites rows as the rollout proceeds. A model is any object with the two method
 """
 
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import load_attribute
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 
@@ -75,10 +75,11 @@ def make_traffic(name: str) -> Traffic:
     Raises:
         ConfigError: The name is unknown, or what it names is not a traffic model.
     """
-    module, _, attribute = _MODELS.get(full := traffic_name(name), full).partition(":")
+    target = _MODELS.get(full := traffic_name(name), full)
     if full not in _MODELS and (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)  # a model beside the user's files, as for planners
-    model: Traffic = getattr(import_module(module), attribute)()
+    hint = "give package.module:Model of a class on the Python path"
+    model: Traffic = load_attribute("traffic", target, hint)()
     for method in ("start", "step"):
         if not callable(getattr(model, method, None)):
             raise ConfigError(

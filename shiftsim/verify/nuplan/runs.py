@@ -13,8 +13,7 @@ from shiftsim.metrics import judge, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.observation import observe_log, scene_info
-from shiftsim.sim.planner import Observation, Planner
+from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.verify.files import TOLERANCE, Groups, Source
 from shiftsim.verify.metric_worlds import known_scores

@@ -9,11 +9,12 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.geometry.paths import make_path, project, window
+from shiftsim.geometry.polylines import make_path, project, window
 from shiftsim.planners.pdm.brake import brake_poses
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.rollout import follow, read_pose
 from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.pdm.step import brake_poses
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
 from shiftsim.planners.routes.search import search_cheapest, search_levels

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.geometry.paths import make_path
+from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
-from shiftsim.sim.observation import scene_info
+from shiftsim.sim.planner import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation

@@ -7,7 +7,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.paths import make_path
+from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
     Forecast,

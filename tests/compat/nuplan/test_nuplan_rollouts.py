@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+from boxes import boxes_intersect
 from worlds import cruise_scenario, moved, standing_tracks
 
 from shiftsim.compat import nuplan
-from shiftsim.geometry.boxes import boxes_intersect
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights, Trajectory, center_poses

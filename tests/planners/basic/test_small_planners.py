@@ -7,7 +7,7 @@ from worlds import cruise_scenario
 from shiftsim.errors import ConfigError, DataError, PlannerError
 from shiftsim.planners.contract import check_planner, frozen_inputs
 from shiftsim.planners.registry import load_planner
-from shiftsim.sim.observation import observe_log, scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AX, VX, VY, Command
 
 T0 = 1_600_000_000_000_000 + 60 * 50_000  # iteration 0 of the toy scenario [us]

@@ -15,7 +15,7 @@ from shiftsim.geometry.corridors import CLEAR, HIT, OPEN
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, find_lead, find_sides
 from shiftsim.planners.idm.planner import Idm
 from shiftsim.planners.routes.search import search_levels
-from shiftsim.sim.observation import observe_log, scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.layers import make_lists
 from shiftsim.world.state import VX, AgentKind, TrafficLights
 

@@ -12,7 +12,7 @@ from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.planners.learned.carl import view as carl_view
 from shiftsim.planners.learned.carl.planner import Carl, command_of
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
-from shiftsim.sim.observation import observe_log, scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, Command, LightStatus, TrafficLights
 
 pytest.importorskip("torch")

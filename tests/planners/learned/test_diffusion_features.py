@@ -19,7 +19,7 @@ from shiftsim.planners.learned.diffusion.features import (
     lanes_on_route,
 )
 from shiftsim.sim.loop import Rollout
-from shiftsim.sim.observation import scene_info
+from shiftsim.sim.planner import scene_info
 from shiftsim.world.layers import make_layer, make_polylines, square_around
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 

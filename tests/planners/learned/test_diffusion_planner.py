@@ -9,7 +9,7 @@ from worlds import cruise_scenario, moved, standing_tracks, straight_road
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
-from shiftsim.sim.observation import scene_info
+from shiftsim.sim.planner import scene_info
 from shiftsim.world.state import AgentKind
 
 torch = pytest.importorskip("torch")

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from boxes import to_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.frames import to_frame
 from shiftsim.sim.loop import Rollout, simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLights

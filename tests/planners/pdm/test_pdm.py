@@ -11,13 +11,13 @@ from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straigh
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.corridors import HIT
-from shiftsim.geometry.paths import make_path
+from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm.corridor import corridor_shape, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.registry import load_planner
-from shiftsim.sim.observation import observe_log, scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 
 NUM_ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import offsets, seeds
 
-from shiftsim.geometry.paths import RUN, bound_runs
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve, curve_capacity
 from shiftsim.sim.traffic.idm.shapes import (
     APART,

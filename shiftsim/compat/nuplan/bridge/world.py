@@ -25,8 +25,7 @@ from nuplan.planning.simulation.trajectory.interpolated_trajectory import Interp
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
-from shiftsim.sim.observation import HISTORY_SAMPLES
-from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, SceneInfo
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, Tracks, TrafficLights, Trajectory
 from shiftsim.world.state import VehicleParameters as Dimensions
 

@@ -72,16 +72,10 @@ def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
 def place_agents(
     map: VectorMap, poses: FloatArray, sizes: FloatArray, taken: FloatArray
 ) -> list[Start | None]:
-    """Starts of vehicles that can be simulated, in order; None for the others.
+    """Starts of vehicles, in order; None for those that cannot be simulated.
 
-    Args:
-        map: The map.
-        poses: (N, 3) logged box centres x [m], y [m], heading [rad].
-        sizes: (N, 2) length, width [m].
-        taken: (M, 4, 2) corners of boxes that must stay free, such as the ego's [m].
-
-    Returns:
-        N starts. A start whose box touches a taken box, or that of an earlier agent, is dropped.
+    A start whose box touches one of `taken` (M, 4, 2), such as the ego's, or that of an earlier
+    agent, is dropped. Vehicles are given by logged centres (N, 3) and sizes (N, 2).
 
     Raises:
         TrafficError: A vehicle starts on a baseline too short to be a path.
@@ -108,19 +102,11 @@ def place_agents(
 def make_fleet(
     map: VectorMap,
     starts: list[Start],
-    sizes: FloatArray,
-    speeds: FloatArray,
-    default_target: float,
+    sizes: FloatArray,  # (A, 2) length, width [m]
+    speeds: FloatArray,  # (A,) speed along the path [m/s]
+    default_target: float,  # speed on a free road where no speed limit is known yet [m/s]
 ) -> Fleet:
-    """Agents at their starts.
-
-    Args:
-        map: The map.
-        starts: A starts.
-        sizes: (A, 2) length, width [m].
-        speeds: (A,) speed along the path [m/s].
-        default_target: Speed on a free road where no speed limit is known yet [m/s].
-    """
+    """Agents at their starts."""
     count = len(starts)
     longest = max([len(map.baselines.at(start.edge)) for start in starts], default=2)
     fleet = Fleet(

@@ -9,8 +9,7 @@ belongs to the buffer where the curve winds around it.
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
-from shiftsim.geometry.predicates import orientation
-from shiftsim.geometry.rings import point_segment_distance
+from shiftsim.geometry.rings import orientation, point_segment_distance
 
 QUADRANT_SEGMENTS = 16  # per right angle of a round join; what shapely's method defaults to
 _SIMPLIFY = 0.01  # concave vertices shallower than this share of the distance are left out
@@ -29,13 +28,9 @@ def curve_capacity(num_points: int) -> int:
 
 @lean_kernel
 def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
-    """Outline of a polyline buffered with flat caps and round joins.
+    """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
-    Args:
-        line: (K, 2) vertices, at least 2 [m].
-        distance: Half width of the buffer [m].
-        keep: (K,) scratch.
-        out: (V, 2) receives the curve [m].
+    `keep` (K,) is scratch; `out` (V, 2) receives the curve.
 
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
@@ -98,12 +93,7 @@ def _is_shallow(
 
 @lean_kernel
 def _offset_side(
-    line: FloatArray,
-    distance: float,
-    left: bool,
-    keep: BoolArray,
-    out: FloatArray,
-    count: int,
+    line: FloatArray, distance: float, left: bool, keep: BoolArray, out: FloatArray, count: int
 ) -> int:
     """Append the offset of one side, to the left of the direction walked, and the cap after it."""
     size, step = len(line), 1 if left else -1

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.paths import RUN, bound_runs
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
-from shiftsim.sim.traffic.idm.footprints import remaining_path
+from shiftsim.sim.traffic.idm.paths import remaining_path
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,

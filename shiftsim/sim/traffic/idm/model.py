@@ -13,7 +13,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
-from shiftsim.sim.traffic.idm.footprints import set_box
+from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import (
     REPLAYED_KINDS,
     IdmParameters,

@@ -1,5 +1,7 @@
 """Paths of reactive agents: built from baselines, extended along the lane graph, interpolated.
 
+An agent's footprint is its box and the buffer of the piece of its path just ahead.
+
 A path is an array of vertices (K, 4): x [m], y [m], heading [rad], progress [m]. Headings are
 unwrapped along the path and wrapped when a pose is read.
 """
@@ -7,16 +9,21 @@ unwrapped along the path and wrapped when a pose is read.
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.geometry.polylines import interpolate, point_on_polyline, vertex_heading
+from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
     MAX_ROUTE,
     PROGRESS,
     Fleet,
+    Footprints,
     IdmParameters,
     LaneGraph,
+    Scene,
 )
+from shiftsim.sim.traffic.idm.shapes import bound_ring
 from shiftsim.world.layers import Polylines
 from shiftsim.world.state import LightStatus
 
@@ -42,12 +49,7 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
 def finish_path(path: FloatArray, size: int) -> int:
     """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
 
-    Args:
-        path: (K, 4) raw vertices; their progress is written.
-        size: How many of them count.
-
-    Returns:
-        How many vertices are left, at the start of `path`.
+    The first `size` vertices of `path` (K, 4) count. Returns how many are left, at its start.
     """
     progress = 0.0
     kept = 0
@@ -196,3 +198,71 @@ def _remember(fleet: Fleet, agent: int, edge: int) -> None:
         size -= 1
     route[size] = edge
     fleet.route_size[agent] = size + 1
+
+
+@lean_kernel
+def set_box(
+    footprints: Footprints,
+    index: int,
+    x: float,
+    y: float,
+    heading: float,
+    length: float,
+    width: float,
+) -> None:
+    """Put something where its box is, without a path ahead."""
+    box, bounds = footprints.box[index], footprints.bounds[index]
+    box_corners(x, y, heading, length, width, box)
+    footprints.present[index] = True
+    bounds[0], bounds[1], bounds[2], bounds[3] = x, y, x, y
+    bound_ring(box, bounds)
+
+
+@lean_kernel
+def remaining_path(fleet: Fleet, agent: int, line: FloatArray) -> int:
+    """Write the path ahead of an agent into `line` (K, 2); returns its number of vertices."""
+    path, size = fleet.path[agent], fleet.path_size[agent]
+    return _cut(path, size, fleet.progress[agent], path[size - 1, PROGRESS], line)
+
+
+@lean_kernel
+def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
+    """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
+    first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
+    after = first_after(path, size, first)
+    if after == size or not path[0, PROGRESS] < last:
+        # nuPlan rule 127: at an end of the path two vertices are left
+        head = size - 2 if after == size else 0
+        for vertex in range(2):
+            line[vertex, 0] = path[head + vertex, 0]
+            line[vertex, 1] = path[head + vertex, 1]
+        return 2
+    x, y, _ = pose_on_path(path, size, first)
+    line[0, 0], line[0, 1] = x, y
+    count = 1
+    while after < size and path[after, PROGRESS] < last:
+        line[count, 0], line[count, 1] = path[after, 0], path[after, 1]
+        count += 1
+        after += 1
+    x, y, _ = pose_on_path(path, size, last)
+    line[count, 0], line[count, 1] = x, y
+    return count + 1
+
+
+@lean_kernel
+def move_agent(scene: Scene, agent: int) -> int:
+    """Pose and footprint of an agent from its progress; returns -1 where a curve is too long."""
+    fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
+    path, size = fleet.path[agent], fleet.path_size[agent]
+    progress = fleet.progress[agent]
+    x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
+    fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2] = x, y, heading
+    length, width = fleet.size[agent, 0], fleet.size[agent, 1]
+    set_box(footprints, agent, x, y, heading, length, width)
+    front = progress + 0.5 * length + fleet.speed[agent] * scene.parameters.headway
+    points = _cut(path, size, progress - 0.5 * length, front, scratch.line)
+    curve = footprints.curve[agent]
+    made = buffer_curve(scratch.line[:points], 0.5 * width, scratch.keep, curve)
+    footprints.curve_size[agent] = max(made, 0)
+    bound_ring(curve[: footprints.curve_size[agent]], footprints.bounds[agent])
+    return made

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.geometry.paths import RUN
+from shiftsim.geometry.polylines import RUN
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap

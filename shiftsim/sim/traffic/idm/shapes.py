@@ -3,15 +3,14 @@
 An outline is one or two rings: a box, and the buffer of a piece of path (`buffer`), whose ring may
 cross itself inside. Their union is meant; touching counts as contact. Rings are searched with
 bounding boxes, and exact predicates decide whether two edges meet. Corridors are searched by the
-runs of segments of their line (`geometry.paths`).
+runs of segments of their line (`geometry.polylines`).
 """
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.paths import RUN
-from shiftsim.geometry.predicates import orientation
-from shiftsim.geometry.rings import point_segment_distance, segments_meet
+from shiftsim.geometry.polylines import RUN
+from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
 
 APART, MEETING, UNSURE = 0, 1, 2
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
@@ -171,22 +170,12 @@ def last_near_run(runs: FloatArray, half_width: float, bounds: FloatArray) -> in
 
 @lean_kernel
 def touches_corridor(
-    line: FloatArray,
-    runs: FloatArray,
-    half_width: float,
-    ring: FloatArray,
-    bounds: FloatArray,
+    line: FloatArray, runs: FloatArray, half_width: float, ring: FloatArray, bounds: FloatArray
 ) -> int:
     """Whether a ring meets the flat-capped buffer of a polyline: APART, MEETING, or UNSURE.
 
-    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps.
-
-    Args:
-        line: (K, 2) vertices, at least 2 [m].
-        runs: (R, 4) bounds of its runs [m].
-        half_width: Distance of the buffer [m].
-        ring: (V, 2) the ring [m].
-        bounds: (4,) bounding box of the ring [m].
+    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps. The line (K, 2)
+    has runs with bounds (R, 4), the ring (V, 2) the bounds (4,).
     """
     reach = half_width * _OUTER
     low_x, low_y = bounds[0] - reach, bounds[1] - reach
@@ -224,12 +213,7 @@ def touches_corridor(
 
 @lean_kernel
 def _touches_segment(
-    px: float,
-    py: float,
-    qx: float,
-    qy: float,
-    half_width: float,
-    ring: FloatArray,
+    px: float, py: float, qx: float, qy: float, half_width: float, ring: FloatArray
 ) -> int:
     inner, outer = half_width * _INNER, half_width * _OUTER
     low_x, high_x = min(px, qx) - outer, max(px, qx) + outer

@@ -5,9 +5,8 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
-from shiftsim.sim.traffic.idm.footprints import move_agent, set_box
 from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
-from shiftsim.sim.traffic.idm.paths import extend_route
+from shiftsim.sim.traffic.idm.paths import extend_route, move_agent, set_box
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY
@@ -19,14 +18,10 @@ _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA
 
 @lean_kernel
 def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) -> tuple[int, int]:
-    """Move every agent by one step and write where it is.
+    """Move every agent by one step, `span` [s] long, and write where it is.
 
-    Args:
-        scene: The traffic; its lights are those at the end of the step.
-        ego: (11,) ego state at the beginning of the step.
-        row: Holds the replayed tracks at the end of the step.
-        span: Length of the step [s].
-        first: BEGIN, or the agent that an interrupted step goes on with.
+    The scene has the lights, and the row the replayed tracks, of the end of the step; `ego` (11,)
+    is of its beginning. `first` is BEGIN, or the agent that an interrupted step goes on with.
 
     Returns:
         DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the

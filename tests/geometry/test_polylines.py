@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shiftsim.geometry.paths import make_path, pose_at, project, window
+from shiftsim.geometry.polylines import make_path, pose_at, project, window
 
 
 @settings(max_examples=30)
