@@ -277,9 +277,5 @@ def merge(
     from shiftsim.runs.derive import merge_runs
     from shiftsim.runs.results import open_run
 
-    merged = merge_runs(
-        [open_run(path) for path in runs],
-        out=out,
-        allow_partial=allow_partial,
-    )
+    merged = merge_runs([open_run(path) for path in runs], out=out, allow_partial=allow_partial)
     leave_with(merged, allow_partial=allow_partial, as_json=as_json)

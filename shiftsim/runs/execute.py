@@ -53,10 +53,7 @@ Watch: TypeAlias = Callable[[Progress], None]
 
 
 def execute(
-    prepared: Prepared,
-    *,
-    on_progress: Watch = lambda progress: None,
-    argv: Sequence[str] = (),
+    prepared: Prepared, *, on_progress: Watch = lambda progress: None, argv: Sequence[str] = ()
 ) -> Run:
     """Do all tasks and write the run folder.
 

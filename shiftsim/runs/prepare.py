@@ -18,13 +18,7 @@ from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
 from shiftsim.runs.config import RunConfig, Value, parse_shard
-from shiftsim.runs.manifest import (
-    State,
-    check_resumable,
-    check_space,
-    check_target,
-    code_digest,
-)
+from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
@@ -75,10 +69,7 @@ class Chosen(NamedTuple):
 
 
 def prepare(
-    config: RunConfig,
-    *,
-    planners: Sequence[Any] = (),
-    noises: Sequence[NoiseModel] = (),
+    config: RunConfig, *, planners: Sequence[Any] = (), noises: Sequence[NoiseModel] = ()
 ) -> Prepared:
     """Resolve every name and check everything that a run needs.
 
@@ -92,9 +83,7 @@ def prepare(
     """
     models = list(noises) or [parse_noise(name) for name in _expanded(config.noise)]
     config = replace(
-        config,
-        noise=tuple(model.name for model in models),
-        traffic=traffic_name(config.traffic),
+        config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
     )
     _check_traffic(config.traffic)
     thresholds = asdict(thresholds_of(config.thresholds))

@@ -19,14 +19,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import (
-    FOLDER,
-    Place,
-    RolloutReader,
-    Task,
-    complete_rollout,
-    describe,
-)
+from shiftsim.runs.rollouts import FOLDER, Place, RolloutReader, Task, complete_rollout, describe
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 

@@ -36,12 +36,7 @@ _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 # one thread per worker: the parallelism is across scenarios
 _ONE_THREAD = {
     name: "1"
-    for name in (
-        "NUMBA_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-    )
+    for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 }
 
 
