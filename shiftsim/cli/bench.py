@@ -5,8 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, say, say_json, terminal_width
-from shiftsim.cli.options import Settings, planner_arguments, with_settings
+from shiftsim.cli.common import (
+    Debug,
+    Json,
+    Quiet,
+    Settings,
+    planner_arguments,
+    plural,
+    say,
+    say_json,
+    terminal_width,
+    with_settings,
+)
 from shiftsim.cli.running import DryRun, interruptible
 
 if TYPE_CHECKING:

@@ -10,8 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.options import ALL, Settings, planner_arguments, with_settings
+from shiftsim.cli.common import (
+    ALL,
+    Debug,
+    Json,
+    Quiet,
+    Settings,
+    planner_arguments,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+    with_settings,
+)
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress

@@ -5,8 +5,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
-from shiftsim.cli.options import Settings, with_settings
+from shiftsim.cli.common import (
+    Debug,
+    Json,
+    Quiet,
+    Settings,
+    new_app,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+    with_settings,
+)
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
