@@ -4,13 +4,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.runs.config import RunConfig, make_config, parse_shard
-from shiftsim.runs.execute import Progress, record, scenario_of
+from shiftsim.runs.execute import Progress, record
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
 from shiftsim.runs.prepare import RUNS, run_name
@@ -125,13 +126,7 @@ class Rescorer:
     """Scores one stored rollout after the other."""
 
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        """Score rollouts of a run.
-
-        Args:
-            run: Its folder.
-            store: Folder of the store it was made with.
-            config: Its settings, with the other thresholds and metrics.
-        """
+        """Score rollouts of the run in a folder, under its settings with other thresholds."""
         self.config = config
         self._run, self._scenarios = open_run(run), Scenarios(store)
 
@@ -175,11 +170,12 @@ def rescore(
     for metric in metrics:
         load_metric(metric)
     found = open_run_store(run, store)
+    here, simulated = code_digest(), run.manifest["determining"].get("code", "")
     determining = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
         "metric_version": METRIC_VERSION,
-        "code": _code(run.manifest["determining"].get("code", "")),
+        "code": here if here == simulated else f"{simulated}, scored by {here}",
     }
     values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
     config = make_config(values, where=str(run.path / "manifest.json"))
@@ -212,22 +208,15 @@ def rescore(
             [Batch((task,)) for task in sorted(done, key=lambda task: task.token)],
             workers=min(workers or default_workers(), len(done)),
             alone=1,
-            group=scenario_of,
+            group=attrgetter("token"),
         )
         with closing(outcomes):
-            add = partial(_add, writer, run)
+
+            def add(result: TaskResult) -> None:
+                writer.add(result, stored=run.rollout_places[result.task])
+
             record(outcomes, add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
     finally:
         writer.close()
-
-
-def _add(writer: RunWriter, run: Run, result: TaskResult) -> None:
-    writer.add(result, stored=run.rollout_places[result.task])
-
-
-def _code(simulated: str) -> str:
-    """Digest of the code that simulated, and of the code that scores where it is another."""
-    here = code_digest()
-    return here if here == simulated else f"{simulated}, scored by {here}"

@@ -6,7 +6,7 @@ themselves stay as they are. Runs over a whole store use the accepted ones.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -93,8 +93,8 @@ class Verdicts:
 
     def counts(self) -> dict[str, int]:
         """How many scenarios there are by verdict, and how many break each rule."""
-        out = {name: 0 for name in (ACCEPTED, DROPPED, FAILED)}
-        out |= {name: 0 for name in (COLLISION, AREA, STANDING, OFF_ROUTE)}
+        names = (ACCEPTED, DROPPED, FAILED, COLLISION, AREA, STANDING, OFF_ROUTE)
+        out = dict.fromkeys(names, 0)
         for row in self.rows:
             out[row["verdict"]] += 1
             for reason in row["reason"].split(", ") if row["verdict"] == DROPPED else ():
@@ -119,11 +119,7 @@ class Playback:
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
-    """Drive a scenario as it was recorded, and say whether it is fit for use.
-
-    Returns:
-        The row of the verdict.
-    """
+    """Drive a scenario as it was recorded; the row of the verdict whether it is fit for use."""
     # nuPlan rule 550: the recording itself, under thresholds of the filter's own
     log = simulate(scenario, None, controller="log-playback")
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds)
@@ -131,11 +127,8 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
     path = float(np.hypot(*np.diff(centers[:, :2], axis=0).T).sum())
     progress = next(s.value for s in result.statistics if s.name == _PROGRESS)
     rows = {row.metric: row for row in result.rows}
-    broken = []
-    if rows[_COLLISIONS].score != 1.0:
-        broken.append(COLLISION)
-    if rows[_DRIVABLE].score != 1.0:
-        broken.append(AREA)
+    rules = {_COLLISIONS: COLLISION, _DRIVABLE: AREA}
+    broken = [rule for name, rule in rules.items() if rows[name].score != 1.0]
     # nuPlan rule 551: too little progress is a short path, or a path beside the route
     if path < config.min_path_m:
         broken.append(STANDING)
@@ -205,7 +198,9 @@ def filter_store(
                 journal.put(f"{conditions['hash']} {outcome.task}", row)
                 done[outcome.task] = row
                 on_progress(len(done), len(opened))
-        _write(path, [done[token] for token in opened.tokens], conditions)
+        found = [dict(done[token]) for token in opened.tokens]
+        table = pa.Table.from_pylist(found, schema=_SCHEMA)
+        write_blocks(path / VERDICTS, [table], conditions)
         journal.remove()
     finally:
         journal.close()
@@ -241,11 +236,6 @@ def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, 
     return found.rows if same else ()
 
 
-def _write(store: Path, rows: Iterable[Mapping[str, Any]], conditions: Mapping[str, Any]) -> None:
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=_SCHEMA)
-    write_blocks(store / VERDICTS, [table], conditions)
-
-
 def _read(store: Path) -> Verdicts:
     path = store / VERDICTS
     table = Table(path, _SCHEMA)
@@ -256,11 +246,7 @@ def _read(store: Path) -> Verdicts:
 
 
 def read_verdicts(store: str | Path, store_hash: str) -> Verdicts | None:
-    """The verdicts of a store; None where it was not filtered.
-
-    Args:
-        store: Folder of the store.
-        store_hash: Its content hash.
+    """The verdicts of a store, whose content has a hash; None where it was not filtered.
 
     Raises:
         DataError: The file is damaged, or of another content of the store.

@@ -137,11 +137,7 @@ class Run:
         }
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
-        """One stored rollout.
-
-        Args:
-            task: Which one.
-            scenario: Its scenario, from the store the run was made with.
+        """One stored rollout; its scenario is that of the store the run was made with.
 
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.
