@@ -30,28 +30,13 @@ _UNFINISHED = 3
 _MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustness"}
 
 
+_SETTINGS = """planners store split checkpoints planner_args seeds noise traffic controller limit
+device batch_size strict workers timeout executor scheduler retry_failed out save_rollouts
+allow_partial""".split()
+
+
 @with_settings(
-    "planners",
-    "store",
-    "split",
-    "checkpoints",
-    "planner_args",
-    "seeds",
-    "noise",
-    "traffic",
-    "controller",
-    "limit",
-    "device",
-    "batch_size",
-    "strict",
-    "workers",
-    "timeout",
-    "executor",
-    "scheduler",
-    "retry_failed",
-    "out",
-    "save_rollouts",
-    "allow_partial",
+    *_SETTINGS,
     store="Own scenarios: name or folder (demo).",
     split="Name or file (the whole store; demo-mini of the demo).",
     seeds="Only these, such as 0,1; the result is partial.",

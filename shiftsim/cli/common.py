@@ -60,11 +60,7 @@ Advance = Callable[[int, int, str], None]
 
 @contextmanager
 def progress_bar(*, quiet: bool) -> Iterator[Advance]:
-    """Shows how far something is: a bar with the remaining time, or a line per 10 %.
-
-    Yields:
-        A function to be called with done, total and a note.
-    """
+    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
     if quiet:
         yield lambda done, total, note: None
     elif sys.stderr.isatty():
@@ -74,25 +70,18 @@ def progress_bar(*, quiet: bool) -> Iterator[Advance]:
 
 
 def _bar() -> Iterator[Advance]:
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("ETA"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=None)
 
         def advance(done: int, total: int, note: str) -> None:
@@ -130,11 +119,7 @@ def with_settings(
     """Give a command the options of settings, at the place of its parameter `settings`.
 
     The command gets those that were given, as `RunConfig` wants them; arguments of planners are
-    texts still, for `planner_arguments`.
-
-    Args:
-        names: The settings, in the order of the help.
-        helps: Another help text for some of them.
+    texts still, for `planner_arguments`. `helps` are other help texts for some of them.
     """
     options = [_option(name, helps.get(name)) for name in names]
 

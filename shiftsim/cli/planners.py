@@ -37,12 +37,8 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
 
     missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
     if as_json:
-        say_json(
-            [
-                {**asdict(entry), "ready": not missing[name], "missing": missing[name]}
-                for name, entry in PLANNERS.items()
-            ]
-        )
+        state = ({"ready": not text, "missing": text} for text in missing.values())
+        say_json([asdict(e) | more for e, more in zip(PLANNERS.values(), state, strict=True)])
         return
     for name, entry in PLANNERS.items():
         say(f" {name:18} {entry.kind:11} {entry.description}")

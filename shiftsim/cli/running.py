@@ -88,15 +88,9 @@ def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> Non
 def interruptible(
     folder: Path, again: list[str], *, quiet: bool
 ) -> Iterator[Callable[["Progress"], None]]:
-    """Show progress; an interrupt, or a request to end from a batch system, keeps what is finished.
+    """Yields what shows progress; an interrupt, or a request to end, keeps what is finished.
 
-    Args:
-        folder: Where that is kept.
-        again: Words of the command that goes on with it.
-        quiet: Show nothing.
-
-    Yields:
-        Shows how far the work is.
+    It then says in which folder that is kept, and the words of the command that goes on with it.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -171,17 +165,19 @@ def _announce(prepared: "Prepared") -> None:
 
 def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
     """Print what a run gave, and leave with the code for it."""
-    _show(finished, allow_partial=allow_partial, as_json=as_json)
+    if as_json:
+        from shiftsim.report.scores import summary
+
+        say_json(summary(finished))
+    else:
+        _show(finished, allow_partial=allow_partial)
     if not finished.is_complete:
         raise typer.Exit(_UNFINISHED)
 
 
-def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
-    from shiftsim.report.scores import failures, score_table, summary, worst_rollouts
+def _show(finished: "Run", *, allow_partial: bool) -> None:
+    from shiftsim.report.scores import failures, score_table, worst_rollouts
 
-    if as_json:
-        say_json(summary(finished))
-        return
     counts = finished.manifest["counts"]
     say()
     say(score_table([finished], allow_partial=allow_partial))

@@ -204,17 +204,9 @@ def export_to_nuplan(
         for (kind, mapping), count in sorted(report.mappings.items())
     ]
     if as_json:
-        say_json(
-            {
-                "logs": report.logs,
-                "maps": report.maps,
-                "token_file": report.token_file,
-                "tokens": report.tokens,
-                "cities": report.cities,
-                "mappings": mappings,
-                "missing_maps": report.missing_maps,
-            }
-        )
+        names = ("logs", "maps", "token_file", "tokens", "cities")
+        shown = {name: getattr(report, name) for name in names}
+        say_json(shown | {"mappings": mappings, "missing_maps": report.missing_maps})
         return
     say(f" {plural(len(report.tokens), 'log')} → {report.logs}")
     say(f" {plural(len(report.cities), 'map')} → {report.maps}")

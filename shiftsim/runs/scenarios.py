@@ -49,9 +49,7 @@ def open_named_store(name: str) -> ScenarioStore:
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     """The store that a run was made with, or its bundle, which then has the hash of that store.
 
-    Args:
-        run: The run.
-        store: Name or path, where the store has moved.
+    `store` says where the store has moved.
 
     Raises:
         DataError: It is not there, or is another one.
@@ -61,7 +59,14 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         found = open_store(bundle)
         wanted = run.manifest.get("bundle", {}).get("hash")
     else:
-        found = _open(run, store)
+        place = store or run.manifest["store"]
+        path = store_path(place)
+        if "://" not in place and not path.exists():
+            raise DataError(
+                f"the store of run {run.path.name!r} is not at {str(path)!r}",
+                hint="say where it is with --store",
+            )
+        found = open_store(place if "://" in place else path)
         wanted = run.manifest["determining"]["store"]
     if found.hash != wanted:
         raise DataError(
@@ -72,30 +77,8 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     return found
 
 
-def _open(run: Run, store: str | None) -> ScenarioStore:
-    place = store or run.manifest["store"]
-    if "://" in place:
-        return open_store(place)
-    path = store_path(place)
-    if not path.exists():
-        raise DataError(
-            f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint="say where it is with --store",
-        )
-    return open_store(path)
-
-
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
-    """Copy scenarios with their recordings and maps into a run folder.
-
-    Args:
-        store: The store.
-        folder: The run folder.
-        tokens: The scenarios.
-
-    Returns:
-        What the manifest says about it.
-    """
+    """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
     target = folder / BUNDLE
     if not target.exists():
         partial = folder / f".{BUNDLE}.tmp"
@@ -260,14 +243,8 @@ def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
     if path.suffix == ".txt":
         lines = list(tokens)
     elif path.suffix == ".toml":
-        lines = [
-            f"name = {json.dumps(split.name)}",
-            f"count = {len(tokens)}",
-            f'hash = "{split.hash}"',
-            "tokens = [",
-            *(f'    "{token}",' for token in tokens),
-            "]",
-        ]
+        head = f'name = {json.dumps(split.name)}\ncount = {len(tokens)}\nhash = "{split.hash}"'
+        lines = [head, "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
     else:
         raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
     try:

@@ -117,7 +117,7 @@ def test_a_request_to_end_keeps_what_is_finished_and_says_how_to_go_on(toy, tmp_
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     )
-    journal = tmp_path / "run" / "unfinished.jsonl"
+    journal = tmp_path / "run" / "unfinished.sqlite"
     while not (journal.exists() and journal.stat().st_size):
         assert process.poll() is None
         time.sleep(0.01)
