@@ -159,7 +159,8 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runs.scenarios import choose_scenarios, open_named_store, write_split
+    from shiftsim.runs.filter import choose_scenarios, write_split
+    from shiftsim.runs.scenarios import open_named_store
 
     opened = open_named_store(store)
     found = choose_scenarios(

@@ -23,15 +23,10 @@ from shiftsim.runs.workers import default_workers, map_unordered
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
-    """Write the run folder that the shards `1/n` to `n/n` are parts of.
+    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without.
 
-    Args:
-        runs: The shards.
-        out: The new folder; by default the name of the shards without their number.
-        allow_partial: Accept that shards are missing; their tasks then are `missing`.
-
-    Returns:
-        The run; its scores and metrics are the same bytes as without shards.
+    By default it has the name of the shards without their number. With `allow_partial` shards may
+    be missing; their tasks then are `missing`.
 
     Raises:
         ConfigError: Something is no shard, of another run, given twice or missing.
@@ -123,10 +118,9 @@ def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
 
 
 class Rescorer:
-    """Scores one stored rollout after the other."""
+    """Scores one stored rollout of a run after the other."""
 
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        """Score rollouts of the run in a folder, under its settings with other thresholds."""
         self.config = config
         self._run, self._scenarios = open_run(run), Scenarios(store)
 
@@ -152,17 +146,10 @@ def rescore(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder as if the run had been made with other thresholds.
+    """Write a run folder (`runs/<id>`) as if the run had been made with other thresholds.
 
-    Args:
-        run: A run with stored rollouts.
-        thresholds: Threshold profile.
-        metrics: Own metrics, by `module:attribute`.
-        store: The store, where it has moved.
-        out: The new folder; by default `runs/<id>`.
-        workers: Worker processes; 0 chooses from the cores.
-        on_progress: Called after every rollout.
-        argv: The command line, for the manifest.
+    `metrics` are custom ones by `module:attribute`, `store` says where the store has moved,
+    `workers` of 0 chooses from the cores, `argv` is for the manifest.
 
     Raises:
         DataError: Rollouts are missing, or the store is another one.

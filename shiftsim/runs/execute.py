@@ -59,12 +59,7 @@ def execute(
 
     Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
     with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
-    replaced by an incomplete one.
-
-    Args:
-        prepared: The run.
-        on_progress: Called after every task.
-        argv: The command line, for the manifest.
+    replaced by an incomplete one. `argv` is for the manifest.
 
     Raises:
         DataError: The folder cannot be written.

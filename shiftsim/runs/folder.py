@@ -77,13 +77,10 @@ class RunWriter:
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
-        """Begin a run, or go on with one.
+        """Begin a run, or `resume` one: keep what is finished.
 
-        Args:
-            path: Its folder.
-            manifest: Says what the run is; written as `running`, unless a complete run is there,
-                which stays as it is until this one has finished as well.
-            resume: Keep what is finished.
+        The manifest is written as `running`, unless a complete run is there, which stays as it is
+        until this one has finished as well.
 
         Raises:
             ConfigError: Another process works on this folder.

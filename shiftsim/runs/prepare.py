@@ -74,10 +74,7 @@ def prepare(
 ) -> Prepared:
     """Resolve every name and check everything that a run needs.
 
-    Args:
-        config: The settings; `planners` and `noise` name what the next two hold, if given.
-        planners: Classes or instances that take the place of the names.
-        noises: Noise models that take the place of the names.
+    Classes or instances of planners, and noise models, take the place of the names in the settings.
 
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.

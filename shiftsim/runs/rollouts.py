@@ -142,10 +142,7 @@ def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
 def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
     """A stored rollout, completed by what its scenario holds already.
 
-    Args:
-        rows: Columns of `STATES`, and of `TRACKS` where they are not those of the log; others do
-            not matter.
-        scenario: The scenario that was driven.
+    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log.
 
     Raises:
         DataError: The scenario is not the one that was driven.
