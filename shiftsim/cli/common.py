@@ -8,7 +8,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import wraps
@@ -43,6 +43,15 @@ def say(text: str = "") -> None:
 def say_json(value: Any) -> None:
     """A value as JSON; what JSON does not know becomes text."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+
+
+def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
+    """What was found, as JSON or line by line."""
+    if as_json:
+        say_json(values)
+    else:
+        for line in lines:
+            say(line)
 
 
 def plural(count: int, noun: str) -> str:

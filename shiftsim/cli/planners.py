@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, new_app, plural, say, say_json
+from shiftsim.cli.common import Debug, Json, new_app, plural, say, say_json, show
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -98,11 +98,7 @@ def inspect(path: Source, as_json: Json = False, debug: Debug = False) -> None:
     from shiftsim.planners.learned.convert import inspect_checkpoint
 
     found = inspect_checkpoint(path)
-    if as_json:
-        say_json(found.to_dict())
-        return
-    for line in found.lines():
-        say(line)
+    show(found.to_dict(), found.lines(), as_json=as_json)
 
 
 @checkpoint.command()
@@ -116,8 +112,4 @@ def convert(
     from shiftsim.planners.learned.convert import convert_checkpoint
 
     made = convert_checkpoint(path, out)
-    if as_json:
-        say_json(made.to_dict())
-        return
-    for line in made.lines():
-        say(line)
+    show(made.to_dict(), made.lines(), as_json=as_json)

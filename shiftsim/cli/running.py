@@ -10,19 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import (
-    ALL,
-    Debug,
-    Json,
-    Quiet,
-    Settings,
-    planner_arguments,
-    plural,
-    progress_bar,
-    say,
-    say_json,
-    with_settings,
-)
+from shiftsim.cli import common
+from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress
@@ -44,9 +33,9 @@ Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win o
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
-@with_settings(*ALL)
+@common.with_settings(*common.ALL)
 def run(
-    settings: Settings,
+    settings: common.Settings,
     config: Config = None,
     dry_run: DryRun = False,
     quiet: Quiet = False,
@@ -62,7 +51,7 @@ def run(
     before = values.get("planner_args", {})
     values |= settings
     if texts:
-        values["planner_args"] = planner_arguments(texts, before, values.get("planners", ()))
+        values["planner_args"] = common.planner_arguments(texts, before, values.get("planners", ()))
     made = make_config(values, where=str(config) if config else "run")
     run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
 
@@ -198,11 +187,11 @@ def _show(finished: "Run", *, allow_partial: bool) -> None:
         say(f" replay:  shiftsim view {finished.path}")
 
 
-@with_settings("workers", "limit")
+@common.with_settings("workers", "limit")
 def demo(
     out: Annotated[Path | None, typer.Option(help="Folder of the demo store.")] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -237,7 +226,7 @@ def demo(
         say("  shiftsim planners list           shiftsim --help")
 
 
-@with_settings(
+@common.with_settings(
     "thresholds",
     "metrics",
     "store",
@@ -248,7 +237,7 @@ def demo(
 )
 def score(
     source: Annotated[Path, typer.Argument(metavar="RUN", help="A run with stored rollouts.")],
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,

@@ -5,18 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli.common import (
-    Debug,
-    Json,
-    Quiet,
-    Settings,
-    new_app,
-    plural,
-    progress_bar,
-    say,
-    say_json,
-    with_settings,
-)
+from shiftsim.cli import common
+from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
@@ -54,7 +44,7 @@ def check(
         raise typer.Exit(_DATA)
 
 
-@with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
+@common.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
 def filter_scenarios(
     store: Store,
     min_path: Annotated[float | None, typer.Option(help="Shortest path [m]. [5]")] = None,
@@ -62,7 +52,7 @@ def filter_scenarios(
         float | None, typer.Option(help="Least share of it along the route. [0.5]")
     ] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -115,7 +105,7 @@ def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
 
 
-def _chosen(store: "ScenarioStore", settings: Settings) -> tuple[str, ...]:
+def _chosen(store: "ScenarioStore", settings: common.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
     from shiftsim.runs.filter import read_verdicts
@@ -138,7 +128,7 @@ def _chosen(store: "ScenarioStore", settings: Settings) -> tuple[str, ...]:
     return store.reviews.usable(store.tokens, usable)
 
 
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def make_split(
     store: Store,
     out: Annotated[
@@ -151,7 +141,7 @@ def make_split(
     per_type: Annotated[int | None, typer.Option(min=1, help="At most N of every type.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="At most N in all.")] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -178,12 +168,12 @@ def make_split(
 
 
 @export.command("nuplan")
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def export_to_nuplan(
     store: Store,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -225,7 +215,7 @@ def export_to_nuplan(
     )
 
 
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def show_stats(
     store: Store,
     by: Annotated[str, typer.Option(help="city or type.")] = "city",
@@ -237,7 +227,7 @@ def show_stats(
         Path | None, typer.Option(help="Draw bars into this file (.png, .svg, .pdf).")
     ] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
