@@ -1,13 +1,12 @@
 """Import paths of earlier versions, for one version more.
 
-`MODULES` and `NAMES` are the whole story: what was printed in README or docs and has moved since.
+`MODULES`, and `MOVED` of some packages, are the whole story: what was printed in README or docs
+and has moved since.
 """
 
-import sys
 import warnings
-from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
+from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
@@ -28,36 +27,20 @@ MODULES = {
     "shiftsim.traffic.idm": "shiftsim.sim.traffic.idm.model",
     "shiftsim.traffic.mixed": "shiftsim.sim.traffic.mixed",
 }
-NAMES = {
-    "shiftsim.data.opendrive": {"read_opendrive": "shiftsim.data.opendrive.reading"},
-    "shiftsim.data.store": {
-        "StoreWriter": "shiftsim.data.store.writing",
-        "open_store": "shiftsim.data.store.reading",
-    },
-    "shiftsim.planners": {"load_planner": "shiftsim.planners.registry"},
-}
 
 
-def moved_names(package: str) -> Callable[[str], Any]:
-    """The `__getattr__` of a package that names have moved out of."""
-
-    def find(name: str) -> Any:
-        if name not in NAMES[package]:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        _warn(f"{package}.{name}", f"{NAMES[package][name]}.{name}")
-        return getattr(import_module(NAMES[package][name]), name)
-
-    return find
+def moved_name(name: str, module: str) -> Any:
+    """A name that has moved from a package into a module of it."""
+    _warn(f"{module.rpartition('.')[0]}.{name}", f"{module}.{name}")
+    return getattr(import_module(module), name)
 
 
-class _Finder(MetaPathFinder, Loader):
-    """Asked last, for modules that nobody else knows."""
+def find_spec(name: str) -> ModuleSpec | None:
+    """What imports a module under its earlier path."""
+    return ModuleSpec(name, _Loader()) if name in MODULES else None
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        return ModuleSpec(fullname, self) if fullname in MODULES else None
 
+class _Loader(Loader):
     def exec_module(self, module: ModuleType) -> None:
         _warn(module.__name__, MODULES[module.__name__])
         found = vars(import_module(MODULES[module.__name__]))
@@ -67,8 +50,3 @@ class _Finder(MetaPathFinder, Loader):
 
 def _warn(old: str, new: str) -> None:
     warnings.warn(f"{old} is now {new}", DeprecationWarning, stacklevel=3)
-
-
-def install() -> None:
-    """Let earlier import paths work in this process."""
-    sys.meta_path.append(_Finder())

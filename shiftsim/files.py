@@ -115,11 +115,7 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
 
 
 def sources(paths: Iterable[Path]) -> dict[str, bytes]:
-    """Modules of ours and all that they import, one from the other: their text by path.
-
-    Args:
-        paths: Files below `PACKAGE`.
-    """
+    """Modules of ours, below `PACKAGE`, and all that they import: their text by path."""
     waiting, found = list(paths), dict[str, bytes]()
     while waiting:
         name = waiting.pop().relative_to(PACKAGE).as_posix()

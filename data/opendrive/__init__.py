@@ -1,5 +1,13 @@
 """OpenDRIVE maps."""
 
-from shiftsim._moved import moved_names
+from typing import Any
 
-__getattr__ = moved_names(__name__)
+MOVED = {"read_opendrive": "reading"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in MOVED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from shiftsim._moved import moved_name
+
+    return moved_name(name, f"{__name__}.{MOVED[name]}")

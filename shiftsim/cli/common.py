@@ -1,14 +1,22 @@
-"""What several commands share: options, progress, JSON."""
+"""What several commands share: options, progress, JSON.
 
+Options are made from the settings of a run: a field of `RunConfig` is an option.
+"""
+
+import inspect
 import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from dataclasses import fields
+from functools import wraps
+from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import typer
+
+from shiftsim.runs.config import RunConfig, parse_argument
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
@@ -37,6 +45,15 @@ def say_json(value: Any) -> None:
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
 
 
+def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
+    """What was found, as JSON or line by line."""
+    if as_json:
+        say_json(values)
+    else:
+        for line in lines:
+            say(line)
+
+
 def plural(count: int, noun: str) -> str:
     """`1 task`, `2 tasks`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -52,11 +69,7 @@ Advance = Callable[[int, int, str], None]
 
 @contextmanager
 def progress_bar(*, quiet: bool) -> Iterator[Advance]:
-    """Shows how far something is: a bar with the remaining time, or a line per 10 %.
-
-    Yields:
-        A function to be called with done, total and a note.
-    """
+    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
     if quiet:
         yield lambda done, total, note: None
     elif sys.stderr.isatty():
@@ -66,25 +79,18 @@ def progress_bar(*, quiet: bool) -> Iterator[Advance]:
 
 
 def _bar() -> Iterator[Advance]:
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("ETA"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=None)
 
         def advance(done: int, total: int, note: str) -> None:
@@ -108,3 +114,70 @@ def _lines() -> Advance:
             typer.echo(text, err=True)
 
     return advance
+
+
+Settings: TypeAlias = dict[str, Any]
+_FIELDS = {item.name: item for item in fields(RunConfig)}
+ALL = tuple(_FIELDS)
+_KIND = inspect.Parameter.KEYWORD_ONLY  # those with a default may come first
+
+
+def with_settings(
+    *names: str, **helps: str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of settings, at the place of its parameter `settings`.
+
+    The command gets those that were given, as `RunConfig` wants them; arguments of planners are
+    texts still, for `planner_arguments`. `helps` are other help texts for some of them.
+    """
+    options = [_option(name, helps.get(name)) for name in names]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            parameters += options if name == "settings" else [parameter.replace(kind=_KIND)]
+
+        @wraps(command)
+        def call(**values: Any) -> None:
+            raw = {name: values.pop(name) for name in names}
+            settings = {n: _parsed(n, value) for n, value in raw.items() if value not in (None, [])}
+            command(settings=settings, **values)
+
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        return call
+
+    return decorate
+
+
+def _option(name: str, text: str | None) -> inspect.Parameter:
+    item = _FIELDS[name]
+    option = item.metadata["option"]
+    kind: Any = item.type
+    if get_origin(kind) is dict or (get_origin(kind) is tuple and not option.parse):
+        kind = list[get_args(kind)[0]]  # type: ignore[misc]
+    elif option.parse:
+        kind = str
+    flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
+    return inspect.Parameter(
+        name,
+        _KIND,
+        default=None,
+        annotation=Annotated[kind | None, typer.Option(*flags, help=text or option.help)],
+    )
+
+
+def _parsed(name: str, value: Any) -> Any:
+    parse = _FIELDS[name].metadata["option"].parse
+    return parse(value) if parse else value
+
+
+def planner_arguments(
+    texts: Sequence[str], before: Mapping[str, Any], planners: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Arguments by planner, those of the command line put over what a file says."""
+    arguments = {name: dict(table) for name, table in before.items()}
+    for text in texts:
+        owner, name, value = parse_argument(text, tuple(planners))
+        arguments.setdefault(owner, {})[name] = value
+    return arguments

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, say_json
+from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
 
 REFERENCE = PACKAGE / "verify" / "reference"
@@ -49,11 +49,7 @@ def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) ->
     """Versions, cores and memory, and whether the kernels compute what they should."""
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance)
-    if as_json:
-        say_json(asdict(found))
-    else:
-        for line in found.lines():
-            say(line)
+    show(asdict(found), found.lines(), as_json=as_json)
     if not found.is_well:
         raise typer.Exit(_DATA)
 

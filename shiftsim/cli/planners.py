@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, new_app, plural, say, say_json
+from shiftsim.cli.common import Debug, Json, new_app, plural, say, say_json, show
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -37,12 +37,8 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
 
     missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
     if as_json:
-        say_json(
-            [
-                {**asdict(entry), "ready": not missing[name], "missing": missing[name]}
-                for name, entry in PLANNERS.items()
-            ]
-        )
+        state = ({"ready": not text, "missing": text} for text in missing.values())
+        say_json([asdict(e) | more for e, more in zip(PLANNERS.values(), state, strict=True)])
         return
     for name, entry in PLANNERS.items():
         say(f" {name:18} {entry.kind:11} {entry.description}")
@@ -102,11 +98,7 @@ def inspect(path: Source, as_json: Json = False, debug: Debug = False) -> None:
     from shiftsim.planners.learned.convert import inspect_checkpoint
 
     found = inspect_checkpoint(path)
-    if as_json:
-        say_json(found.to_dict())
-        return
-    for line in found.lines():
-        say(line)
+    show(found.to_dict(), found.lines(), as_json=as_json)
 
 
 @checkpoint.command()
@@ -120,8 +112,4 @@ def convert(
     from shiftsim.planners.learned.convert import convert_checkpoint
 
     made = convert_checkpoint(path, out)
-    if as_json:
-        say_json(made.to_dict())
-        return
-    for line in made.lines():
-        say(line)
+    show(made.to_dict(), made.lines(), as_json=as_json)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from shiftsim.cli import common
 from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.options import ALL, Settings, planner_arguments, with_settings
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress
@@ -33,9 +33,9 @@ Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win o
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
-@with_settings(*ALL)
+@common.with_settings(*common.ALL)
 def run(
-    settings: Settings,
+    settings: common.Settings,
     config: Config = None,
     dry_run: DryRun = False,
     quiet: Quiet = False,
@@ -51,7 +51,7 @@ def run(
     before = values.get("planner_args", {})
     values |= settings
     if texts:
-        values["planner_args"] = planner_arguments(texts, before, values.get("planners", ()))
+        values["planner_args"] = common.planner_arguments(texts, before, values.get("planners", ()))
     made = make_config(values, where=str(config) if config else "run")
     run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
 
@@ -77,15 +77,9 @@ def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> Non
 def interruptible(
     folder: Path, again: list[str], *, quiet: bool
 ) -> Iterator[Callable[["Progress"], None]]:
-    """Show progress; an interrupt, or a request to end from a batch system, keeps what is finished.
+    """Yields what shows progress; an interrupt, or a request to end, keeps what is finished.
 
-    Args:
-        folder: Where that is kept.
-        again: Words of the command that goes on with it.
-        quiet: Show nothing.
-
-    Yields:
-        Shows how far the work is.
+    It then says in which folder that is kept, and the words of the command that goes on with it.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -160,17 +154,19 @@ def _announce(prepared: "Prepared") -> None:
 
 def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
     """Print what a run gave, and leave with the code for it."""
-    _show(finished, allow_partial=allow_partial, as_json=as_json)
+    if as_json:
+        from shiftsim.report.scores import summary
+
+        say_json(summary(finished))
+    else:
+        _show(finished, allow_partial=allow_partial)
     if not finished.is_complete:
         raise typer.Exit(_UNFINISHED)
 
 
-def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
-    from shiftsim.report.scores import failures, score_table, summary, worst_rollouts
+def _show(finished: "Run", *, allow_partial: bool) -> None:
+    from shiftsim.report.scores import failures, score_table, worst_rollouts
 
-    if as_json:
-        say_json(summary(finished))
-        return
     counts = finished.manifest["counts"]
     say()
     say(score_table([finished], allow_partial=allow_partial))
@@ -191,11 +187,11 @@ def _show(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
         say(f" replay:  shiftsim view {finished.path}")
 
 
-@with_settings("workers", "limit")
+@common.with_settings("workers", "limit")
 def demo(
     out: Annotated[Path | None, typer.Option(help="Folder of the demo store.")] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -230,7 +226,7 @@ def demo(
         say("  shiftsim planners list           shiftsim --help")
 
 
-@with_settings(
+@common.with_settings(
     "thresholds",
     "metrics",
     "store",
@@ -241,7 +237,7 @@ def demo(
 )
 def score(
     source: Annotated[Path, typer.Argument(metavar="RUN", help="A run with stored rollouts.")],
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -277,9 +273,5 @@ def merge(
     from shiftsim.runs.derive import merge_runs
     from shiftsim.runs.results import open_run
 
-    merged = merge_runs(
-        [open_run(path) for path in runs],
-        out=out,
-        allow_partial=allow_partial,
-    )
+    merged = merge_runs([open_run(path) for path in runs], out=out, allow_partial=allow_partial)
     leave_with(merged, allow_partial=allow_partial, as_json=as_json)

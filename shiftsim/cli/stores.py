@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from shiftsim.cli import common
 from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
-from shiftsim.cli.options import Settings, with_settings
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
@@ -44,7 +44,7 @@ def check(
         raise typer.Exit(_DATA)
 
 
-@with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
+@common.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
 def filter_scenarios(
     store: Store,
     min_path: Annotated[float | None, typer.Option(help="Shortest path [m]. [5]")] = None,
@@ -52,7 +52,7 @@ def filter_scenarios(
         float | None, typer.Option(help="Least share of it along the route. [0.5]")
     ] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -105,7 +105,7 @@ def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
 
 
-def _chosen(store: "ScenarioStore", settings: Settings) -> tuple[str, ...]:
+def _chosen(store: "ScenarioStore", settings: common.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
     from shiftsim.runs.filter import read_verdicts
@@ -128,7 +128,7 @@ def _chosen(store: "ScenarioStore", settings: Settings) -> tuple[str, ...]:
     return store.reviews.usable(store.tokens, usable)
 
 
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def make_split(
     store: Store,
     out: Annotated[
@@ -141,7 +141,7 @@ def make_split(
     per_type: Annotated[int | None, typer.Option(min=1, help="At most N of every type.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="At most N in all.")] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -149,7 +149,8 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runs.scenarios import choose_scenarios, open_named_store, write_split
+    from shiftsim.runs.filter import choose_scenarios, write_split
+    from shiftsim.runs.scenarios import open_named_store
 
     opened = open_named_store(store)
     found = choose_scenarios(
@@ -167,12 +168,12 @@ def make_split(
 
 
 @export.command("nuplan")
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def export_to_nuplan(
     store: Store,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -194,17 +195,9 @@ def export_to_nuplan(
         for (kind, mapping), count in sorted(report.mappings.items())
     ]
     if as_json:
-        say_json(
-            {
-                "logs": report.logs,
-                "maps": report.maps,
-                "token_file": report.token_file,
-                "tokens": report.tokens,
-                "cities": report.cities,
-                "mappings": mappings,
-                "missing_maps": report.missing_maps,
-            }
-        )
+        names = ("logs", "maps", "token_file", "tokens", "cities")
+        shown = {name: getattr(report, name) for name in names}
+        say_json(shown | {"mappings": mappings, "missing_maps": report.missing_maps})
         return
     say(f" {plural(len(report.tokens), 'log')} → {report.logs}")
     say(f" {plural(len(report.cities), 'map')} → {report.maps}")
@@ -222,7 +215,7 @@ def export_to_nuplan(
     )
 
 
-@with_settings("split", "all_scenarios")
+@common.with_settings("split", "all_scenarios")
 def show_stats(
     store: Store,
     by: Annotated[str, typer.Option(help="city or type.")] = "city",
@@ -234,7 +227,7 @@ def show_stats(
         Path | None, typer.Option(help="Draw bars into this file (.png, .svg, .pdf).")
     ] = None,
     *,
-    settings: Settings,
+    settings: common.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,

@@ -33,18 +33,7 @@ def map_on_cluster(
     limit: float = 0.0,
     pieces: Callable[[T], Sequence[T]] | None = None,
 ) -> Generator[Outcome[T, R], None, None]:
-    """Apply a function to every task, in whatever order they finish.
-
-    Args:
-        make: Called once per process; returns the function.
-        tasks: The tasks.
-        scheduler: Address of the scheduler, such as `tcp://head:8786`.
-        alone: So many leading tasks are done one at a time before the others.
-        limit: Time that each piece of a task may take [s]; 0 for any.
-        pieces: Splits a task that is several in one, as for `executors.map_unordered`.
-
-    Yields:
-        One outcome per task, or per piece of one whose process died.
+    """As `workers.map_unordered`, on the cluster whose scheduler is at an address.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.

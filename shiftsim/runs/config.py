@@ -183,17 +183,12 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
         ConfigError: A name is unknown, or a value is wrong.
     """
     known = {item.name for item in fields(RunConfig)}
-    for name in values:
-        try:
-            one_of("setting", name, known)
-        except ConfigError as error:
-            raise ConfigError(f"{where}: {error}", hint=error.hint) from error
-    if "planners" not in values:
-        raise ConfigError(f"{where}: no planner", hint="name one, for example --planner idm")
-    plain: dict[str, Any] = {
-        name: tuple(v) if isinstance(v, list) else v for name, v in values.items()
-    }
+    plain: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
     try:
+        for name in values:
+            one_of("setting", name, known)
+        if "planners" not in values:
+            raise ConfigError("no planner", hint="name one, for example --planner idm")
         return RunConfig(**plain)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}", hint=error.hint) from error

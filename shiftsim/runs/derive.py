@@ -4,13 +4,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.runs.config import RunConfig, make_config, parse_shard
-from shiftsim.runs.execute import Progress, record, scenario_of
+from shiftsim.runs.execute import Progress, record
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
 from shiftsim.runs.prepare import RUNS, run_name
@@ -22,15 +23,10 @@ from shiftsim.runs.workers import default_workers, map_unordered
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
-    """Write the run folder that the shards `1/n` to `n/n` are parts of.
+    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without.
 
-    Args:
-        runs: The shards.
-        out: The new folder; by default the name of the shards without their number.
-        allow_partial: Accept that shards are missing; their tasks then are `missing`.
-
-    Returns:
-        The run; its scores and metrics are the same bytes as without shards.
+    By default it has the name of the shards without their number. With `allow_partial` shards may
+    be missing; their tasks then are `missing`.
 
     Raises:
         ConfigError: Something is no shard, of another run, given twice or missing.
@@ -122,16 +118,9 @@ def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
 
 
 class Rescorer:
-    """Scores one stored rollout after the other."""
+    """Scores one stored rollout of a run after the other."""
 
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        """Score rollouts of a run.
-
-        Args:
-            run: Its folder.
-            store: Folder of the store it was made with.
-            config: Its settings, with the other thresholds and metrics.
-        """
         self.config = config
         self._run, self._scenarios = open_run(run), Scenarios(store)
 
@@ -157,17 +146,10 @@ def rescore(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder as if the run had been made with other thresholds.
+    """Write a run folder (`runs/<id>`) as if the run had been made with other thresholds.
 
-    Args:
-        run: A run with stored rollouts.
-        thresholds: Threshold profile.
-        metrics: Own metrics, by `module:attribute`.
-        store: The store, where it has moved.
-        out: The new folder; by default `runs/<id>`.
-        workers: Worker processes; 0 chooses from the cores.
-        on_progress: Called after every rollout.
-        argv: The command line, for the manifest.
+    `metrics` are custom ones by `module:attribute`, `store` says where the store has moved,
+    `workers` of 0 chooses from the cores, `argv` is for the manifest.
 
     Raises:
         DataError: Rollouts are missing, or the store is another one.
@@ -175,11 +157,12 @@ def rescore(
     for metric in metrics:
         load_metric(metric)
     found = open_run_store(run, store)
+    here, simulated = code_digest(), run.manifest["determining"].get("code", "")
     determining = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
         "metric_version": METRIC_VERSION,
-        "code": _code(run.manifest["determining"].get("code", "")),
+        "code": here if here == simulated else f"{simulated}, scored by {here}",
     }
     values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
     config = make_config(values, where=str(run.path / "manifest.json"))
@@ -212,22 +195,15 @@ def rescore(
             [Batch((task,)) for task in sorted(done, key=lambda task: task.token)],
             workers=min(workers or default_workers(), len(done)),
             alone=1,
-            group=scenario_of,
+            group=attrgetter("token"),
         )
         with closing(outcomes):
-            add = partial(_add, writer, run)
+
+            def add(result: TaskResult) -> None:
+                writer.add(result, stored=run.rollout_places[result.task])
+
             record(outcomes, add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
     finally:
         writer.close()
-
-
-def _add(writer: RunWriter, run: Run, result: TaskResult) -> None:
-    writer.add(result, stored=run.rollout_places[result.task])
-
-
-def _code(simulated: str) -> str:
-    """Digest of the code that simulated, and of the code that scores where it is another."""
-    here = code_digest()
-    return here if here == simulated else f"{simulated}, scored by {here}"

@@ -19,16 +19,8 @@ from shiftsim.runs.rollouts import Task
 # columns of a stored rollout in the order of cause and effect within one step
 _KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
 _LATER = ("degraded", "plan_poses", "command_", "noise_")
-_UNITS = {
-    "m": "m",
-    "rad": "rad",
-    "mps": "m/s",
-    "mps2": "m/s²",
-    "radps": "rad/s",
-    "radps2": "rad/s²",
-}
-
-
+_UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
+_UNITS |= {"m": "m", "rad": "rad"}
 _AXES = ("x [m]", "y [m]", "heading [rad]")
 
 
@@ -88,19 +80,17 @@ class Difference:
 
 
 def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
-    """Compare two runs.
+    """Compare two runs, and look into a number of changes, the largest of the score first.
 
     Planners are paired by name; two runs of one planner each are compared whatever their names.
-
-    Args:
-        first: One run.
-        second: The other one.
-        limit: How many changes are looked into, those with the largest change of score first.
 
     Raises:
         ConfigError: They have no rollout in common.
     """
-    names = _planner_names(first, second)
+    planners = [run.manifest["config"]["planners"] for run in (first, second)]
+    single = len(planners[0]) == len(planners[1]) == 1
+    names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}
+    names = {name: other for name, other in names.items() if other in planners[1]}
     ours = {_key(row): row for row in first.scores.to_pylist()}
     theirs = {_key(row): row for row in second.scores.to_pylist()}
     back = {other: name for name, other in names.items()}
@@ -122,8 +112,10 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
         _change(first, second, common[i], names[common[i].planner], ours, paired)
         for i in changed[:limit]
     ]
+    before_by, after_by = (run.manifest["determining"] for run in (first, second))
+    settings = sorted({*before_by, *after_by})
     return Difference(
-        settings=_settings(first, second),
+        settings=tuple(n for n in settings if before_by.get(n) != after_by.get(n)),
         same=int(np.sum(before == after)),
         better=int(np.sum(after > before)),
         worse=int(np.sum(after < before)),
@@ -173,19 +165,6 @@ def _key(row: dict[str, Any]) -> Task:
     return Task(*(row[name] for name in Task._fields))
 
 
-def _planner_names(first: Run, second: Run) -> dict[str, str]:
-    """Planner of the second run by that of the first."""
-    ours, theirs = (run.manifest["config"]["planners"] for run in (first, second))
-    if len(ours) == len(theirs) == 1:
-        return {ours[0]: theirs[0]}
-    return {name: name for name in ours if name in theirs}
-
-
-def _settings(first: Run, second: Run) -> tuple[str, ...]:
-    ours, theirs = (run.manifest["determining"] for run in (first, second))
-    return tuple(n for n in sorted({*ours, *theirs}) if ours.get(n) != theirs.get(n))
-
-
 def _change(
     first: Run,
     second: Run,
@@ -229,12 +208,12 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     if best is None and len(first) == len(second):
         return None
     row, name = best or (rows, "")
-    seconds = float(_since_start(first if len(first) > row else second, row))
+    times = (first if len(first) > row else second)["time_us"]
+    seconds = float((times[row].as_py() - times[0].as_py()) * 1e-6)
     if not name:
         return Departure(row, seconds, "length of the rollout", len(first), len(second))
     ours, theirs = (np.ravel(_values(table[name], rows)[row]) for table in (first, second))
-    place = _first_difference(ours, theirs)
-    index = 0 if place is None else place
+    index = _first_difference(ours, theirs) or 0
     return Departure(row, seconds, _quantity(name, index), float(ours[index]), float(theirs[index]))
 
 
@@ -262,11 +241,6 @@ def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
     if not differ.any():
         return None
     return int(np.argmax(differ.reshape(len(differ), -1).any(axis=1)))
-
-
-def _since_start(table: pa.RecordBatch, row: int) -> float:
-    times = table["time_us"]
-    return (times[row].as_py() - times[0].as_py()) * 1e-6
 
 
 def _quantity(name: str, index: int) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import Any, TypeAlias
 
 from shiftsim.errors import DataError
@@ -38,8 +39,7 @@ class Progress:
 
     def after(self, result: TaskResult) -> "Progress":
         """The progress after one more result."""
-        failed = result.status != OK
-        return self + Progress(1, 0, int(failed), result.seconds)
+        return self + Progress(1, 0, int(result.status != OK), result.seconds)
 
     def __add__(self, other: "Progress") -> "Progress":
         names = {**self.seconds, **other.seconds}
@@ -53,21 +53,13 @@ Watch: TypeAlias = Callable[[Progress], None]
 
 
 def execute(
-    prepared: Prepared,
-    *,
-    on_progress: Watch = lambda progress: None,
-    argv: Sequence[str] = (),
+    prepared: Prepared, *, on_progress: Watch = lambda progress: None, argv: Sequence[str] = ()
 ) -> Run:
     """Do all tasks and write the run folder.
 
     Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
     with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
-    replaced by an incomplete one.
-
-    Args:
-        prepared: The run.
-        on_progress: Called after every task.
-        argv: The command line, for the manifest.
+    replaced by an incomplete one. `argv` is for the manifest.
 
     Raises:
         DataError: The folder cannot be written.
@@ -139,14 +131,7 @@ def _do_batches(prepared: Prepared, writer: RunWriter, on_progress: Watch) -> bo
 def record(
     outcomes: Outcomes, add: Callable[[TaskResult], None], progress: Progress, on_progress: Watch
 ) -> None:
-    """Put results on disk as they come.
-
-    Args:
-        outcomes: What workers give back.
-        add: Puts one result on disk.
-        progress: How far the run was before.
-        on_progress: Called after every batch.
-    """
+    """Put what workers give back on disk as it comes, and tell how far the run is."""
     for outcome in outcomes:
         for result in ended(outcome):
             add(result)
@@ -155,13 +140,10 @@ def record(
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
-    """What is left to do of a run.
+    """What is left to do of a run, by the status of the tasks that have ended.
 
-    Args:
-        batches: All of it. A batch that is not finished is done as a whole again: its results may
-            depend on one another in the last digits.
-        ended: Status of the tasks that have ended.
-        retry: Whether those that failed are done again.
+    A batch that is not finished is done as a whole again: its results may depend on one another in
+    the last digits. `retry` does those that failed again, too.
     """
     out: list[Batch] = []
     for batch in batches:
@@ -195,13 +177,8 @@ def _outcomes(prepared: Prepared, batches: Sequence[Batch]) -> Outcomes:
         alone=leading,
         limit=config.timeout,
         pieces=Batch.split,
-        group=scenario_of,
+        group=attrgetter("token"),
     )
-
-
-def scenario_of(batch: Batch) -> str:
-    """What a worker stays with, as it has read it already."""
-    return batch.token
 
 
 def ended(outcome: Outcome[Batch, list[TaskResult]]) -> list[TaskResult]:
@@ -240,9 +217,8 @@ def run(
     """
     sources = list(planner) if isinstance(planner, (list, tuple)) else [planner]
     models = [noise] if isinstance(noise, (str, NoiseModel)) else list(noise)
-    names = [model for model in models if isinstance(model, str)]
     made = [m if isinstance(m, NoiseModel) else parse_noise(m) for m in models if m != "all"]
-    if "all" in names:
+    if "all" in [model for model in models if isinstance(model, str)]:
         made += [parse_noise(name) for name in NOISE_NAMES]
     values = {
         "planners": [planner_name(source) for source in sources],

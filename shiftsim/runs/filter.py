@@ -1,4 +1,6 @@
-"""The automatic filter: drive scenarios as recorded, drop those that cannot be driven so.
+"""Which scenarios of a store are used: the automatic filter, and splits made of what passes.
+
+The filter drives scenarios as recorded, and drops those that cannot be driven so.
 
 The verdicts lie beside the scenarios, in `filter/verdicts.parquet` of the store; the scenarios
 themselves stay as they are. Runs over a whole store use the accepted ones.
@@ -6,10 +8,12 @@ themselves stay as they are. Runs over a whole store use the accepted ones.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +22,12 @@ import pyarrow as pa
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import Table, digest, write_blocks
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.scenarios import Split
 from shiftsim.runs.task import Scenarios, attempt
 from shiftsim.runs.workers import default_workers, map_unordered
 from shiftsim.sim.loop import simulate
@@ -93,8 +98,8 @@ class Verdicts:
 
     def counts(self) -> dict[str, int]:
         """How many scenarios there are by verdict, and how many break each rule."""
-        out = {name: 0 for name in (ACCEPTED, DROPPED, FAILED)}
-        out |= {name: 0 for name in (COLLISION, AREA, STANDING, OFF_ROUTE)}
+        names = (ACCEPTED, DROPPED, FAILED, COLLISION, AREA, STANDING, OFF_ROUTE)
+        out = dict.fromkeys(names, 0)
         for row in self.rows:
             out[row["verdict"]] += 1
             for reason in row["reason"].split(", ") if row["verdict"] == DROPPED else ():
@@ -119,11 +124,7 @@ class Playback:
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
-    """Drive a scenario as it was recorded, and say whether it is fit for use.
-
-    Returns:
-        The row of the verdict.
-    """
+    """Drive a scenario as it was recorded; the row of the verdict whether it is fit for use."""
     # nuPlan rule 550: the recording itself, under thresholds of the filter's own
     log = simulate(scenario, None, controller="log-playback")
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds)
@@ -131,11 +132,8 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
     path = float(np.hypot(*np.diff(centers[:, :2], axis=0).T).sum())
     progress = next(s.value for s in result.statistics if s.name == _PROGRESS)
     rows = {row.metric: row for row in result.rows}
-    broken = []
-    if rows[_COLLISIONS].score != 1.0:
-        broken.append(COLLISION)
-    if rows[_DRIVABLE].score != 1.0:
-        broken.append(AREA)
+    rules = {_COLLISIONS: COLLISION, _DRIVABLE: AREA}
+    broken = [rule for name, rule in rules.items() if rows[name].score != 1.0]
     # nuPlan rule 551: too little progress is a short path, or a path beside the route
     if path < config.min_path_m:
         broken.append(STANDING)
@@ -170,16 +168,11 @@ def filter_store(
     workers: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Verdicts:
-    """Judge every scenario of a store and write the verdicts into it.
+    """Find the verdict on every scenario of a store, and write them into it.
 
     A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
-    settings on the same scenarios are kept. The file has the same bytes for any number of workers.
-
-    Args:
-        store: Folder of the store.
-        config: What a scenario must satisfy; the values of the benchmark where None.
-        workers: Worker processes; 0 chooses from the cores.
-        on_progress: Called with scenarios done and scenarios in all.
+    settings on the same scenarios are kept. The file has the same bytes for any number of workers,
+    of which 0 chooses from the cores. `on_progress` is told scenarios done and in all.
 
     Raises:
         DataError: There is no store, or it is damaged.
@@ -205,7 +198,9 @@ def filter_store(
                 journal.put(f"{conditions['hash']} {outcome.task}", row)
                 done[outcome.task] = row
                 on_progress(len(done), len(opened))
-        _write(path, [done[token] for token in opened.tokens], conditions)
+        found = [dict(done[token]) for token in opened.tokens]
+        table = pa.Table.from_pylist(found, schema=_SCHEMA)
+        write_blocks(path / VERDICTS, [table], conditions)
         journal.remove()
     finally:
         journal.close()
@@ -241,11 +236,6 @@ def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, 
     return found.rows if same else ()
 
 
-def _write(store: Path, rows: Iterable[Mapping[str, Any]], conditions: Mapping[str, Any]) -> None:
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=_SCHEMA)
-    write_blocks(store / VERDICTS, [table], conditions)
-
-
 def _read(store: Path) -> Verdicts:
     path = store / VERDICTS
     table = Table(path, _SCHEMA)
@@ -256,11 +246,7 @@ def _read(store: Path) -> Verdicts:
 
 
 def read_verdicts(store: str | Path, store_hash: str) -> Verdicts | None:
-    """The verdicts of a store; None where it was not filtered.
-
-    Args:
-        store: Folder of the store.
-        store_hash: Its content hash.
+    """The verdicts of a store, whose content has a hash; None where it was not filtered.
 
     Raises:
         DataError: The file is damaged, or of another content of the store.
@@ -275,3 +261,62 @@ def read_verdicts(store: str | Path, store_hash: str) -> Verdicts | None:
             hint=f"shiftsim filter {path}, or --all to use every scenario",
         )
     return found
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
+
+    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
+    and `wanted` values by column, none for any.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        head = f'name = {json.dumps(split.name)}\ncount = {len(tokens)}\nhash = "{split.hash}"'
+        lines = [head, "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
+    return split

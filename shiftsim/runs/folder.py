@@ -77,13 +77,10 @@ class RunWriter:
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
-        """Begin a run, or go on with one.
+        """Begin a run, or `resume` one: keep what is finished.
 
-        Args:
-            path: Its folder.
-            manifest: Says what the run is; written as `running`, unless a complete run is there,
-                which stays as it is until this one has finished as well.
-            resume: Keep what is finished.
+        The manifest is written as `running`, unless a complete run is there, which stays as it is
+        until this one has finished as well.
 
         Raises:
             ConfigError: Another process works on this folder.
@@ -111,11 +108,7 @@ class RunWriter:
             yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
 
     def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
-        """Put one result on disk.
-
-        Args:
-            result: The result.
-            stored: Where its rollout is, if another run has it already.
+        """Put one result on disk; its rollout may be `stored` by another run already.
 
         Raises:
             OSError: The disk is full; what is there already stays.
@@ -138,12 +131,9 @@ class RunWriter:
         expected: Iterable[Task],
         absent: Callable[[Task], str] = lambda task: "the run was interrupted",
     ) -> Run:
-        """Write tables and manifest.
+        """Write tables and manifest, whose `counts` are filled in.
 
-        Args:
-            manifest: The manifest; its `counts` are filled in.
-            expected: All tasks of a complete run.
-            absent: Why a task has no result.
+        `expected` are all tasks of a complete run; `absent` says why one has no result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]

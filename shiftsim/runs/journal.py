@@ -33,11 +33,7 @@ class Journal:
     """Numbered entries: a key, JSON values, and bytes beside them."""
 
     def __init__(self, path: Path, *, keep: bool) -> None:
-        """Begin a journal, or go on with one; nothing is in the file before the first entry.
-
-        Args:
-            path: The file.
-            keep: Keep what is in it.
+        """Begin a journal, or keep one; nothing is in the file before the first entry.
 
         Raises:
             ConfigError: Another process works with it.
@@ -70,10 +66,7 @@ class Journal:
         return database
 
     def put(self, key: str, values: Mapping[str, Any], data: bytes = b"") -> int:
-        """Put an entry on disk; with the same key again, the last one counts.
-
-        Returns:
-            Its number.
+        """Put an entry on disk, and return its number; of the same key, the last one counts.
 
         Raises:
             OSError: The disk is full; what is there already stays.
@@ -103,13 +96,11 @@ class Journal:
 
     def values(self, number: int) -> dict[str, Any]:
         """The values of an entry."""
-        found: dict[str, Any] = json.loads(self._select("content", number))
-        return found
+        return dict(json.loads(self._select("content", number)))
 
     def data(self, number: int) -> bytes:
         """The bytes of an entry."""
-        found: bytes = self._select("data", number)
-        return found
+        return bytes(self._select("data", number))
 
     def _select(self, column: str, number: int) -> Any:
         query = f"select {column} from entries where number = ?"

@@ -112,7 +112,10 @@ def state_of(folder: Path) -> State:
         DataError: The folder holds something else.
         ConfigError: It holds an unfinished run of an earlier version.
     """
-    if not folder.exists() or (folder.is_dir() and not any(_visible(folder))):
+    # a killed process leaves halves of files, whose names begin with a dot
+    if not folder.exists() or (
+        folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
+    ):
         return "new"
     manifest = read_manifest(folder)
     if has_entries(folder / _EARLIER_JOURNAL):
@@ -129,21 +132,8 @@ def state_of(folder: Path) -> State:
     return "complete" if counts["ok"] == counts["expected"] else "failed"
 
 
-def _visible(folder: Path) -> list[Path]:
-    """Without the halves of files that a killed process leaves."""
-    return [path for path in folder.iterdir() if not path.name.startswith(".")]
-
-
 def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") -> State:
-    """Whether a run may be written to a folder: a new one, or one with the same run.
-
-    Args:
-        folder: The folder.
-        determining: Everything that the results depend on.
-        shard: The part `i/n` of the tasks.
-
-    Returns:
-        How far the run there is.
+    """How far the run in a folder is, to which another one is to be written: the same, or none yet.
 
     Raises:
         ConfigError: The folder holds something else; the message says what differs.
@@ -182,11 +172,6 @@ def difference(manifest: dict[str, Any], determining: dict[str, Any], shard: str
 def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "") -> None:
     """Refuse to begin anew where an unfinished run with other settings seems to be meant.
 
-    Args:
-        folder: The folder of the run, where there is nothing yet.
-        determining: Everything that its results depend on.
-        shard: The part `i/n` of the tasks.
-
     Raises:
         ConfigError: There is one; the message says what differs.
     """
@@ -199,21 +184,14 @@ def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "
         except (DataError, KeyError):
             continue
         different = difference(manifest, determining, shard)
+        text = f"no unfinished run with these settings; {str(other)!r} is another one: {different}"
         raise ConfigError(
-            f"no unfinished run with these settings; {str(other)!r} is another one: {different}"[
-                :_MAX_MESSAGE
-            ],
-            hint="give its settings, or leave out --resume to begin anew",
+            text[:_MAX_MESSAGE], hint="give its settings, or leave out --resume to begin anew"
         )
 
 
 def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
-    """Refuse a run that cannot end where it is to be.
-
-    Args:
-        folder: The folder of the run, which need not exist.
-        num_tasks: Its tasks.
-        with_rollouts: Whether all rollouts are kept.
+    """Refuse a run that cannot end in its folder, which need not exist yet.
 
     Raises:
         ConfigError: The disk has too little space.

@@ -18,13 +18,7 @@ from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
 from shiftsim.runs.config import RunConfig, Value, parse_shard
-from shiftsim.runs.manifest import (
-    State,
-    check_resumable,
-    check_space,
-    check_target,
-    code_digest,
-)
+from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
@@ -36,6 +30,7 @@ if TYPE_CHECKING:
     from shiftsim.runs.filter import Verdicts
 
 RUNS = Path("runs")
+_NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
 _MAX_NAME = 40  # characters of one part of a run's name
 _MEMORY_OF_NETWORK = 1.5e9  # bytes per worker
 
@@ -75,28 +70,30 @@ class Chosen(NamedTuple):
 
 
 def prepare(
-    config: RunConfig,
-    *,
-    planners: Sequence[Any] = (),
-    noises: Sequence[NoiseModel] = (),
+    config: RunConfig, *, planners: Sequence[Any] = (), noises: Sequence[NoiseModel] = ()
 ) -> Prepared:
     """Resolve every name and check everything that a run needs.
 
-    Args:
-        config: The settings; `planners` and `noise` name what the next two hold, if given.
-        planners: Classes or instances that take the place of the names.
-        noises: Noise models that take the place of the names.
+    Classes or instances of planners, and noise models, take the place of the names in the settings.
 
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.
     """
-    models = list(noises) or [parse_noise(name) for name in _expanded(config.noise)]
+    # `all` stands for the seven of the benchmark
+    names = [
+        name for given in config.noise for name in (NOISE_NAMES if given == "all" else [given])
+    ]
+    models = list(noises) or [parse_noise(name) for name in dict.fromkeys(names)]
     config = replace(
-        config,
-        noise=tuple(model.name for model in models),
-        traffic=traffic_name(config.traffic),
+        config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
     )
-    _check_traffic(config.traffic)
+    try:
+        make_traffic(config.traffic)
+    except (ImportError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"traffic {config.traffic!r} is not available: {error}",
+            hint="use --traffic nonreactive",
+        ) from error
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:
         load_metric(metric)
@@ -166,13 +163,14 @@ def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
 def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     known = tuple(store.tokens)
     whole = config.split in ("", store.path.name)
-    verdicts = _verdicts(config, store) if whole and not config.all_scenarios else None
-    usable = known if verdicts is None else verdicts.accepted
+    verdicts, usable = None, known
     if whole and not config.all_scenarios:
-        usable = store.reviews.usable(known, usable)
+        verdicts = _verdicts(config, store)
+        usable = store.reviews.usable(known, verdicts.accepted if verdicts else known)
     split = find_split(config.split, Path(store.path), usable)
     tokens = split.tokens[: config.limit] if config.limit else split.tokens
-    missing = sorted(set(tokens) - set(known))
+    store_tokens = set(known)
+    missing = sorted(set(tokens) - store_tokens)
     if missing and not config.allow_partial:
         raise DataError(
             f"split {split.name!r} needs {len(tokens)} scenarios, store {config.store!r} "
@@ -189,16 +187,12 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
         determining["filter"] = verdicts.hash
     if store.reviews.hash:
         determining["review"] = store.reviews.hash
-    absent = set(missing)
-    present = [token for token in tokens if token not in absent]
+    present = [token for token in tokens if token in store_tokens]
     return Chosen(split.name, present, missing, len(known) - len(usable), determining)
 
 
 def _verdicts(config: RunConfig, store: ScenarioStore) -> "Verdicts | None":
-    """The verdicts that decide which scenarios of a whole store are run.
-
-    A split names its scenarios itself.
-    """
+    """The verdicts that decide which scenarios of a whole store are run."""
     from shiftsim.runs.filter import read_verdicts
 
     found = read_verdicts(store.path, store.hash)
@@ -235,21 +229,6 @@ def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int)
     memory = max([_MEMORY_OF_NETWORK for entry in entries if entry.in_batches], default=0.0)
     workers = config.workers or (default_workers(memory) if memory else default_workers())
     return 1 if stuck else max(1, min(workers, num_batches))
-
-
-def _expanded(names: Iterable[str]) -> list[str]:
-    """`all` stands for the seven of the benchmark."""
-    out = [name for given in names for name in (NOISE_NAMES if given == "all" else (given,))]
-    return list(dict.fromkeys(out))
-
-
-def _check_traffic(name: str) -> None:
-    try:
-        make_traffic(name)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"traffic {name!r} is not available: {error}", hint="use --traffic nonreactive"
-        ) from error
 
 
 def _tasks(
@@ -298,12 +277,9 @@ def _of_shard(shard: str, batches: list[Batch]) -> list[Batch]:
 
 def _leading_first(batches: list[Batch]) -> list[Batch]:
     """One batch per planner to the front: they compile all the kernels."""
-    leading: dict[str, Batch] = {}
-    for batch in batches:
-        leading.setdefault(batch.planner, batch)
-    first = list(leading.values())
-    chosen = set(first)
-    return first + [batch for batch in batches if batch not in chosen]
+    leading = {batch.planner: batch for batch in reversed(batches)}
+    first = [batch for batch in batches if leading[batch.planner] is batch]
+    return first + [batch for batch in batches if leading[batch.planner] is not batch]
 
 
 def _determining(
@@ -319,7 +295,13 @@ def _determining(
         "code": code_digest(),
         "metric_version": METRIC_VERSION,
         "planners": {entry.name: dict(entry.fingerprint) for entry in entries},
-        "noise": {model.name: _noise_fields(model) for model in models},
+        "noise": {
+            model.name: {
+                **{name: getattr(model, name) for name in _NOISE_FIELDS},
+                "function": model.name if model.function is not None else None,
+            }
+            for model in models
+        },
         "seeds": sorted(config.seeds) if noisy else [0],
         "traffic": config.traffic,
         "controller": config.controller,
@@ -330,11 +312,6 @@ def _determining(
     }
     plain: dict[str, Any] = json.loads(json.dumps(fields, sort_keys=True, default=str))
     return plain
-
-
-def _noise_fields(model: NoiseModel) -> dict[str, Any]:
-    out = {name: getattr(model, name) for name in ("kind", "sigma_accel", "sigma_rate", "theta")}
-    return out | {"function": model.name if model.function is not None else None}
 
 
 def run_name(config: RunConfig, split: str, determining: dict[str, Any]) -> str:

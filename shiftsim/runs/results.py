@@ -19,14 +19,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import (
-    FOLDER,
-    Place,
-    RolloutReader,
-    Task,
-    complete_rollout,
-    describe,
-)
+from shiftsim.runs.rollouts import FOLDER, Place, RolloutReader, Task, complete_rollout, describe
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -144,11 +137,7 @@ class Run:
         }
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
-        """One stored rollout.
-
-        Args:
-            task: Which one.
-            scenario: Its scenario, from the store the run was made with.
+        """One stored rollout; its scenario is that of the store the run was made with.
 
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.

@@ -12,6 +12,7 @@ whose. The first columns name the task, for readers that know nothing of places.
 import math
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,6 @@ from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Tracks
 
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 _NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
@@ -64,16 +64,9 @@ _WRITE_OPTIONS: dict[str, Any] = {
     "write_statistics": False,
 }
 _NAME = pa.dictionary(pa.int32(), pa.string())
-_KEY = [
-    pa.field(name, kind, nullable=False)
-    for name, kind in {
-        "planner": _NAME,
-        "noise": _NAME,
-        "seed": pa.int64(),
-        "token": _NAME,
-        "iteration": pa.int64(),
-    }.items()
-]
+_KEY = _without_nulls(
+    {"planner": _NAME, "noise": _NAME, "seed": pa.int64(), "token": _NAME, "iteration": pa.int64()}
+)
 
 
 class Task(NamedTuple):
@@ -101,11 +94,15 @@ class Place(NamedTuple):
 
 def rollout_rows(log: SimulationLog, *, with_tracks: bool) -> pa.RecordBatch:
     """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones."""
-    columns = _states(log)
+    columns = [pa.array(log.time_us)]
+    for values in (log.ego, log.commands, log.noise):
+        columns += map(pa.array, np.ascontiguousarray(values.T))
+    columns += [pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
     if not with_tracks:
         return pa.RecordBatch.from_arrays(columns, schema=STATES)
-    schema = pa.schema([*STATES, *TRACKS])
-    return pa.RecordBatch.from_arrays([*columns, *_tracks(log.tracks)], schema=schema)
+    tracks = log.tracks
+    columns += map(_lists, (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes))
+    return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
 
 
 def encode_rows(rows: pa.RecordBatch) -> bytes:
@@ -122,17 +119,6 @@ def encode_rows(rows: pa.RecordBatch) -> bytes:
 def decode_rows(data: bytes) -> pa.RecordBatch:
     """What `encode_rows` was given."""
     return pa.ipc.open_stream(data).read_next_batch()
-
-
-def _states(log: SimulationLog) -> list[pa.Array]:
-    arrays = [pa.array(log.time_us)]
-    for values in (log.ego, log.commands, log.noise):
-        arrays += map(pa.array, np.ascontiguousarray(values.T))
-    return [*arrays, pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
-
-
-def _tracks(tracks: Tracks) -> list[pa.Array]:
-    return [_lists(x) for x in (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)]
 
 
 def _lists(values: np.ndarray) -> pa.Array:
@@ -156,10 +142,7 @@ def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
 def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
     """A stored rollout, completed by what its scenario holds already.
 
-    Args:
-        rows: Columns of `STATES`, and of `TRACKS` where they are not those of the log; others do
-            not matter.
-        scenario: The scenario that was driven.
+    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log.
 
     Raises:
         DataError: The scenario is not the one that was driven.
@@ -173,7 +156,12 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
         )
     tracks = scenario.tracks.rows(samples)
     if "track_valid" in rows.schema.names:
-        tracks = _stored_tracks(rows, tracks)
+        shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
+        stored: dict[str, Any] = {
+            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape))
+            for name, shape in shapes.items()
+        }
+        tracks = replace(tracks, **stored)
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
@@ -193,18 +181,6 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
 
 def _stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
     return np.stack([rows[name].to_numpy() for name in names], axis=1)
-
-
-def _stored_tracks(rows: pa.RecordBatch, recorded: Tracks) -> Tracks:
-    count = recorded.num_tracks
-    return Tracks(
-        _from_lists(rows["track_valid"], (count,)),
-        _from_lists(rows["track_poses"], (count, 3)),
-        _from_lists(rows["track_velocities"], (count, 2)),
-        _from_lists(rows["track_sizes"], (count, 2)),
-        recorded.kinds,
-        recorded.tokens,
-    )
 
 
 def num_rows(file: Path) -> int:
@@ -276,11 +252,9 @@ class PartWriter:
         self._pending_bytes = 0
 
     def add(self, task: Task, rows: pa.RecordBatch) -> Place:
-        """Write a rollout, or keep it until its row group is full.
+        """Write the rows of a rollout, or keep them until their row group is full.
 
-        Args:
-            task: Whose it is.
-            rows: Columns of `rollouts.STATES`, and of `TRACKS` in all rollouts or in none.
+        They have columns of `STATES`, and of `TRACKS` in all rollouts or in none.
 
         Returns:
             Where it will be.

@@ -5,18 +5,15 @@ their maps, so that the folder alone is enough to score, view and plot it anywhe
 """
 
 import hashlib
-import json
 import shutil
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.review import REVIEW
-from shiftsim.errors import ConfigError, DataError, nearest, one_of
+from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.files import read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
 from shiftsim.runs.results import Run
@@ -49,9 +46,7 @@ def open_named_store(name: str) -> ScenarioStore:
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     """The store that a run was made with, or its bundle, which then has the hash of that store.
 
-    Args:
-        run: The run.
-        store: Name or path, where the store has moved.
+    `store` says where the store has moved.
 
     Raises:
         DataError: It is not there, or is another one.
@@ -61,7 +56,14 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         found = open_store(bundle)
         wanted = run.manifest.get("bundle", {}).get("hash")
     else:
-        found = _open(run, store)
+        place = store or run.manifest["store"]
+        path = store_path(place)
+        if "://" not in place and not path.exists():
+            raise DataError(
+                f"the store of run {run.path.name!r} is not at {str(path)!r}",
+                hint="say where it is with --store",
+            )
+        found = open_store(place if "://" in place else path)
         wanted = run.manifest["determining"]["store"]
     if found.hash != wanted:
         raise DataError(
@@ -72,30 +74,8 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     return found
 
 
-def _open(run: Run, store: str | None) -> ScenarioStore:
-    place = store or run.manifest["store"]
-    if "://" in place:
-        return open_store(place)
-    path = store_path(place)
-    if not path.exists():
-        raise DataError(
-            f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint="say where it is with --store",
-        )
-    return open_store(path)
-
-
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
-    """Copy scenarios with their recordings and maps into a run folder.
-
-    Args:
-        store: The store.
-        folder: The run folder.
-        tokens: The scenarios.
-
-    Returns:
-        What the manifest says about it.
-    """
+    """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
     target = folder / BUNDLE
     if not target.exists():
         partial = folder / f".{BUNDLE}.tmp"
@@ -147,13 +127,10 @@ def token_hash(tokens: Iterable[str]) -> str:
 
 
 def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
-    """The split of a name.
+    """The split of a name; `tokens` are all scenarios of the store in a folder.
 
-    Args:
-        name: A file (`.toml`, or `.txt` with one token per line), a name below `splits/` of the
-            store, or the store's own name (or nothing) for all its scenarios.
-        store: Folder of the store.
-        tokens: All scenarios of the store.
+    The name is that of a file (`.toml`, or `.txt` with one token per line), one below `splits/` of
+    the store, or the store's own (or nothing) for all its scenarios.
 
     Raises:
         ConfigError: There is no such split, or it contradicts itself.
@@ -206,73 +183,4 @@ def read_split(path: Path) -> Split:
                 f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
                 hint="the file was edited or cut off; fetch or write it again",
             )
-    return split
-
-
-def choose_scenarios(
-    rows: Iterable[Mapping[str, str]],
-    usable: Collection[str],
-    *,
-    wanted: Mapping[str, Collection[str]],
-    per_type: int | None = None,
-    limit: int | None = None,
-) -> tuple[str, ...]:
-    """Tokens of some scenarios of a store, sorted.
-
-    Args:
-        rows: `token`, `type` and `city` of every scenario.
-        usable: Tokens to choose from.
-        wanted: Values by column; none for any.
-        per_type: At most so many of every type, the first ones by token.
-        limit: At most so many in all, the first ones by token.
-
-    Raises:
-        ConfigError: No scenario has one of the values wanted.
-    """
-    table = sorted(rows, key=itemgetter("token"))
-    for column, values in wanted.items():
-        known = sorted({row[column] for row in table})
-        for value in values:
-            one_of(column, value, known)
-    counts: Counter[str] = Counter()
-    chosen = []
-    for row in table:
-        fits = all(not values or row[column] in values for column, values in wanted.items())
-        if not fits or row["token"] not in usable:
-            continue
-        counts[row["type"]] += 1
-        if per_type is None or counts[row["type"]] <= per_type:
-            chosen.append(row["token"])
-    return tuple(chosen[:limit])
-
-
-def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
-    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
-
-    It is named after the file.
-
-    Raises:
-        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
-    """
-    split = Split(path.stem, tokens)
-    if not tokens:
-        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
-    if path.suffix == ".txt":
-        lines = list(tokens)
-    elif path.suffix == ".toml":
-        lines = [
-            f"name = {json.dumps(split.name)}",
-            f"count = {len(tokens)}",
-            f'hash = "{split.hash}"',
-            "tokens = [",
-            *(f'    "{token}",' for token in tokens),
-            "]",
-        ]
-    else:
-        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
     return split

@@ -53,11 +53,7 @@ class Batch:
 
 
 class Stopwatch:
-    """How long parts of a task took.
-
-    Attributes:
-        seconds: Durations by column of `tasks.parquet` [s].
-    """
+    """How long parts of a task took: `seconds` by column of `tasks.parquet` [s]."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -221,14 +217,7 @@ def planning_times(log: SimulationLog) -> dict[str, float]:
 def score_rollout(
     scenario: Scenario, log: SimulationLog, config: RunConfig
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key.
-
-    Args:
-        scenario: The scenario.
-        log: How it was driven.
-        config: Says under which thresholds and custom metrics it is scored, and with which traffic
-            it was driven.
-    """
+    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
     profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {

@@ -34,15 +34,7 @@ _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
 _TIME_TO_COMPILE = 60.0  # s, on top of the limit of a leading task
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 # one thread per worker: the parallelism is across scenarios
-_ONE_THREAD = {
-    name: "1"
-    for name in (
-        "NUMBA_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-    )
-}
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +91,9 @@ def map_unordered(
 
 
 def default_workers(memory_each: float = 0.5e9) -> int:
-    """Worker processes when nothing is said: one per core, as long as they fit into the memory.
-
-    Args:
-        memory_each: Memory that each of them needs [bytes].
-    """
-    free = _free_memory()
-    fitting = int(free // memory_each) if free else _cores()
-    return max(1, min(_cores(), fitting))
+    """One worker process per core, as long as they fit into the memory [bytes]."""
+    free, cores = _free_memory(), _cores()
+    return max(1, min(cores, int(free // memory_each) if free else cores))
 
 
 def _cores() -> int:
@@ -149,8 +136,7 @@ def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T
 
 
 def _close(function: object) -> None:
-    close = getattr(function, "close", None)
-    if close is not None:
+    if (close := getattr(function, "close", None)) is not None:
         close()
 
 
@@ -320,22 +306,16 @@ def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
     search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
     paths = os.pathsep.join(filter(None, search))
     words = [sys.executable, "-c", command, str(os.getpid()), str(theirs.fileno())]
-    environment = {**os.environ, **_ONE_THREAD, "PYTHONPATH": paths}
+    env = {**os.environ, **_ONE_THREAD, "PYTHONPATH": paths}
     if sys.platform == "win32":
         group = subprocess.CREATE_NEW_PROCESS_GROUP
-        process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, creationflags=group, env=environment
-        )
+        process = subprocess.Popen(words, stdin=subprocess.PIPE, creationflags=group, env=env)
         assert process.stdin is not None
         with process.stdin as pipe:
             pipe.write(theirs.share(process.pid))
         return process
     return subprocess.Popen(
-        words,
-        pass_fds=[theirs.fileno()],
-        stdin=subprocess.DEVNULL,
-        process_group=0,
-        env=environment,
+        words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, process_group=0, env=env
     )
 
 

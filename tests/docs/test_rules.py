@@ -14,7 +14,9 @@ SOURCES = [
 RULES = (REPOSITORY / "docs" / "nuplan_rules.md").read_text("utf-8")
 ARCHITECTURE = (REPOSITORY / "docs" / "architecture.md").read_text("utf-8")
 CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text("utf-8")
-PLACES = re.findall(r"`((?:[\w-]+/)+[\w.-]*)`(?:(?:,| and)? `([\w.]+)`)?", RULES + ARCHITECTURE + CONTRIBUTING)
+PLACES = re.findall(
+    r"`((?:[\w-]+/)+[\w.-]*)`(?:(?:,| and)? `([\w.]+)`)?", RULES + ARCHITECTURE + CONTRIBUTING
+)
 _CITED = re.compile(r"nuPlan rules? (\d+(?:(?:,| and|, and)\s+(?:#\s+)?\d+)*)")
 
 

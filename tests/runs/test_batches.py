@@ -83,7 +83,7 @@ def test_a_death_in_a_batch_costs_one_scenario(toy, tmp_path, one_by_one):
 
 
 @pytest.mark.parametrize("size", [1, 5])
-def test_makeshift_steps_are_counted_or_fail_a_strict_run(toy, tmp_path, size):
+def test_fallback_steps_are_counted_or_fail_a_strict_run(toy, tmp_path, size):
     counted = run(toy, tmp_path / "counted", trouble="lost", batch_size=size)
     steps = {row["token"]: row["degraded_steps"] for row in counted.scores.to_pylist()}
     assert steps[BAD] >= 1

@@ -3,13 +3,8 @@
 import pytest
 
 from shiftsim.errors import ConfigError
-from shiftsim.runs.scenarios import (
-    choose_scenarios,
-    find_split,
-    read_split,
-    token_hash,
-    write_split,
-)
+from shiftsim.runs.filter import choose_scenarios, write_split
+from shiftsim.runs.scenarios import find_split, read_split, token_hash
 
 TOKENS = ("a1", "b2", "c3")
 

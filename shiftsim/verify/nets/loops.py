@@ -13,8 +13,7 @@ import numpy as np
 
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
-from shiftsim.sim.planner import HISTORY_SAMPLES, observe_log, past_rows, scene_info
-from shiftsim.sim.planner import Observation
+from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, observe_log, past_rows, scene_info
 from shiftsim.verify.files import Source, Tolerances
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state

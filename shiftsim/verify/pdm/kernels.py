@@ -10,7 +10,6 @@ import shapely
 from shapely.ops import substring
 
 from shiftsim.geometry.polylines import make_path, project, window
-from shiftsim.planners.pdm.brake import brake_poses
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.rollout import follow, read_pose
 from shiftsim.planners.pdm.route import offset_poses

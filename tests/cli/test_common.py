@@ -7,7 +7,7 @@ import typer
 from typer.testing import CliRunner
 
 from shiftsim.cli import app
-from shiftsim.cli.options import with_settings
+from shiftsim.cli.common import with_settings
 from shiftsim.runs.config import RunConfig, make_config
 
 
