@@ -100,7 +100,9 @@ def _find(
                 if area < 0 or (entry >= 0 and area == guess):
                     continue
                 is_known = is_on_route and limit >= highest
-                if (held == _WHOLE and is_known) or not meets_bounds(box, slabs.bounds[area]):
+                if held == _WHOLE and is_known:
+                    break
+                if not meets_bounds(box, slabs.bounds[area]):
                     continue
                 if not is_known and locate(slabs, area, x, y) == INTERIOR:
                     limit = max(limit, limits[area])
