@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-thorough test-docs test-kill test-browser lint types docs bench bench-smoke verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-long test-docs test-kill test-browser lint types docs bench bench-smoke verify dist clean-cache
 
 install: .venv/installed
 
@@ -15,13 +15,16 @@ demo: install
 	$(BIN)/shiftsim demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not browser and not thorough"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not browser and not thorough and not long"
 
 test-fast: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser and not thorough"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser and not thorough and not long"
 
 test-thorough: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough and not browser"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough and not browser and not long"
+
+test-long: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m long
 
 test-docs: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/docs
