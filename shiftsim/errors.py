@@ -3,6 +3,8 @@
 import difflib
 from collections.abc import Iterable
 
+_MAX_TEXT = 100_000  # characters
+
 
 class ShiftsimError(Exception):
     """Base of all errors that a user can cause or repair.
@@ -54,6 +56,17 @@ class InvalidTrajectoryError(PlannerError):
 
 class MissingExtraError(ShiftsimError, ImportError):
     """An optional dependency is not installed."""
+
+
+def readable(value: object) -> str:
+    """A value as text that every file can hold, whatever its `__str__` does; cut where too long."""
+    try:
+        text = str(value)
+    except (Exception, SystemExit) as error:
+        text = (
+            f"{type(value).__name__}, which has no text: its __str__ raises {type(error).__name__}"
+        )
+    return text[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

@@ -1,10 +1,12 @@
 """Where users' files are, and how files are read and written: settings in TOML, whole files only.
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
-half written: `whole_file` is the one way to replace one. `sources` says what a module of ours is
-made of, so that caches and runs notice when it changes.
+half written: `whole_file` is the one way to replace one. What a file that may be anybody's names is
+looked for inside its folder only, with `below`. `sources` says what a module of ours is made of, so
+that caches and runs notice when it changes.
 """
 
+import json
 import os
 import re
 import sys
@@ -16,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(
@@ -48,16 +50,69 @@ def remote_store_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
 
 
+def below(folder: Path, name: str) -> Path:
+    """The place of something in a folder by its relative path.
+
+    Raises:
+        DataError: It is outside of the folder, by its name or by a link.
+    """
+    place = folder / name
+    try:
+        if place.resolve().is_relative_to(folder.resolve()):
+            return place
+    except (OSError, ValueError, RuntimeError):  # a circle of links, a zero byte
+        pass
+    raise DataError(
+        f"{str(folder)!r}: {name!r} is outside of this folder",
+        hint="do not trust that folder: a file in it names, or is a link to, something elsewhere",
+    )
+
+
+def draft(path: Path) -> Path:
+    """Where a file is written before it takes its place; nothing is there, not even a link."""
+    partial = path.with_name(f".{path.name}.tmp")
+    partial.unlink(missing_ok=True)
+    return partial
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A file to be written, which then takes its place: whole or not at all."""
-    partial = path.with_name(f".{path.name}.tmp")
+    partial = draft(path)
     try:
         yield partial
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one step, in UTF-8.
+
+    Half a surrogate pair, for which UTF-8 has no bytes, is written as JSON would escape it.
+    """
+    with whole_file(path) as partial:
+        partial.write_text(text, "utf-8", errors="backslashreplace", newline="")
+
+
+def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
+    """Where each line is, in words, and its JSON value; blank lines are left out.
+
+    A line ends at a line feed and nowhere else: JSON may hold the other separators of Unicode.
+
+    Raises:
+        DataError: A line is not JSON in UTF-8.
+    """
+    for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
+        where = f"{path}: line {number}"
+        if line.strip():
+            try:
+                yield where, json.loads(line.decode())
+            except (ValueError, RecursionError) as error:
+                raise DataError(
+                    f"{where}: not JSON: {error}", hint="repair or remove that line"
+                ) from error
 
 
 def locked(path: Path) -> BinaryIO:

@@ -14,7 +14,7 @@ from pyarrow import fs
 from shiftsim.data.store.review import REVIEW
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS, digest, read_manifest
 from shiftsim.errors import DataError
-from shiftsim.files import remote_store_folder
+from shiftsim.files import below, remote_store_folder
 
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
 
@@ -38,7 +38,7 @@ class RemoteFiles:
         self.path = self._identify(remote_store_folder())
         self.need(SCENARIOS)
         for name in self._overlays():
-            self._fetch(name, self.path / name)
+            self._fetch(name, below(self.path, name))
 
     def need(self, name: str) -> None:
         """Copy a file of the store, or all of a folder, as far as they are not here already.
@@ -47,8 +47,10 @@ class RemoteFiles:
             DataError: A file cannot be read, or is not what the store was written with.
         """
         for file in self._files:
-            if (file == name or file.startswith(f"{name}/")) and not (self.path / file).exists():
-                self._fetch(file, self.path / file)
+            if file == name or file.startswith(f"{name}/"):
+                place = below(self.path, file)
+                if not place.exists():
+                    self._fetch(file, place)
 
     def _identify(self, cache: Path) -> Path:
         """Folder of the copies of this content."""

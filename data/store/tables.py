@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,13 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store import schema
 from shiftsim.errors import DataError
-from shiftsim.files import whole_file
+from shiftsim.files import below, whole_file, write_text
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
+_SHA256 = re.compile("[0-9a-f]{64}")
 _FOOTER = "shiftsim"
 _COMPRESSION, _LEVEL = "zstd", 1
 _REPEATING = ("length_m", "width_m", "log", "type", "city")  # columns of few values
@@ -30,17 +32,17 @@ def file_name(name: str) -> str:
 
 def map_file(store: Path, city: str) -> Path:
     """File of a map."""
-    return store / "maps" / f"{file_name(city)}.parquet"
+    return below(store, f"maps/{file_name(city)}.parquet")
 
 
 def report_file(store: Path, city: str) -> Path:
     """File of what is known about the conversion of a city."""
-    return store / "reports" / f"{file_name(city)}.json"
+    return below(store, f"reports/{file_name(city)}.json")
 
 
 def recording_folder(store: Path, recording: str) -> Path:
     """Folder of a recording."""
-    return store / "recordings" / file_name(recording)
+    return below(store, f"recordings/{file_name(recording)}")
 
 
 def ego_file(folder: Path, name: str) -> Path:
@@ -77,8 +79,11 @@ def read_manifest(store: Path) -> dict[str, Any]:
             f" {schema.VERSION}",
             hint="convert the data again with this version of shiftsim",
         )
-    if not isinstance(files, dict) or not isinstance(content, str):
+    if not isinstance(files, dict):
         raise DataError(f"{path}: damaged: no list of files", hint=REPAIR)
+    for name, value in {"hash": content, **files}.items():
+        if not isinstance(value, str) or not _SHA256.fullmatch(value):
+            raise DataError(f"{path}: damaged: {name!r} has no SHA-256 digest", hint=REPAIR)
     return manifest
 
 
@@ -114,8 +119,7 @@ def write_blocks(
 def write_json(path: Path, content: object) -> None:
     """Write a JSON file in one step."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", "utf-8")
+    write_text(path, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
 class Table:
@@ -170,7 +174,11 @@ class Table:
         """
         groups = list(range(self.num_blocks)) if blocks is None else blocks
         try:
-            return self._file.read_row_groups(groups, columns or self._names, use_threads=False)
+            found = self._file.read_row_groups(groups, columns or self._names, use_threads=False)
+            for column in found.columns:
+                if pa.types.is_string(column.type):
+                    column.validate(full=True)  # that it is UTF-8
+            return found
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import locked
+from shiftsim.files import below, locked
 
 _SETTINGS = (
     "page_size = 16384",
@@ -38,8 +38,8 @@ class Journal:
         Raises:
             ConfigError: Another process works with it.
         """
-        self.path = path
-        self._appended = path.with_name(f"{path.name}-wal")
+        self.path = below(path.parent, path.name)
+        self._appended = below(path.parent, f"{path.name}-wal")
         try:
             self._lock = locked(path)
         except BlockingIOError as error:

@@ -19,7 +19,15 @@ import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import FOLDER, Place, RolloutReader, Task, complete_rollout, describe
+from shiftsim.runs.rollouts import (
+    FOLDER,
+    Place,
+    RolloutReader,
+    Task,
+    complete_rollout,
+    describe,
+    part_file,
+)
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -172,7 +180,7 @@ def stored_place(
     run: Path, rollout: str | None, rollout_row: int, rollout_rows: int
 ) -> Place | None:
     """Where a rollout is, by the columns of `tasks.parquet`."""
-    return Place(run / FOLDER / rollout, rollout_row, rollout_rows) if rollout else None
+    return Place(part_file(run / FOLDER, rollout), rollout_row, rollout_rows) if rollout else None
 
 
 def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
@@ -205,7 +213,9 @@ def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]
 
 def _read(path: Path) -> pa.Table:
     try:
-        return pq.ParquetFile(path).read(use_threads=False)
+        table = pq.ParquetFile(path).read(use_threads=False)
+        table.validate(full=True)  # that texts are UTF-8
+        return table
     except (OSError, pa.ArrowException) as error:
         raise DataError(
             f"{str(path)!r} cannot be read: {error}", hint="make the run again"

@@ -10,6 +10,7 @@ whose. The first columns name the task, for readers that know nothing of places.
 """
 
 import math
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -23,6 +24,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
+from shiftsim.files import draft
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -54,6 +56,7 @@ TRACKS = _without_nulls(
     }
 )
 FOLDER = "rollouts"
+_PART = re.compile(r"part-\d+\.parquet")
 _MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
 _MAX_GROUP = 16, 16 << 20
 # states hardly compress and are never searched: what costs more time brings next to nothing
@@ -247,6 +250,7 @@ class PartWriter:
         self.folder = folder
         self._number = next_number(folder)
         self._writer: pq.ParquetWriter | None = None
+        self._partial = folder  # what it writes to
         self._pending: list[tuple[Task, pa.RecordBatch]] = []
         self._count = self._rows = self._bytes = 0  # in the file under way
         self._pending_bytes = 0
@@ -276,14 +280,11 @@ class PartWriter:
     def _path(self) -> Path:
         return self.folder / part_name(self._number)
 
-    @property
-    def _partial(self) -> Path:
-        return self._path.with_name(f".{self._path.name}.tmp")
-
     def _write_group(self) -> None:
         rows = pa.Table.from_batches([batch for _, batch in self._pending]).combine_chunks()
         schema = pa.schema([*_KEY, *rows.schema])
         if self._writer is None:
+            self._partial = draft(self._path)
             self._writer = pq.ParquetWriter(self._partial, schema, **_WRITE_OPTIONS)
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))
@@ -337,6 +338,19 @@ def without_key(rows: pa.RecordBatch) -> pa.RecordBatch:
 def part_name(number: int) -> str:
     """Name of a file of rollouts."""
     return f"part-{number:05d}.parquet"
+
+
+def part_file(folder: Path, name: str) -> Path:
+    """The file of rollouts in a folder that a table or a journal names.
+
+    Raises:
+        DataError: It cannot be the name of one.
+    """
+    if not _PART.fullmatch(name):
+        raise DataError(
+            f"{str(folder)!r}: {name!r} is no file of rollouts", hint="make the run again"
+        )
+    return folder / name
 
 
 def next_number(folder: Path) -> int:
