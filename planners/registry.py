@@ -9,7 +9,6 @@ import hashlib
 import importlib
 import inspect
 import pickle
-import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of
+from shiftsim.files import import_named
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
 from shiftsim.sim.planner import BatchPlanner, Planner
@@ -86,10 +86,8 @@ def planner_factory(spec: str) -> Any:
             f"planner {spec!r} is not of the form package.module:Class",
             hint="for example my_package.my_module:MyPlanner",
         )
-    if entry is None and (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)
     try:
-        module = importlib.import_module(module_name)
+        module = import_named(module_name)
     except MissingExtraError:
         raise
     except ImportError as error:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, BinaryIO
 
 from shiftsim.errors import ConfigError, DataError
@@ -156,6 +157,27 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def fresh_python(command: str, *words: str) -> tuple[list[str], dict[str, str]]:
+    """Words and environment that start an interpreter which knows this package.
+
+    What lies in the current folder is no code to it.
+    """
+    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
+    paths = os.pathsep.join(filter(None, search))
+    return [sys.executable, "-P", "-c", command, *words], {**os.environ, "PYTHONPATH": paths}
+
+
+def import_named(module: str) -> ModuleType:
+    """A module by its name; one that the user has named may lie in the current folder.
+
+    Nothing else is ever imported from there: a stray file is not code.
+    """
+    own = not module.startswith("shiftsim.")
+    if own and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+    return import_module(module)
+
+
 def load_attribute(what: str, name: str, hint: str) -> Any:
     """What a user names as `module:attribute`; `what` it is and the hint go into the message.
 
@@ -164,7 +186,7 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
     """
     module, _, attribute = name.partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
 

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -98,8 +97,6 @@ def _options(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # own planners, noises, metrics and traffic beside the user's files
     debug = "--debug" in words
     try:
         code = _run([word for word in words if word != "--debug"], debug)
