@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.world.layers import Layer, make_layer
 from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
 from shiftsim.world.scenario import Scenario

@@ -10,15 +10,16 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import circle_around
-from shiftsim.geometry.corridors import (
+from shiftsim.geometry.polylines import (
     CLEAR,
     HIT,
+    RUN,
     Stretch,
+    bound_runs,
     corridor_polygon,
     side_of,
     without_repeats,
 )
-from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.geometry.rings import point_segment_distance, rings_touch
 
 UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet

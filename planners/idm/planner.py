@@ -6,10 +6,8 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.boxes import box_corners, boxes_to_corners
-from shiftsim.geometry.corridors import OPEN
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import Path, pose_at
+from shiftsim.geometry.boxes import box_corners, boxes_to_corners, wrap_angle
+from shiftsim.geometry.polylines import OPEN, Path, pose_at
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, exact_side, find_lead, find_sides
 from shiftsim.planners.routes.lanes import (
     HINT,

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import box_corners
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import (
     Path,
     arc_lengths,

@@ -22,7 +22,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction

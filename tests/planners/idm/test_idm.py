@@ -11,7 +11,7 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.corridors import CLEAR, HIT, OPEN
+from shiftsim.geometry.polylines import CLEAR, HIT, OPEN
 from shiftsim.planners.idm.corridor import UNKNOWN, Objects, find_lead, find_sides
 from shiftsim.planners.idm.planner import Idm
 from shiftsim.planners.routes.search import search_levels
