@@ -23,10 +23,10 @@ _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
 _COMMANDS = {
-    "demo": "running:demo",
+    "demo": "demo:demo",
     "run": "running:run",
-    "score": "running:score",
-    "merge": "running:merge",
+    "score": "deriving:score",
+    "merge": "deriving:merge",
     "bench": "bench:bench",
     "report": "reading:report",
     "explain": "reading:explain",

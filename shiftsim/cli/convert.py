@@ -136,7 +136,8 @@ def dsc3d(
 
     from shiftsim.data.deepplan.convert import convert_dsc3d
     from shiftsim.files import store_path
-    from shiftsim.runs.workers import default_workers, map_unordered
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
 
     flags = {
         "country": country,

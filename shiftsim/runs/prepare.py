@@ -17,12 +17,11 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
-from shiftsim.runs.config import RunConfig, Value, parse_shard
+from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
-from shiftsim.runs.workers import default_workers
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import make_traffic, traffic_name
 
