@@ -108,7 +108,7 @@ def inspect(
     debug: Debug = False,
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
-    from shiftsim.data.store.review import REVIEW
+    from shiftsim.data.store.tables import REVIEW
     from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.review.server import ReviewServer
     from shiftsim.view.review.service import ReviewService

@@ -165,7 +165,10 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     verdicts, usable = None, known
     if whole and not config.all_scenarios:
         verdicts = _verdicts(config, store)
-        usable = store.reviews.usable(known, verdicts.accepted if verdicts else known)
+        accepted = set(verdicts.accepted if verdicts else known)
+        usable = tuple(token for token in known if token in accepted)
+        if store.is_reviewed:
+            usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
     tokens = split.tokens[: config.limit] if config.limit else split.tokens
     store_tokens = set(known)
@@ -184,7 +187,7 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     determining = {"store": store.hash, "tokens": token_hash(tokens)}
     if verdicts is not None:
         determining["filter"] = verdicts.hash
-    if store.reviews.hash:
+    if store.is_reviewed and store.reviews.hash:
         determining["review"] = store.reviews.hash
     present = [token for token in tokens if token in store_tokens]
     return Chosen(split.name, present, missing, len(known) - len(usable), determining)
