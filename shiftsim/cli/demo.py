@@ -5,19 +5,19 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Quiet, say
+from shiftsim import cli
+from shiftsim.cli import Debug, Quiet, say
 from shiftsim.cli.running import run_config
 
 _PLANNERS = ("log-future", "idm", "constant-velocity")
 _NOISE = ("none", "ou-high")
 
 
-@common.with_settings("workers", "limit")
+@cli.with_settings("workers", "limit")
 def demo(
     out: Annotated[Path | None, typer.Option(help="Folder of the demo store.")] = None,
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:

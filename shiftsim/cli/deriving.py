@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, progress_bar
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, progress_bar
 from shiftsim.cli.running import leave_with
 
 
-@common.with_settings(
+@cli.with_settings(
     "thresholds",
     "metrics",
     "store",
@@ -22,7 +22,7 @@ from shiftsim.cli.running import leave_with
 )
 def score(
     source: Annotated[Path, typer.Argument(metavar="RUN", help="A run with stored rollouts.")],
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,

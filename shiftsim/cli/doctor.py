@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, show
+from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
 
 REFERENCE = PACKAGE / "verify" / "reference"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress
@@ -31,9 +31,9 @@ Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win o
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
-@common.with_settings(*common.ALL)
+@cli.with_settings(*cli.ALL)
 def run(
-    settings: common.Settings,
+    settings: cli.Settings,
     config: Config = None,
     dry_run: DryRun = False,
     quiet: Quiet = False,
@@ -49,7 +49,7 @@ def run(
     before = values.get("planner_args", {})
     values |= settings
     if texts:
-        values["planner_args"] = common.planner_arguments(texts, before, values.get("planners", ()))
+        values["planner_args"] = cli.planner_arguments(texts, before, values.get("planners", ()))
     made = make_config(values, where=str(config) if config else "run")
     run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
 

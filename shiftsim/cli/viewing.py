@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Quiet, plural, progress_bar, say
+from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
 
 if TYPE_CHECKING:
     from shiftsim.view.build import Gallery
