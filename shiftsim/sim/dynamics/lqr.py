@@ -290,7 +290,7 @@ def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[f
     return accel, steering_rate(ref, speed, state[STEERING], accel, params)
 
 
-@lean_kernel
+@kernel
 def track(
     now_us: int,
     state: FloatArray,
