@@ -17,6 +17,7 @@ from shiftsim.files import below, whole_file, write_text
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
+REVIEW = "review/review.jsonl"
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
 _SHA256 = re.compile("[0-9a-f]{64}")
