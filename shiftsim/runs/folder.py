@@ -137,8 +137,10 @@ class RunWriter:
         `expected` are all tasks of a complete run; `absent` says why one has no result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
-        tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
+        tables: list[_SortedTable] = []
         try:
+            for name, schema in TABLES.items():
+                tables.append(_SortedTable(self.path / f"{name}.parquet", schema))
             places = self._write_rollouts()
             tasks = iter(sorted(expected))
             while chunk := list(islice(tasks, _CHUNK)):

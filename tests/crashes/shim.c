@@ -20,6 +20,8 @@ static char root[4096];
 static size_t root_length;
 static int mode, at;
 static atomic_int calls;
+static char noted[1 << 20]; /* a line per call: its name, and the path below the folder */
+static size_t noted_length;
 
 /* Exported: begin to count below a folder; with another mode than COUNT act at a call. */
 void shim_arm(const char *folder, int new_mode, int new_at) {
@@ -30,34 +32,37 @@ void shim_arm(const char *folder, int new_mode, int new_at) {
     atomic_store(&calls, 0);
 }
 
-int shim_count(void) { return atomic_load(&calls); }
+const char *shim_calls(void) { return noted; }
 
-static int is_below(int folder, const char *path) {
-    char full[8192], base[4096] = "";
-    if (!root_length || !path) return 0;
+/* The rest of the path where it is below the folder, else null. */
+static const char *below(int folder, const char *path) {
+    static _Thread_local char full[8192];
+    char base[4096] = "";
+    if (!root_length || !path) return NULL;
     if (path[0] != '/') {
         if (folder == AT_FDCWD) {
-            if (!getcwd(base, sizeof base)) return 0;
+            if (!getcwd(base, sizeof base)) return NULL;
         } else {
             char link[64];
             snprintf(link, sizeof link, "/proc/self/fd/%d", folder);
             ssize_t n = readlink(link, base, sizeof base - 1);
-            if (n < 0) return 0;
+            if (n < 0) return NULL;
             base[n] = 0;
         }
     }
     snprintf(full, sizeof full, "%s%s%s", base, path[0] == '/' ? "" : "/", path);
-    return !strncmp(full, root, root_length) && (full[root_length] == '/' || !full[root_length]);
+    if (strncmp(full, root, root_length)) return NULL;
+    return full[root_length] == '/' || !full[root_length] ? full + root_length : NULL;
 }
 
-static int is_open_below(int file) {
+static const char *open_below(int file) {
     char link[64], path[4096];
-    if (!root_length) return 0;
+    if (!root_length) return NULL;
     snprintf(link, sizeof link, "/proc/self/fd/%d", file);
     ssize_t n = readlink(link, path, sizeof path - 1);
-    if (n < 0) return 0;
+    if (n < 0) return NULL;
     path[n] = 0;
-    return is_below(AT_FDCWD, path);
+    return below(AT_FDCWD, path);
 }
 
 static void die(void) {
@@ -66,7 +71,10 @@ static void die(void) {
 }
 
 /* 0: go on; 1: go on and die; otherwise the error to report. */
-static int next(int takes_space) {
+static int next(const char *name, const char *path, int takes_space) {
+    if (!path) return 0;
+    noted_length += snprintf(noted + noted_length, sizeof noted - noted_length, "%s %s\n", name, path);
+    if (noted_length >= sizeof noted) noted_length = sizeof noted - 1;
     int number = atomic_fetch_add(&calls, 1) + 1;
     if (mode == BEFORE && number == at) die();
     if (mode == AFTER && number == at) return 1;
@@ -79,10 +87,10 @@ static int next(int takes_space) {
 #define REAL(name) static __typeof__(name) *real; \
     if (!real) real = (__typeof__(name) *)dlsym(RTLD_NEXT, #name)
 
-#define WRAP(type, name, parameters, arguments, below, takes_space) \
+#define WRAP(type, name, parameters, arguments, place, takes_space) \
     type name parameters { \
         REAL(name); \
-        int order = (below) ? next(takes_space) : 0; \
+        int order = next(#name, place, takes_space); \
         if (order > 1) { errno = order; return -1; } \
         type result = real arguments; \
         if (order == 1) die(); \
@@ -93,7 +101,7 @@ static int next(int takes_space) {
 #define WRAP_WRITE(name, parameters, arguments, file, half) \
     ssize_t name parameters { \
         REAL(name); \
-        int order = is_open_below(file) ? next(1) : 0; \
+        int order = next(#name, open_below(file), 1); \
         int is_first_full = order == ENOSPC && atomic_load(&calls) == at; \
         if (order == 1 || is_first_full) { half; } \
         else if (order > 1) { errno = order; return -1; } \
@@ -119,28 +127,28 @@ WRAP_WRITE(copy_file_range,
            (int from, off64_t *start, int file, off64_t *where, size_t size, unsigned flags),
            (from, start, file, where, size, flags), file, HALVE)
 
-WRAP(int, fsync, (int file), (file), is_open_below(file), 1)
-WRAP(int, fdatasync, (int file), (file), is_open_below(file), 1)
-WRAP(int, ftruncate, (int file, off_t size), (file, size), is_open_below(file), 0)
-WRAP(int, ftruncate64, (int file, off64_t size), (file, size), is_open_below(file), 0)
-WRAP(int, truncate, (const char *path, off_t size), (path, size), is_below(AT_FDCWD, path), 0)
-WRAP(int, truncate64, (const char *path, off64_t size), (path, size), is_below(AT_FDCWD, path), 0)
+WRAP(int, fsync, (int file), (file), open_below(file), 1)
+WRAP(int, fdatasync, (int file), (file), open_below(file), 1)
+WRAP(int, ftruncate, (int file, off_t size), (file, size), open_below(file), 0)
+WRAP(int, ftruncate64, (int file, off64_t size), (file, size), open_below(file), 0)
+WRAP(int, truncate, (const char *path, off_t size), (path, size), below(AT_FDCWD, path), 0)
+WRAP(int, truncate64, (const char *path, off64_t size), (path, size), below(AT_FDCWD, path), 0)
 WRAP(int, fallocate, (int file, int how, off_t where, off_t size), (file, how, where, size),
-     is_open_below(file), 1)
-WRAP(int, unlink, (const char *path), (path), is_below(AT_FDCWD, path), 0)
+     open_below(file), 1)
+WRAP(int, unlink, (const char *path), (path), below(AT_FDCWD, path), 0)
 WRAP(int, unlinkat, (int folder, const char *path, int flags), (folder, path, flags),
-     is_below(folder, path), 0)
-WRAP(int, rmdir, (const char *path), (path), is_below(AT_FDCWD, path), 0)
-WRAP(int, remove, (const char *path), (path), is_below(AT_FDCWD, path), 0)
-WRAP(int, mkdir, (const char *path, mode_t flags), (path, flags), is_below(AT_FDCWD, path), 1)
+     below(folder, path), 0)
+WRAP(int, rmdir, (const char *path), (path), below(AT_FDCWD, path), 0)
+WRAP(int, remove, (const char *path), (path), below(AT_FDCWD, path), 0)
+WRAP(int, mkdir, (const char *path, mode_t flags), (path, flags), below(AT_FDCWD, path), 1)
 WRAP(int, mkdirat, (int folder, const char *path, mode_t flags), (folder, path, flags),
-     is_below(folder, path), 1)
-WRAP(int, link, (const char *old, const char *path), (old, path), is_below(AT_FDCWD, path), 1)
+     below(folder, path), 1)
+WRAP(int, link, (const char *old, const char *path), (old, path), below(AT_FDCWD, path), 1)
 WRAP(int, linkat, (int from, const char *old, int folder, const char *path, int flags),
-     (from, old, folder, path, flags), is_below(folder, path), 1)
-WRAP(int, rename, (const char *old, const char *path), (old, path), is_below(AT_FDCWD, path), 1)
+     (from, old, folder, path, flags), below(folder, path), 1)
+WRAP(int, rename, (const char *old, const char *path), (old, path), below(AT_FDCWD, path), 1)
 WRAP(int, renameat, (int from, const char *old, int folder, const char *path),
-     (from, old, folder, path), is_below(folder, path), 1)
+     (from, old, folder, path), below(folder, path), 1)
 
 /* Opening counts where it makes a file. */
 #define WRAP_OPEN(name, parameters, arguments, last, folder) \
@@ -153,7 +161,7 @@ WRAP(int, renameat, (int from, const char *old, int folder, const char *path),
             rights = va_arg(more, mode_t); \
             va_end(more); \
         } \
-        int order = flags & O_CREAT && is_below(folder, path) ? next(1) : 0; \
+        int order = flags & O_CREAT ? next(#name, below(folder, path), 1) : 0; \
         if (order > 1) { errno = order; return -1; } \
         int result = real arguments; \
         if (order == 1) die(); \

@@ -26,7 +26,6 @@ HERE = Path(__file__).parent
 KILLS = ("before", "after")  # half of a write arrives, where it dies after the call
 ERRORS = ("eio", "eio on", "full")  # one call fails, all from it on do, no space is left from it on
 TABLES = ("scores.parquet", "metrics.parquet")
-ARMED = {"n": "run", "filter": "store"}
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="the shim is made for Linux"),
@@ -75,7 +74,8 @@ JOBS = {
     ),
     "filter": Job(*[("filter", "./store", "--quiet", *ONE)] * 2, "store", ("store",)),
     "convert": Job(
-        *[("convert", "dsc3d", "./town", "--store", "./made", "--quiet", *ONE)] * 2, "made"
+        *[("convert", "dsc3d", "./town", "--store", "./made", "--quiet", *ONE)] * 2,
+        "shiftsim-data/made",
     ),
 }
 MOODY = """
@@ -99,7 +99,7 @@ class Place:
         build = ["gcc", "-shared", "-fPIC", "-O1", "-o", library, HERE / "shim.c", "-ldl"]
         subprocess.run(build, check=True)
         (folder / "moody.py").write_text(MOODY)
-        write_toy_store(folder / "toy", count=2)
+        write_toy_store(folder / "toy", count=2, iterations=10)
         shutil.copytree(folder / "toy", folder / "given" / "store")
         write_town(folder / "town")
         environment = {k: v for k, v in os.environ.items() if k != "SHIFTSIM_DATA"}
@@ -161,7 +161,7 @@ class Place:
         return {
             path.relative_to(folder).as_posix(): path.read_bytes()
             for path in folder.rglob("*")
-            if path.is_file()
+            if path.is_file() and ".partial" not in path.parts
         }
 
     def close(self) -> None:
@@ -185,7 +185,7 @@ def run_results(folder: Path) -> dict:
     for task, place in run.rollout_places.items():
         rows = run.rollout_rows(task)
         names = [name for name in rows.schema.names if name != "planning_seconds"]
-        out[str(task)] = rows.select(names).to_pylist()
+        out[str(task)] = repr(rows.select(names).to_pylist())
         assert place is not None
     tasks = run.tasks.to_pylist()
     kept = ("planner", "noise", "seed", "token", "status", "error", "scenario_type")
@@ -206,15 +206,25 @@ def place(tmp_path_factory):
     made.close()
 
 
-def try_calls(place: Place, name: str, mode: str, step: int, first: int = 1) -> None:
-    """End a job at every `step`-th call in turn, and see that it can be finished."""
+def turning_points(calls: list[str]) -> list[int]:
+    """Numbers, from 1 on, of the calls that are not one more write to the file of the last one."""
+    return [at for at, call in enumerate(calls, 1) if at == 1 or call != calls[at - 2]]
+
+
+def every_call(calls: list[str]) -> list[int]:
+    return list(range(1, len(calls) + 1))
+
+
+def try_calls(place: Place, name: str, mode: str, choose) -> None:
+    """End a job at each chosen call in turn, and see that it can be finished."""
     job = JOBS[name]
     place.begin(job)
     undisturbed = place.ask(job.words, "count", 0, job.root)
     assert undisturbed["code"] == 0, undisturbed["output"]
+    calls = undisturbed["calls"]
     expected = place.results(job)
     wrong = []
-    for at in range(first, undisturbed["count"] + 1, step):
+    for at in choose(calls):
         place.begin(job)
         ended = place.ask(job.words, mode, at, job.root)
         fault = what_is_wrong(ended, mode)
@@ -228,8 +238,8 @@ def try_calls(place: Place, name: str, mode: str, step: int, first: int = 1) -> 
         except Exception as error:
             fault += f" {type(error).__name__}: {error}"
         if fault:
-            wrong.append(f"call {at}: {fault}")
-    assert not wrong, f"{len(wrong)} of {undisturbed['count']} calls:\n" + "\n".join(wrong[:40])
+            wrong.append(f"call {at}, {calls[at - 1]}: {fault}")
+    assert not wrong, f"{len(wrong)} wrong, of {len(calls)} calls:\n" + "\n".join(wrong)
 
 
 def what_is_wrong(ended: dict, mode: str) -> str:
@@ -245,8 +255,38 @@ def what_is_wrong(ended: dict, mode: str) -> str:
     return f"ended with {ended['code']}: {ended['output']}"
 
 
+def some(first: int, step: int):
+    """A choice of every `step`-th turning point."""
+    return lambda calls: turning_points(calls)[first::step]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "mode"), [("run", "before"), ("run", "full"), ("merge", "eio"), ("filter", "after")]
+)
+def test_a_job_that_ends_at_some_calls_can_be_finished(place, name, mode):
+    try_calls(place, name, mode, some(3, 13))
+
+
+def test_a_run_that_is_killed_in_its_first_moments_can_be_finished(place):
+    try_calls(place, "run", "before", lambda calls: range(1, 8))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("mode", KILLS + ERRORS)
+@pytest.mark.parametrize("name", [name for name in JOBS if name != "two workers"])
+def test_a_job_that_ends_at_many_calls_can_be_finished(place, name, mode):
+    try_calls(place, name, mode, some((KILLS + ERRORS).index(mode), 8))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("mode", ["before", "full"])
+def test_a_run_in_two_processes_that_ends_at_some_calls_can_be_finished(place, mode):
+    try_calls(place, "two workers", mode, some(7, 12))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("mode", KILLS + ERRORS)
 @pytest.mark.parametrize("name", JOBS)
 def test_a_job_that_ends_at_any_call_can_be_finished(place, name, mode):
-    try_calls(place, name, mode, 1)
+    try_calls(place, name, mode, every_call)
