@@ -12,7 +12,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -84,7 +84,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield partial
         partial.replace(path)
     except BaseException:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # the error that counts is the first one
+            partial.unlink(missing_ok=True)
         raise
 
 
@@ -171,11 +172,17 @@ def import_named(module: str) -> ModuleType:
     """A module by its name; one that the user has named may lie in the current folder.
 
     Nothing else is ever imported from there: a stray file is not code.
+
+    Raises:
+        ImportError: There is none, or it ends the process.
     """
     own = not module.startswith("shiftsim.")
     if own and (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)
-    return import_module(module)
+    try:
+        return import_module(module)
+    except SystemExit as error:  # else the command would end as if all were well
+        raise ImportError(f"it leaves with SystemExit: {error.code}", name=module) from error
 
 
 def load_attribute(what: str, name: str, hint: str) -> Any:

@@ -269,7 +269,8 @@ class _SortedTable:
         """Remove what is not finished."""
         with suppress(OSError):
             self._writer.close()
-        self._partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a draft is in nobody's way
+            self._partial.unlink(missing_ok=True)
 
 
 def _link(source: Path, target: Path) -> None:

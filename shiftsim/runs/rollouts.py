@@ -309,7 +309,8 @@ class PartWriter:
             with suppress(OSError):
                 self._writer.close()
             self._writer = None
-            self._partial.unlink(missing_ok=True)
+            with suppress(OSError):  # a draft is in nobody's way
+                self._partial.unlink(missing_ok=True)
 
 
 def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:

@@ -128,10 +128,8 @@ class TaskRunner:
         began = perf_counter()
         try:
             logs = simulate_together(list(rollouts.values()))
-        except (
-            Exception,
-            SystemExit,
-        ):  # the shared pass itself failed: too little memory for all of them?
+        except (Exception, SystemExit):
+            # the shared pass itself failed: too little memory for all of them?
             self._forget(batch.planner)
             return [self._alone(task) for task in batch.tasks]
         share = (perf_counter() - began) / max(1, len(logs))
@@ -197,7 +195,9 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
     """What a piece of work returns or, whatever goes wrong, the failed result of its task."""
     try:
         return work()
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit as well
         # the one place: a task that fails is a row, not the end of a run
         is_ours = isinstance(error, ShiftsimError)
         kind = "" if is_ours else f"{type(error).__name__}: "
