@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
@@ -136,7 +137,11 @@ def _offsets(count: int, size: int) -> pa.Array:
 
 def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
     flat = column.flatten().to_numpy(zero_copy_only=False)
-    return np.array(flat.reshape(len(column), *shape))
+    try:
+        return np.array(flat.reshape(len(column), *shape))
+    except ValueError as error:
+        what = f"a rollout has {len(flat)} numbers in {len(column)} rows of shape {shape}"
+        raise DataError(what, hint="make the run again") from error
 
 
 def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
@@ -154,6 +159,8 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
             f"scenario {scenario.token!r} in the store is not the one that was driven",
             hint="use the store that the manifest names",
         )
+    ego = _stack(rows, EGO_COLUMNS)
+    require(RUN, "state", ego, f"the rollout of scenario {scenario.token!r}: an ego")
     tracks = scenario.tracks.rows(samples)
     if "track_valid" in rows.schema.names:
         shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
@@ -165,7 +172,7 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
-        ego=_stack(rows, EGO_COLUMNS),
+        ego=ego,
         tracks=tracks,
         traffic_lights=scenario.traffic_lights.rows(samples),
         expert_time_us=scenario.iteration_times,
@@ -221,6 +228,11 @@ class RolloutReader:
         """
         if self._file is None or self._path != place.file:
             self._file, self._path, self._group = _opened(place.file), place.file, -1
+            columns = {column.name: column.type for column in self._file.schema_arrow}
+            for column in [*STATES, *(c for c in TRACKS if c.name in columns)]:
+                if columns.get(column.name) != column.type:
+                    what = f"column {column.name!r} is missing or not {column.type}"
+                    raise _unreadable(place.file, TypeError(what))
             found = self._file.metadata
             lengths = [found.row_group(i).num_rows for i in range(found.num_row_groups)]
             self._starts = np.cumsum([0, *lengths])
