@@ -15,7 +15,10 @@ from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.ranges import STORE, require
 from shiftsim.world.scenario import Scenario
 
-_POSE, _VELOCITY, _SIZE = (TRACKS.names[a:b] for a, b in ((2, 5), (5, 7), (7, 9)))
+_BOX = TRACKS.names[2:]  # x, y, heading, velocity, size
+_EGO_LIMITS, _BOX_LIMITS = (
+    np.array([STORE[name][:2] for name in names]) for names in (EGO_COLUMNS, _BOX)
+)
 
 
 def require_rows(window: Window, where: str) -> None:
@@ -34,37 +37,45 @@ def require_plausible(scene: Scenario, ego: str, folder: Path) -> None:
     if (np.diff(scene.time_us) <= 0).any():
         raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
     require(STORE, "light_status", scene.traffic_lights.status, frames)
-    for name, values in zip(EGO_COLUMNS, scene.ego.T, strict=True):
-        require(STORE, name, values, f"{ego_file(folder, ego)}: column")
-    for names, values in (
-        (_POSE, tracks.poses),
-        (_VELOCITY, tracks.velocities),
-        (_SIZE, tracks.sizes),
-    ):
-        low, high = (np.array([STORE[name][end] for name in names]) for end in (0, 1))
-        at = _first_outside(tracks.valid, values, low, high, names is _VELOCITY)
-        if at >= 0:
-            row, track, column = np.unravel_index(at, values.shape)
-            where = f"{folder / TRACKS_FILE}: track {tracks.tokens[track]!r}, row {row}: column"
-            require(STORE, names[column], values[row, track, column], where)
+    low, high = _EGO_LIMITS.T
+    if not ((scene.ego >= low) & (scene.ego <= high)).all():
+        for name, values in zip(EGO_COLUMNS, scene.ego.T, strict=True):
+            require(STORE, name, values, f"{ego_file(folder, ego)}: column")
+    arrays = tracks.poses, tracks.velocities, tracks.sizes
+    row, track = _first_outside(tracks.valid, *arrays, _BOX_LIMITS)
+    if row >= 0:
+        where = f"{folder / TRACKS_FILE}: track {tracks.tokens[track]!r}, row {row}: column"
+        values = np.concatenate([array[row, track] for array in arrays])
+        for name, value in zip(_BOX, values, strict=True):
+            require(STORE, name, value, where, may_be_nan=name in ("vx_mps", "vy_mps"))
 
 
 @kernel
 def _first_outside(
-    valid: BoolArray, values: FloatArray, low: FloatArray, high: FloatArray, may_be_nan: bool
-) -> int:
-    """Flat index of the first of values (R, N, K) that is valid and not in its range, or -1."""
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    limits: FloatArray,
+) -> tuple[int, int]:
+    """Row and track of the first box with a number outside of `limits` (7, 2), or -1 and -1."""
+    low, high = limits[:, 0], limits[:, 1]
     for row in range(valid.shape[0]):
         for track in range(valid.shape[1]):
-            for column in range(len(low)):
-                value = values[row, track, column]
-                if (
-                    valid[row, track]
-                    and not (low[column] <= value <= high[column])
-                    and not (may_be_nan and np.isnan(value))
-                ):
-                    return (row * valid.shape[1] + track) * len(low) + column
-    return -1
+            if not valid[row, track]:
+                continue
+            good = True
+            for axis in range(3):
+                value = poses[row, track, axis]
+                good &= (value >= low[axis]) & (value <= high[axis])
+            for axis in range(2):
+                value = sizes[row, track, axis]
+                good &= (value >= low[5 + axis]) & (value <= high[5 + axis])
+                value = velocities[row, track, axis]  # NaN where the object is static
+                good &= not ((value < low[3 + axis]) | (value > high[3 + axis]))
+            if not good:
+                return row, track
+    return -1, -1
 
 
 def require_sound(road: VectorMap, where: str) -> None:

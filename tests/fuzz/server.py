@@ -1,7 +1,7 @@
 """Runs cases, each in a process of its own with a limit of time and of memory.
 
     python tests/fuzz/server.py TARGET FIRST COUNT   # cases by number: always the same ones
-    python tests/fuzz/server.py --corpus             # the inputs that once failed
+    python tests/fuzz/server.py                      # the inputs that once failed, of all targets
 
 One line of JSON per case goes to the standard output. The processes are forks of this one, so that
 imports and kernels are paid for once.
@@ -16,7 +16,8 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Iterator
-from contextlib import redirect_stderr
+from contextlib import contextmanager, redirect_stderr
+from itertools import chain
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -87,40 +88,65 @@ def _fault(error: Any, folder: Path) -> str:
     return "" if error.hint or isinstance(error, ConfigError) else "no hint"
 
 
-def cases(target: str, first: int, count: int, *, keep: Path | None = None) -> Iterator[Any]:
-    """Damage copies of the seeds, and read them; number, way, outcome, details."""
-    base = Path(
-        tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
-    )
-    try:
-        (base / "seeds").mkdir()
-        TARGETS[target].seeds(base / "seeds")
-        seeds = sorted((base / "seeds").iterdir())
-        for seed in seeds:  # the sound ones: everything is imported and compiled after it
-            shutil.copytree(seed, base / "cases" / "warm", dirs_exist_ok=True)
-            bad = list(implausible(TARGETS[target].read(base / "cases" / "warm")))
+@contextmanager
+def seeds_of(target: str) -> Iterator[tuple[list[Path], Path]]:
+    """The sound inputs of a reader, each read once, and the folder for cases."""
+    shared = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryDirectory(prefix="fuzz-", dir=shared) as base:
+        folder = Path(base) / "seeds"
+        folder.mkdir()
+        TARGETS[target].seeds(folder)
+        seeds = sorted(folder.iterdir())
+        for seed in seeds:  # everything is imported and compiled after it
+            warm = shutil.copytree(seed, Path(base) / "cases/warm")
+            bad = list(implausible(TARGETS[target].read(warm)))
             assert not bad, (seed.name, bad)
-            shutil.rmtree(base / "cases" / "warm")
+            shutil.rmtree(warm)
+        yield seeds, folder.parent / "cases"
+
+
+def fuzz(target: str, first: int, count: int, keep: Path | None = None) -> Iterator[Any]:
+    """Damage copies of the seeds, and read them; number, way, outcome, details."""
+    with seeds_of(target) as (seeds, place):
         for number in range(first, first + count):
             random = Random(f"{target} {number}")
-            folder = base / "cases" / f"case{number}"
-            shutil.copytree(random.choice(seeds), folder)
+            seed = random.choice(seeds)
+            folder = shutil.copytree(seed, place / f"case{number}")
             files = sorted(p for p in folder.rglob(TARGETS[target].damaged) if p.is_file())
             ways = [damage(random.choice(files), random) for _ in range(random.choice((1, 1, 2)))]
+            changed = {
+                path.relative_to(folder): path.read_bytes()
+                for path in files
+                if path.read_bytes() != (seed / path.relative_to(folder)).read_bytes()
+            }
             outcome, details = run_case(target, folder)
             if keep is not None and outcome not in ("ok", "refused"):
-                shutil.copytree(folder, keep / target / f"{number}", dirs_exist_ok=True)
+                for name, data in changed.items():
+                    kept = keep / target / f"{seed.name}-{number}" / name
+                    kept.parent.mkdir(parents=True, exist_ok=True)
+                    kept.write_bytes(data)
             shutil.rmtree(folder)
             yield number, "; ".join(ways), outcome, details
-    finally:
-        shutil.rmtree(base, ignore_errors=True)
+
+
+def replay(target: str) -> Iterator[Any]:
+    """Read what is kept of inputs that once failed: the files that differ from a seed."""
+    with seeds_of(target) as (seeds, place):
+        for kept in sorted((CORPUS / target).glob("*")):
+            seed = next(seed for seed in seeds if seed.name == kept.name.rpartition("-")[0])
+            folder = shutil.copytree(seed, place / kept.name)
+            shutil.copytree(kept, folder, dirs_exist_ok=True)
+            yield (f"{target}/{kept.name}", "kept", *run_case(target, folder))
 
 
 def main() -> None:
-    """As the module says."""
-    target, first, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    """As the module says; with a folder in `FUZZ_KEEP`, what fails is kept there."""
     keep = Path(os.environ["FUZZ_KEEP"]) if "FUZZ_KEEP" in os.environ else None
-    for case in cases(target, first, count, keep=keep):
+    if len(sys.argv) > 1:
+        found = fuzz(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), keep)
+    else:
+        found = chain.from_iterable(map(replay, TARGETS))
+    for case in found:
         print(json.dumps(case), flush=True)
 
 
