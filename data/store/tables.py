@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,8 @@ class Table:
         self.path = path
         try:
             self._file = pq.ParquetFile(path, memory_map=True)
-        except (OSError, pa.ArrowException) as error:
-            what = "is missing" if not path.exists() else f"is not a readable Parquet file: {error}"
+        except (OSError, ValueError, pa.ArrowException) as error:
+            what = "is missing" if not os.path.exists(path) else f"is not a readable Parquet file: {error}"
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:

@@ -242,7 +242,7 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
                 values = batch[name].drop_null().to_numpy()
                 require(RUN, _RANGES[name], values, f"{path}: column {name!r} as")
             yield batch
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise _damaged(path, str(error)) from error
 
 

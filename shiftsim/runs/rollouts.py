@@ -135,12 +135,12 @@ def _offsets(count: int, size: int) -> pa.Array:
     return pa.array(np.arange(count + 1, dtype=np.int32) * size)
 
 
-def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
+def _from_lists(column: pa.Array, shape: tuple[int, ...], where: str) -> np.ndarray:
     flat = column.flatten().to_numpy(zero_copy_only=False)
     try:
         return np.array(flat.reshape(len(column), *shape))
     except ValueError as error:
-        what = f"a rollout has {len(flat)} numbers in {len(column)} rows of shape {shape}"
+        what = f"{where}: {len(flat)} numbers in {len(column)} rows of shape {shape}"
         raise DataError(what, hint="make the run again") from error
 
 
@@ -160,12 +160,13 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
             hint="use the store that the manifest names",
         )
     ego = _stack(rows, EGO_COLUMNS)
-    require(RUN, "state", ego, f"the rollout of scenario {scenario.token!r}: an ego")
+    where = f"the rollout of scenario {scenario.token!r}"
+    require(RUN, "state", ego, f"{where}: an ego")
     tracks = scenario.tracks.rows(samples)
     if "track_valid" in rows.schema.names:
         shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
         stored: dict[str, Any] = {
-            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape))
+            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape), where)
             for name, shape in shapes.items()
         }
         tracks = replace(tracks, **stored)
@@ -180,7 +181,7 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
         route=scenario.route,
         commands=_stack(rows, _COMMAND_COLUMNS),
         noise=_stack(rows, _NOISE_COLUMNS),
-        plans=_from_lists(rows["plan_poses"], (-1, 3)),
+        plans=_from_lists(rows["plan_poses"], (-1, 3), where),
         planning_seconds=np.array(rows["planning_seconds"].to_numpy()),
         degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
     )
@@ -202,7 +203,7 @@ def num_rows(file: Path) -> int:
 def _opened(file: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(file)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise _unreadable(file, error) from error
 
 
