@@ -133,7 +133,11 @@ class Table:
         try:
             self._file = pq.ParquetFile(path, memory_map=True)
         except (OSError, ValueError, pa.ArrowException) as error:
-            what = "is missing" if not os.path.exists(path) else f"is not a readable Parquet file: {error}"
+            what = (
+                "is missing"
+                if not os.path.exists(path)
+                else f"is not a readable Parquet file: {error}"
+            )
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:
