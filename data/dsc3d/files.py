@@ -1,5 +1,6 @@
 """Columns of a DSC3D recording: read without trust, and refused with the place and the reason."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ def read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
     Raises:
         ConversionError: The file is missing, not Parquet, or has more rows than `max_rows`.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # a name may be too long to ask for
         raise ConversionError(f"{path} is missing", "copy the whole recording folder")
     try:
         file = pq.ParquetFile(path)

@@ -293,7 +293,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
             hint="make the run again with this version of shiftsim",
         )
-    for key, kind in _MANIFEST.items():
+    finished = {"counts.ok": int, "counts.expected": int} if manifest["state"] == "finished" else {}
+    for key, kind in {**_MANIFEST, **finished}.items():
         value: Any = manifest
         for name in key.split("."):
             value = value.get(name) if isinstance(value, dict) else None

@@ -56,6 +56,8 @@ def require(
     """
     allowed = ranges[field]
     array = np.atleast_1d(values)
+    if array.dtype == object:  # an integer of any size
+        array = np.array([min(max(value, -_ANY), _ANY) for value in array.flat], np.float64)
     if not array.size or (array.min() >= allowed.low and array.max() <= allowed.high):
         return  # quick, and not taken where there is a NaN
     good = allowed.holds(array)
@@ -78,7 +80,7 @@ def _same(names: str, low: float, high: float, unit: str = "") -> dict[str, Rang
 _TIME = Range(-(2.0**55), 2.0**55, "us")  # a thousand years; sums of two stay exact enough
 _COUNT = 2.0**31
 _ROUNDING = 1e-9
-_ANY = np.finfo(np.float64).max
+_ANY = float(np.finfo(np.float64).max)
 
 # attributes of OpenDRIVE by element; a road whose geometry has no place is left out instead
 OPENDRIVE: Table = {

@@ -29,7 +29,9 @@ from fuzz.targets import TARGETS, implausible
 
 from shiftsim.errors import ConfigError, ShiftsimError
 
-SECONDS, MEMORY = 5.0, 1 << 30
+SECONDS, MEMORY = 5.0, 1 << 30  # of the processor, as others may use it, too; bytes
+PATIENCE = 60.0  # s of waiting
+_HANGS = (signal.SIGPROF, signal.SIGALRM)
 CORPUS = Path(__file__).parent / "corpus"
 
 
@@ -49,7 +51,7 @@ def run_case(target: str, folder: Path) -> tuple[str, str]:
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status):
         end = os.WTERMSIG(status)
-        return ("hang" if end == signal.SIGALRM else "crash"), signal.Signals(end).name
+        return ("hang" if end in _HANGS else "crash"), signal.Signals(end).name
     return tuple(json.loads(answer))
 
 
@@ -57,8 +59,10 @@ def _limit() -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    for end in _HANGS:
+        signal.signal(end, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
 
 
 def _read(target: str, folder: Path) -> tuple[str, str]:

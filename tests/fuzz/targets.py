@@ -20,7 +20,7 @@ from stores import write_toy_store
 from shiftsim.world.scenario import Scenario
 
 FORMAT = GOLDEN / "nuplan_format"
-MANY = 1e9  # no length, speed or count in a sound small file is larger
+MANY = 1e12  # no range but that of a time has a larger end
 MAY_BE_NAN = ("velocities", "speed_limits")
 
 

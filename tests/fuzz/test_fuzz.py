@@ -85,7 +85,7 @@ def _fail(_folder):
         (_loop, "hang"),
         (_take, "traceback"),
         (lambda folder: 1 / 0, "traceback"),
-        (lambda folder: {"x": [1e12]}, "garbage"),
+        (lambda folder: {"x": [1e13]}, "garbage"),
         (lambda folder: np.array([np.nan]), "garbage"),
         (_fail, "no file named"),
         (lambda folder: 5.0, "ok"),

@@ -22,6 +22,7 @@ def test_values_in_range_pass(values):
         (np.array([0, 1, 300, 400]), "a.db: column 'speed', row 2: 300 is beyond"),
         (np.array([0.0, np.nan, 1e300]), "row 1: nan is not a finite number (2 such values)"),
         (np.array([[0.0, 1.0], [2.0, np.inf]]), "row 1: inf is not a finite number"),
+        (10**400, "a.db: column 'speed': 1.797693135e+308 is beyond"),
         (2**63, "a.db: column 'speed': 9.223372037e+18 is beyond"),
     ],
 )
