@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray
 from shiftsim.errors import DataError, ShiftsimError
 
 CHECK = "check the unit of that value, and that the file is whole"
@@ -23,7 +23,7 @@ class Range(NamedTuple):
     high: float
     unit: str = ""
 
-    def holds(self, values: Any) -> BoolArray:
+    def holds(self, values: Any) -> NDArray[np.bool_]:
         """Which values are finite numbers in the range."""
         with np.errstate(invalid="ignore"):
             return (values >= self.low) & (values <= self.high)
@@ -181,6 +181,8 @@ CHECKPOINT: Table = {
 SETTINGS: Table = {
     **_same("workers", 0, 4096),
     **_same("batch_size", 1, 65536),
+    **_same("limit", 0, _COUNT),
+    **_same("timeout", 0, 1e7, "s"),
     **_same("window_s, overlap_s, history_s, padding_s, max_hole_s", 0, 1e5, "s"),
     **_same("min_peak_speed", 0, 1e3, "m/s"),
     **_same("max_overlap", 0, 1e6, "m²"),
