@@ -238,6 +238,7 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
             if found.get(column.name) != column.type:
                 raise _damaged(path, f"column {column.name!r} is missing or not {column.type}")
         for batch in file.iter_batches(batch_size=4096):
+            batch.validate(full=True)  # that texts are UTF-8
             for name in set(_RANGES) & set(batch.schema.names):
                 values = batch[name].drop_null().to_numpy()
                 require(RUN, _RANGES[name], values, f"{path}: column {name!r} as")
