@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Iterable
 
 _MAX_TEXT = 100_000  # characters
+_MAX_MESSAGE = 1000  # characters
 
 
 class ShiftsimError(Exception):
@@ -14,12 +15,20 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        super().__init__(message)
+        super().__init__(_in_one_line(message))
         self.hint = hint
 
     def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
         """Keep the hint when the error travels between processes."""
         return type(self), (str(self), self.hint)
+
+
+def _in_one_line(message: str) -> str:
+    """The message; texts of other libraries and values of damaged files in it may be long."""
+    if len(message) <= _MAX_MESSAGE and "\n" not in message:
+        return message
+    text = " ".join(message.split())
+    return text if len(text) <= _MAX_MESSAGE else f"{text[:700]} … {text[-250:]}"
 
 
 class ConfigError(ShiftsimError):

@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from shiftsim.data.store.plausible import require_sound
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
@@ -32,6 +33,7 @@ _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its u
     " turn_type is_bike intersection_kinds stop_kinds".split()
 }
 _UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
+_NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
 _WIDTHS = {"xy": 2, "bounds": 4}  # columns of the arrays that have two axes
 _WHOLE = ("xy", "arc", "bounds", "grid")  # float parts; all others hold integers
 
@@ -82,8 +84,7 @@ def write_map(path: Path, road: VectorMap) -> None:
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
     columns = [_one_row(values[field.name], field.type) for field in SCHEMA]
-    notes = ("name", "epsg", "num_lanes", "num_roadblocks", "flaws")
-    footer = {name: getattr(road, name) for name in notes}
+    footer = {name: getattr(road, name) for name in _NOTES}
     write_blocks(path, [pa.Table.from_arrays(columns, schema=SCHEMA)], footer)
 
 
@@ -106,9 +107,11 @@ def read_map_file(path: Path) -> VectorMap:
     items = {name: _items(file.read(columns=[name])[name]) for name in SCHEMA.names}
     pa.default_memory_pool().release_unused()
     try:
-        return _assemble(file.footer, items)
+        road = _assemble(file.footer, items)
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
+    require_sound(road, str(path))
+    return road
 
 
 def _items(column: pa.ChunkedArray) -> Any:
@@ -134,5 +137,8 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
             raise ValueError(f"{name}: {len(ids)} ids")
         parts[name] = Layer(ids, parts[name])
     parts.update({name: items[column] for name, column in _ARRAYS.items()})
+    for name, kind in _NOTES.items():
+        if type(footer[name]) is not kind:
+            raise TypeError(f"{name} in the footer is {footer[name]!r}")
     pairs = zip(items["left_boundary_ids"], items["right_boundary_ids"], strict=True)
     return VectorMap(boundary_ids=tuple(pairs), **parts, **footer)

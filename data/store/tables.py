@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,8 +73,8 @@ def read_manifest(store: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text("utf-8"))
         kind, version = manifest["format"], manifest["version"]
         files, content = manifest["files"], manifest["hash"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged: {error!r}", hint=REPAIR) from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DataError(f"{path}: damaged: {error!r}"[:400], hint=REPAIR) from error
     if kind != schema.FORMAT or version != schema.VERSION:
         raise DataError(
             f"{path}: format {kind!r}, version {version!r}, not {schema.FORMAT!r} version"
@@ -135,8 +136,12 @@ class Table:
         self.path = path
         try:
             self._file = pq.ParquetFile(path, memory_map=True)
-        except (OSError, pa.ArrowException) as error:
-            what = "is missing" if not path.exists() else f"is not a readable Parquet file: {error}"
+        except (OSError, ValueError, pa.ArrowException) as error:
+            what = (
+                "is missing"
+                if not os.path.exists(path)
+                else f"is not a readable Parquet file: {error}"
+            )
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:
@@ -153,7 +158,9 @@ class Table:
         text = (self._file.metadata.metadata or {}).get(_FOOTER.encode(), b"{}")
         try:
             footer: dict[str, object] = json.loads(text)
-        except ValueError as error:
+            if not isinstance(footer, dict):
+                raise ValueError("not an object")
+        except (ValueError, RecursionError) as error:
             raise DataError(f"{self.path}: unreadable footer: {error}", hint=REPAIR) from error
         return footer
 

@@ -178,6 +178,11 @@ def _check(name: str, value: Any, kind: Any, option: Option) -> None:
     if option.least is not None and not option.least <= value < math.inf:
         wrong = "it cannot be negative" if option.least == 0 else "it must be at least 1"
         raise ConfigError(f"{name} is {value!r}; {wrong}")
+    if option.least is not None:
+        from shiftsim.world.ranges import SETTINGS  # not needed to show the options
+
+        if not SETTINGS[name].low <= value <= SETTINGS[name].high:
+            raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
 
 
 def _is_a(value: object, kind: type) -> bool:
