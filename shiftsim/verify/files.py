@@ -86,11 +86,6 @@ class Source:
             groups.setdefault(tuple(map(str, values)), []).append(row)
         return {values: self.at(np.array(rows)) for values, rows in groups.items()}
 
-    def by(self, key: str, value: str) -> "Source":
-        """One column as values that another one names, such as scores by metric."""
-        pairs = zip(self[key].tolist(), self[value].tolist(), strict=True)
-        return Source(self.name, key, dict(pairs), self.report)
-
     def each(self, name: str) -> "list[Source]":
         """The objects in a list of a `.json`, as parts of the file; or the one that is not listed.
 
