@@ -34,7 +34,7 @@ LONGEST_PLAN_US = 3_600_000_000  # us, longer ones are broken input
 WINDOW_KNOTS = 81  # knots of the plan in closed loops of mode `window`
 LOOP_TOLERANCE = 1e-6  # closed loops: m, m/s, m/s^2, rad/s
 LOOP_ANGLE_TOLERANCE = 1e-7  # rad, closed loops
-TOLERANCES = {  # of what `TOLERANCE` does not hold for
+TOLERANCES: Arrays = {  # of what `TOLERANCE` does not hold for
     "": TOLERANCE,
     "corners": 2e-9,  # m, coordinates near 4e6 are spaced 5e-10
     "cmd": LOOP_TOLERANCE,

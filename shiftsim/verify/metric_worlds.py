@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.errors import DataError
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import TOLERANCE, Source, read_fields, verify_files
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import ego_states, read_map, read_objects, recorded_log
+from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
 from shiftsim.world.map import VectorMap
 
 SCORE_TOLERANCES = dict.fromkeys(  # the other scores are 0 or 1
@@ -42,19 +43,18 @@ def _read(world: Source) -> tuple[SimulationLog, VectorMap]:
         ego_states(dict(zip(world["state_columns"], np.transpose(world[name]), strict=True)))
         for name in ("ego", "expert")
     )
-    tracks = read_objects(world.each("objects"), len(ego))
+    things = world.each("objects")
+    if len(time_us) != len(expert) or any(len(o["frames"]) != len(time_us) for o in things):
+        raise DataError(f"{len(time_us)} time stamps, other numbers of expert states or of frames")
     token = f"world {world.values.get('world')}"
-    return recorded_log(token, time_us[: len(ego)], ego, tracks, time_us, expert), road
+    tracks = read_objects(things, len(time_us))
+    return recorded_log(make_scenario(token, road, time_us, expert, tracks), ego), road
 
 
 def _verify_world(report: Report, path: Path) -> None:
     world, where = read_fields(path, report, "metric_world"), path.stem
     world.note("label", "world", "kind")
     log, road = _read(world)
-    count = len(log.expert_time_us)
-    report.compare("number of states", where, len(log.ego), count - 1)
-    for thing in world.each("objects"):
-        report.compare("number of frames", where, len(thing["frames"]), count)
     # a connector lies in a roadblock connector, a lane in a roadblock
     kinds = road.block_of >= road.num_roadblocks
     is_connector = np.arange(len(road.edges)) >= road.num_lanes

@@ -26,7 +26,7 @@ _NEAR = 80.0  # m, half width of the square of `proximal`
 _DRIVABLE = ((30.0, 0.0), (100.0, -6.0), (30.0, -8.0), (210.0, -6.0))
 _ORIGINS = {32632: (600000.0, 5300000.0)}  # of the coordinates, by coordinate system
 _POSE = np.array([1e-6, 1e-6, 1e-9])
-_TOLERANCES = {"rear": _POSE, "goal": _POSE, "center": 1e-6, "length": 1e-3}
+_TOLERANCES: dict[str, Any] = {"rear": _POSE, "goal": _POSE, "center": 1e-6, "length": 1e-3}
 _TOLERANCES |= {"interval": 1e-12, "speed": 1e-9}
 # Fields of a lane and of a connector as of `attributes_of`
 _BOTH = {"out": "outgoing", "inc": "incoming"}

@@ -1,5 +1,6 @@
 """Metrics of the nuplan folder: recorded rollouts, scored by us and by the official stack."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,11 +85,11 @@ def _measure(
     ego, logged = (
         worlds.ego_states({n: part[n] for n in worlds.EGO_COLUMNS}) for part in (rows, expert)
     )
-    tracks = tracks_of(objects, len(ego))
-    stamps = rows["time_us"].astype(np.int64), expert["time_us"].astype(np.int64)
-    log = worlds.recorded_log(run[0], stamps[0], ego, tracks, stamps[1], logged)
+    times, tracks = expert["time_us"].astype(np.int64), tracks_of(objects, len(ego))
+    scenario = worlds.make_scenario(run[0], road, times, logged, tracks)
+    log = replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
     columns, count = worlds.ego_columns(ego), len(logged) - 1
-    ours = {"iteration": np.arange(count), "time_us": stamps[1][:count]}
+    ours = {"iteration": np.arange(count), "time_us": times[:count]}
     ours |= {name: columns[name] for name in _RECORDED}
     rows.match(" ".join(run), ours, _RECORDED, quantity="recorded")
     return measure(log, road)
