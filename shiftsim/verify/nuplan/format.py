@@ -11,7 +11,7 @@ from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import find_maps, list_scenarios, load_map, read_scenario
 from shiftsim.errors import DataError
 from shiftsim.verify.files import read_fields
-from shiftsim.verify.nuplan.logs import excerpt_rows
+from shiftsim.verify.nuplan.logs import excerpt_rows, name_rest
 from shiftsim.verify.nuplan.maps import attributes_of, near_square
 from shiftsim.verify.report import Report
 from shiftsim.world.layers import in_any
@@ -49,12 +49,7 @@ def verify_nuplan_format(folder: Path, report: Report) -> None:
     ours = _read_back(folder, logs[0])
     expected.match_tree(path.name, ours, _TOLERANCES, unordered=_UNORDERED)
     expected.finish()
-    known = {*logs, *find_maps(folder / "maps").values(), path}
-    known |= set((folder / "maps").glob("*maps*.json"))
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path not in known and path.name != "README.md":
-            report.skip(f"{path.relative_to(folder)} is not part of the folder's format")
-    report.note("README.md (for reading)")
+    name_rest(folder, {*logs, path}, report)
 
 
 def _read_back(folder: Path, path: Path) -> dict[str, Any]:
