@@ -125,9 +125,10 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     sample = Sample(site, recording, keys)
 
     def table(columns: Callable[[int, Sample], dict[str, Any]], path: Path) -> None:
-        groups = Groups(path, report, ("track_id",))
-        for number, track in enumerate(recording.track_ids.tolist()):
-            groups.match((str(track),), columns(number, sample), _COLUMNS, angles={"yaw"})
+        groups, names = Groups(path, report, ("track_id",)), recording.track_ids.astype(str)
+        report.compare("tracks", path.stem, sorted(names), sorted(name for (name,) in groups))
+        for number, name in enumerate(names.tolist()):
+            groups.match((name,), columns(number, sample), _COLUMNS, angles={"yaw"})
         groups.finish()
 
     parts: dict[str, Callable[[Path], object]] = {
@@ -303,10 +304,11 @@ def _verify_scenarios(
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
     poses = Groups(folder / "expected_ego_20hz.parquet", report, ("window_start_s", "track_id"))
     made = convert_recording(recording, local.placed(site), site.offset[:2], ConversionConfig())
-    egos = {ego.name: ego for ego in made.egos}
+    egos, seen = {ego.name: ego for ego in made.egos}, set()
     for window in made.windows:
         begin = float(str(window.metadata["window_start_s"]))
         key = (f"{begin:.1f}", str(window.metadata["track_id"]))
+        seen.add(key)
         where, ego = f"{folder.name} window {key[0]} track {key[1]}", egos[window.ego]
         rows = slice(window.first_row - ego.first_row, window.last_row - ego.first_row)
         centers = center_poses(ego.states[rows, :3])
@@ -318,9 +320,9 @@ def _verify_scenarios(
             error = np.linalg.norm(centers[:, :2] - xy, axis=1)
             report.compare("20 Hz position", where, error, 0.0 * error, atol=_POSITION)
         first = int(window.iteration_rows[0]) - window.first_row
-        given = repr([tuple(lane) for lane in lanes.pop(key, ())])
+        given = repr([tuple(lane) for lane in lanes.get(key, ())])
         ways = [repr([tuple(lane) for lane in way]) for way in local.sequences(centers[first:, :2])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
-    for start, track in lanes:
+    for start, track in sorted((set(poses) | set(lanes)) - seen):
         report.fail("lanes", f"{folder.name} window {start} track {track}", "no such scenario")
     poses.finish()
