@@ -227,6 +227,12 @@ class Groups(dict[tuple[str, ...], Source]):
         """`Source.match` for the rows of a key."""
         return self[key].match(" ".join(key), *args, **options)
 
+    def match_keys(self, key: tuple[str, ...], ours: list[tuple[str, ...]]) -> None:
+        """Compare which keys begin with `key`, by the rest of them."""
+        theirs = [name[len(key) :] for name in self if name[: len(key)] == key]
+        label, where = f"{self.table.name} present", " ".join(key)
+        self.table.report.compare(label, where, sorted(ours), sorted(theirs))
+
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
         for key in self:

@@ -20,7 +20,9 @@ PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 PROFILE_KEY = (*RUN_KEY, "thresholds")
 _TABLES = {
     **dict.fromkeys(("objects", "route", "collisions"), RUN_KEY),
-    **dict.fromkeys(("metrics", "statistics", "scores"), PROFILE_KEY),
+    "scores": PROFILE_KEY,
+    "metrics": (*PROFILE_KEY, "metric"),
+    "statistics": (*PROFILE_KEY, "metric", "statistic"),
     "time_series": (*RUN_KEY, "metric"),
 }
 # coordinates near 4e6 are spaced 5e-10
@@ -143,33 +145,25 @@ def _compare_profile(
 ) -> None:
     """Compare scores and statistics under one threshold set."""
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
-    metrics = {
-        "metric": list(scores),
-        "category": [_CATEGORIES.get(name, "Planning") for name in scores],
-        "unit": [_UNITS.get(name) for name in scores],
-        "score": list(scores.values()),
-    }
-    bounds = [SCORE_TOLERANCES.get(name, EXACT) for name in scores]
-    tables["metrics"].match(key, metrics, {"score": bounds})
-    row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"]}
-    row |= {**scores, "score": result.score}
+    row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
+    row |= {"score": result.score}
     tables["scores"].match(key, {name: [value] for name, value in row.items()}, SCORE_TOLERANCES)
-    rows, names = tables["statistics"][key], ("metric", "statistic")
-    rows = rows.at(np.lexsort([rows[name].astype(str) for name in reversed(names)]))
-    found = sorted(result.statistics, key=lambda s: (s.metric, s.name))
-    statistics = {
-        "metric": [s.metric for s in found],
-        "statistic": [s.name for s in found],
-        "unit": [s.unit or None for s in found],
-        "type": [s.kind or None for s in found],
-        "value": [s.value for s in found],
-    }
-    bounds = [EXACT if s.unit in ("boolean", "count") else TOLERANCE for s in found]
-    rows.match(" ".join(key), statistics, {"value": bounds})
+    tables["metrics"].match_keys(key, [(name,) for name in scores])
+    for name, score in scores.items():
+        filed = {"category": [_CATEGORIES.get(name, "Planning")], "unit": [_UNITS.get(name)]}
+        atol = {"score": SCORE_TOLERANCES.get(name, EXACT)}
+        tables["metrics"].match((*key, name), {**filed, "score": [score]}, atol)
+    found = result.statistics
+    tables["statistics"].match_keys(key, [(s.metric, s.name) for s in found])
+    for s in found:
+        filed = {"unit": [s.unit or None], "type": [s.kind or None]}
+        atol = {"value": EXACT if s.unit in ("boolean", "count") else TOLERANCE}
+        tables["statistics"].match((*key, s.metric, s.name), {**filed, "value": [s.value]}, atol)
 
 
 def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -> None:
     times = result.measurements.time_us
+    table.match_keys(run, [(metric,) for metric in result.series])
     for metric, ours in result.series.items():
         columns = {
             "unit": [ours.unit or None] * len(times),
