@@ -6,7 +6,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -58,19 +58,19 @@ NAMES = {  # of columns, by the array that lists them
 
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    parts = {f"{stem}.npz": partial(_verify_file, report, check) for stem, check in CHECKS.items()}
+    parts = {f"{stem}.npz": partial(_verify_file, report, *check) for stem, check in CHECKS.items()}
     worlds = {"idm_world_*": partial(verify_idm_world, report=report)}
     verify_files(folder, report, {**parts, **worlds, "meta.json": None})
 
 
-def _verify_file(report: Report, check: "Check", path: Path) -> None:
-    file, names = read_arrays(path, report), check.lists.split()
-    file.note("label", *check.labels.split())
-    if check.unread:
-        file.note(check.unread)
+def _verify_file(
+    report: Report, compute: Callable[[Source], Arrays], lists: str, labels: str, path: Path
+) -> None:
+    file, names = read_arrays(path, report), lists.split()
+    file.note("label", *labels.split())
     file.match("file", {name: NAMES[name] for name in names})
     for number, case in enumerate(_cases(file, names)):
-        case.match(f"case {number}", check.compute(case), TOLERANCES)
+        case.match(f"case {number}", compute(case), TOLERANCES)
     file.finish()
 
 
@@ -231,42 +231,17 @@ def _idm_steps(case: Source) -> Arrays:
     return {"accel_unclipped": idm_acceleration(*given), "forward_euler": euler}
 
 
-class Check(NamedTuple):
-    """How a file is compared."""
-
-    compute: Callable[[Source], Arrays]  # arrays of a case
-    lists: str  # arrays that list `NAMES`
-    labels: str  # arrays that are labels, or that nothing uses
-    unread: str = ""  # inputs of which not all values are read
-
-
 _EGO = "state_columns centre_columns"
+_FRAMES = f"{_EGO} corner_order from_centre_columns"
 _IDM = "param_columns agent_columns lead_columns"
-_INPUTS = "in_state vy, ay, steer_rate, alpha: not read by the model"
-_KNOTS = "ref_pose: knots behind the last window are read by no step"
-CHECKS = {
-    "bicycle_rollouts": Check(_bicycle, "state_columns", "case", _INPUTS),
-    "bicycle_steps": Check(_bicycle, _EGO, "case kind", _INPUTS),
-    "closed_loop": Check(_closed_loop, _EGO, "case shape", _KNOTS),
-    "closed_loop_noise": Check(_closed_loop_noise, _EGO, "case shape", _KNOTS),
-    "comfort_signals": Check(
-        *(_comfort_signals, "flag_columns", "case sig_in_vx"),
-        "sig_in_time_us: only the mean step matters",
-    ),
-    "ego_state_frames": Check(
-        *(_ego_frames, f"{_EGO} corner_order from_centre_columns", "case"),
-        "rear_state steer, steer_rate: not converted",
-    ),
-    "idm_steps": Check(
-        *(_idm_steps, _IDM, "case odeint rk45"),
-        "lead progress, length_rear: not read where the gap is below min_gap",
-    ),
-    "lqr_commands": Check(
-        *(_lqr_commands, "state_columns", "case kind"),
-        "ego_state vy, ax, ay, steer_rate, omega, alpha: not read by the tracker",
-    ),
-    "trajectory_interpolation": Check(
-        *(_trajectory_interpolation, "state_columns", "case"),
-        "knot_state steer_rate, omega, alpha: not carried by interpolation",
-    ),
+CHECKS = {  # file: what computes a case, arrays that list `NAMES`, labels and what nothing uses
+    "bicycle_rollouts": (_bicycle, "state_columns", "case"),
+    "bicycle_steps": (_bicycle, _EGO, "case kind"),
+    "closed_loop": (_closed_loop, _EGO, "case shape"),
+    "closed_loop_noise": (_closed_loop_noise, _EGO, "case shape"),
+    "comfort_signals": (_comfort_signals, "flag_columns", "case sig_in_vx"),
+    "ego_state_frames": (_ego_frames, _FRAMES, "case"),
+    "idm_steps": (_idm_steps, _IDM, "case odeint rk45"),
+    "lqr_commands": (_lqr_commands, "state_columns", "case kind"),
+    "trajectory_interpolation": (_trajectory_interpolation, "state_columns", "case"),
 }
