@@ -104,7 +104,7 @@ def tracks_of(rows: Source, count: int) -> Tracks:
     column = {token: index for index, token in enumerate(kinds)}
     track = [column[token] for token in names]
     if not ((iteration >= 0) & (iteration < count)).all():
-        raise DataError(f"objects at iterations that the ego does not have, which has {count}")
+        raise DataError(f"objects at iterations which the ego does not have, of {count}")
     if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
         raise DataError("an object occurs twice at one iteration")
     if [kinds[token] for token in names] != rows["type"].tolist():
