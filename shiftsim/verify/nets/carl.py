@@ -102,12 +102,13 @@ def _compare(loop: Loop) -> None:
     _, heads = _outputs(loop.variant, pictures[None], measured[None], _VALUE_MEASUREMENTS)
     ours = {name: value[0] for name, value in heads.items()}
     ours |= {"measurements": measured, "action": loop.output}
-    loop.match_row({name: ours[name] for name in _RECORDED}, BOUNDS)
+    ours = {name: ours[name] for name in _RECORDED}
+    loop.row.match(loop.where, ours, BOUNDS, quantity=NAME)
     # the next step goes on from their action: standing still, each step multiplies a difference
-    theirs = loop.planner.decode(loop.recorded("action"), loop.seen)
+    theirs = loop.planner.decode(loop.row["action"], loop.seen)
     for whose, command, atol in (("our", loop.plan, COMMAND), ("their", theirs, DECODED)):
         name = f"command of {whose} action"
-        loop.compare(name, _numbers(command), loop.recorded("command"), atol)
+        loop.compare(name, _numbers(command), loop.row["command"], atol)
 
 
 def _compare_drawn(loop: Loop) -> None:

@@ -208,7 +208,7 @@ def _verify_sampling(
 def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
     bound = SAMPLED[loop.variant]
-    loop.compare("ego_prediction", loop.output[0], loop.recorded("ego_prediction"), bound)
+    loop.compare("ego_prediction", loop.output[0], loop.row["ego_prediction"], bound)
     loop.compare_plan(POSITION)
     if not list(loop.stored):
         return
