@@ -32,8 +32,16 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import FEATURE, PROSE, make_network, match_meta, verify_manifest
+from shiftsim.verify.nets.networks import (
+    FEATURE,
+    PROSE,
+    make_network,
+    match_case,
+    match_meta,
+    verify_manifest,
+)
 from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.worlds import make_tracks
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -88,13 +96,8 @@ class KeyedPlanner(DiffusionPlanner):
 
 
 def _manifest(network: Any) -> dict[str, Any]:
-    last, starts = (
-        "decoder.decoder.dit.final_layer.proj.4",
-        {
-            "prefix": re.compile(re.escape(network.PREFIXES[0])),
-            "used_key": re.compile(r"ema_state_dict\b"),
-        },
-    )
+    last, prefix = "decoder.decoder.dit.final_layer.proj.4", re.escape(network.PREFIXES[0])
+    starts = {"prefix": re.compile(prefix), "used_key": re.compile(r"ema_state_dict\b")}
     return {
         "checkpoint": {"file": PROSE, "container": PROSE, **starts},
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
@@ -124,6 +127,7 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
         "sigma": made.sigma,
         "final_denoise_t": sampler.LAST_TIME,
     }
+    file.match(file.name, ours, SCHEDULE, quantity=NAME)
     steps = {
         "step": numbers,
         "order": np.minimum(numbers, 2),
@@ -133,12 +137,10 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
         "c_x0": made.c_x0,
         "r0": np.array([np.nan, *made.r0.tolist()]),
     }
-    file.match(file.name, ours, SCHEDULE, quantity=NAME)
-    listed = file["steps"]
-    theirs = {name: [step[name] for step in listed] for name in listed[0]}
-    table = Source("sampler steps", "field", theirs, file.report)
-    table.match(file.name, steps, SCHEDULE, quantity=f"{NAME} sampler")
-    table.finish()
+    listed = file.each("steps")
+    for name, values in steps.items():
+        theirs = [step[name] for step in listed]
+        file.report.compare(f"{NAME} sampler {name}", file.name, values, theirs, atol=SCHEDULE)
 
 
 def _verify_forward(file: Source, scenes: Scenes) -> None:
@@ -146,8 +148,6 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
     import torch
 
     case, given = file.name.removeprefix("forward_"), file.below("in.")
-    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
-    match_meta(file, NAME, {"case": case, "variants": variants})
     limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
@@ -162,7 +162,7 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
             "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]),
         }
         file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
-        for variant in variants:
+        for variant in match_case(file, NAME):
             _verify_sampling(file, variant, scene, inputs)
 
 
@@ -172,9 +172,8 @@ def _verify_sampling(
     """All calls of the sampler with one variant of the weights."""
     import torch
 
+    from shiftsim.planners.learned.diffusion.network import sampler
     from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
-    from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE as TIMES
-    from shiftsim.planners.learned.diffusion.network.sampler import sample
 
     network, stored = make_network(NAME, variant), file.below(f"out.{variant}.")
     current, absent = network.present(scene)
@@ -187,26 +186,23 @@ def _verify_sampling(
         return made[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:
-        return network.denormalise(sample(function, current, noise)[:, :, 1:])
+        return network.denormalise(sampler.sample(function, current, noise)[:, :, 1:])
 
-    bound = SAMPLED[variant]
-    ours = {
-        "prediction": (sampled(call), bound),
-        "step_t": (TIMES.call_times, SCHEDULE),
-        "dit_first": (made[0], NETWORK),
-        # of the other calls the ego's input and the last output are stored
-        "step_ego_x": (torch.stack(seen), bound / SCALE),
-        "dit_last": (made[-1], bound / SCALE),
-    }
+    ours = {"prediction": sampled(call), "step_t": sampler.SCHEDULE.call_times}
+    # of the calls behind the first the ego's input and the last output are stored
+    ours |= {"dit_first": made[0], "step_ego_x": torch.stack(seen), "dit_last": made[-1]}
     if "guided_prediction" in stored:
         guided = with_guidance(call, network, inputs["neighbor_agents_past"], absent)
-        ours["guided_prediction"] = (sampled(guided), bound)
-    for name, (value, atol) in ours.items():
-        stored.match(f"{file.name} {variant}", {name: value}, atol, quantity=NAME)
+        ours["guided_prediction"] = sampled(guided)
+    metres = dict.fromkeys(("prediction", "guided_prediction"), SAMPLED[variant])
+    bounds = {**metres, "step_t": SCHEDULE, "dit_first": NETWORK, "": SAMPLED[variant] / SCALE}
+    stored.match(f"{file.name} {variant}", ours, bounds, quantity=NAME)
 
 
 def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
+    import torch
+
     bound = SAMPLED[loop.variant]
     loop.compare("ego_prediction", loop.output[0], loop.row["ego_prediction"], bound)
     loop.compare_plan(POSITION)
@@ -222,17 +218,10 @@ def _compare(loop: Loop) -> None:
         **{f"feature/{name}": getattr(features, name) for name in names},
     }
     if "encoding" in loop.stored:
-        ours["encoding"] = _encoding(loop.planner.network, features)
+        with torch.inference_mode():
+            network, (inputs, _) = loop.planner.network, loop.planner.batch([features])
+            ours["encoding"] = network.encode(network.normalise(inputs))[0]
     loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
-
-
-def _encoding(network: Any, features: Features) -> Any:
-    """Tokens of the scene (107, 192)."""
-    import torch
-
-    with torch.inference_mode():
-        inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
-        return network.encode(network.normalise(inputs))[0]
 
 
 def _verify_agents(file: Source, scenes: Scenes) -> None:
@@ -249,25 +238,27 @@ def _tracks(file: Source) -> Tracks:
     """The frames as tracks, in the order of the last frame; static objects after them."""
     names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
     frames = [file.take(name, -1, len(_TRACK_COLUMNS)) for name in names]
-    kinds: dict[int, int] = {}
-    for name, frame in zip(names[::-1], frames[::-1], strict=True):
-        for track, kind in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True):
-            if kinds.setdefault(int(track), kind) != kind:
-                raise DataError("a track changes its type")
+    typed = [
+        pair
+        for name, frame in zip(names[::-1], frames[::-1], strict=True)
+        for pair in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True)
+    ]
+    kinds = dict(typed)
+    if len(set(typed)) != len(kinds):
+        raise DataError("a track changes its type")
     static = file.take("in.static", -1, 5)
     types = file.take("in.static_type", len(static)).tolist()
     column = {track: index for index, track in enumerate(kinds)}
-    shape = (len(frames), len(column) + len(static))
-    values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)
-    for sample, frame in enumerate(frames):
-        where = [column[int(track)] for track in frame[:, 0]]
-        valid[sample, where] = True
-        values[sample, where] = frame[:, [6, 7, 3, 1, 2, 5, 4]]
-    valid[-1, len(column) :] = True
-    values[-1, len(column) :, [0, 1, 2, 6, 5]] = static.T
-    poses, velocities, sizes = np.split(values, (3, 5), axis=2)
-    codes = np.array([*kinds.values(), *(AgentKind[_STATIC[t]] for t in types)], np.int64)
-    return Tracks(valid, poses, velocities, sizes, codes, tuple(map(str, range(shape[1]))))
+    moving = np.concatenate(frames)
+    samples = [*np.repeat(np.arange(len(frames)), [len(f) for f in frames]), *[-1] * len(static)]
+    columns = [column[track] for track in moving[:, 0].tolist()]
+    columns += range(len(column), len(column) + len(static))
+    values = np.full((len(columns), 7), np.nan)
+    values[: len(moving)] = moving[:, [6, 7, 3, 1, 2, 5, 4]]
+    values[len(moving) :, [0, 1, 2, 6, 5]] = static
+    words = [*(AgentKind(kind).name for kind in kinds.values()), *(_STATIC[t] for t in types)]
+    shape = (len(frames), len(words))
+    return make_tracks(shape, (samples, columns), values, words, tuple(map(str, range(shape[1]))))
 
 
 def _verify_lanes(file: Source, scenes: Scenes) -> None:
@@ -303,12 +294,11 @@ def _lines(file: Source, name: str) -> Polylines:
     return make_polylines(np.split(xy, np.cumsum(lengths)[:-1]))
 
 
+_SIZES = {"parameters": "", "parameters_encoder": "encoder"}
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(
-        verify_manifest, NAME, {"parameters": "", "parameters_encoder": "encoder"}, _manifest
-    ),
+    "state_dict.json": partial(verify_manifest, NAME, _SIZES, _manifest),
     "forward_*.npz": _verify_forward,
     "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare, (*PLANS, "ego_prediction")),
     "overflow_agents_*.npz": _verify_agents,

@@ -110,30 +110,23 @@ def _path(file: Source) -> None:
 def _graph_search(report: Report, path: Path) -> None:
     for number, content in enumerate(read_json(path)):
         case = Source(content["kind"], "field", content, report)
-        found, nodes = _SEARCHES[case["kind"]](case)
+        found, nodes = _search(case)
         ours = {"found": found, "path": [str(node) for node in nodes]}
         case.match(f"case {number}", ours)
         case.finish()
 
 
-def _neighbours(case: Source, *, forward: bool = True) -> list[list[int]]:
-    out: list[list[int]] = [[] for _ in range(case["n"])]
+def _search(case: Source) -> tuple[bool, list[int]]:
+    is_forward = case["kind"] != "bfs_roadblock" or case["forward"]
+    after: list[list[int]] = [[] for _ in range(case["n"])]
     for edge in case["edges"]:
-        start, end = edge if forward else edge[::-1]
-        out[start].append(end)
-    return out
-
-
-def _search_blocks(case: Source) -> tuple[bool, list[int]]:
-    goals, forward = {int(target) for target in case["targets"]}, case["forward"]
-    neighbours = _neighbours(case, forward=forward)
-    found = search_levels(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
-    return found.found, found.path if forward else found.path[::-1]
-
-
-def _search_lanes(case: Source) -> tuple[bool, list[int]]:
-    after, allowed = _neighbours(case), {int(lane) for lane in case["candidates"]}
-    lengths, blocks = case["length"], case["block"]
+        start, end = edge if is_forward else edge[::-1]
+        after[start].append(end)
+    if case["kind"] == "bfs_roadblock":
+        goals = {int(target) for target in case["targets"]}
+        found = search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
+        return found.found, found.path if is_forward else found.path[::-1]
+    allowed, lengths, blocks = set(map(int, case["candidates"])), case["length"], case["block"]
     if not len(lengths) == len(blocks) == case["n"]:
         raise DataError("a lane has no length or no block")
     found = search_cheapest(
@@ -145,7 +138,6 @@ def _search_lanes(case: Source) -> tuple[bool, list[int]]:
     return found.found, found.path
 
 
-_SEARCHES = {"bfs_roadblock": _search_blocks, "lane_dijkstra": _search_lanes}
 CHECKS = {
     **{"idm": _idm, "tracker_sim": _tracker, "comfort": _comfort},
     **{"emergency_brake": _emergency_brake, "path": _path},
