@@ -13,33 +13,14 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.planners.learned.deterministic import keyed_normals
-from shiftsim.planners.learned.diffusion.features import (
-    LANES,
-    ROUTE_LANES,
-    Features,
-    agent_features,
-    lane_features,
-    lanes_on_route,
-)
-from shiftsim.planners.learned.diffusion.kernels import (
-    SAMPLES,
-    LaneLines,
-    line_bounds,
-    nearest_lanes,
-    resample_lanes,
-)
+from shiftsim.planners.learned.diffusion import features as builder
+from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.verify.files import Source
+from shiftsim.verify.nets import networks
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import (
-    FEATURE,
-    PROSE,
-    make_network,
-    match_case,
-    match_meta,
-    verify_manifest,
-)
+from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.worlds import make_tracks
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
@@ -89,7 +70,7 @@ class KeyedPlanner(DiffusionPlanner):
         super().reset(scene)
         self._token = scene.token
 
-    def features(self, observation: Observation) -> Features:
+    def features(self, observation: Observation) -> builder.Features:
         """What the network reads."""
         noise = start_noise(f"{self._token}:{observation.iteration}")
         return replace(super().features(observation), noise=noise)
@@ -99,7 +80,7 @@ def _manifest(network: Any) -> dict[str, Any]:
     last, prefix = "decoder.decoder.dit.final_layer.proj.4", re.escape(network.PREFIXES[0])
     starts = {"prefix": re.compile(prefix), "used_key": re.compile(r"ema_state_dict\b")}
     return {
-        "checkpoint": {"file": PROSE, "container": PROSE, **starts},
+        "checkpoint": {"file": networks.PROSE, "container": networks.PROSE, **starts},
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
         "noise": _NOISE,
     }
@@ -162,7 +143,7 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
             "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]),
         }
         file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
-        for variant in match_case(file, NAME):
+        for variant in networks.match_case(file, NAME):
             _verify_sampling(file, variant, scene, inputs)
 
 
@@ -227,9 +208,9 @@ def _compare(loop: Loop) -> None:
 def _verify_agents(file: Source, scenes: Scenes) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
     match_meta(file, NAME, {"frame_columns": _TRACK_COLUMNS})
-    if f"in.frame{SAMPLES:02d}" in file:
+    if f"in.frame{kernels.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
-    made = agent_features(_tracks(file), file.take("in.anchor", 3))
+    made = builder.agent_features(_tracks(file), file.take("in.anchor", 3))
     ours = dict(zip(("agents", "static", "selected"), made, strict=True))
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
@@ -269,20 +250,22 @@ def _verify_lanes(file: Source, scenes: Scenes) -> None:
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
     limits = np.where(file["in.has_limit"], file["in.limit"].astype(np.float64), np.nan)
     blocks = np.array([index[name] for name in owner], np.int64)
-    resampled = resample_lanes(lines, left, right)
-    lanes = LaneLines(resampled, line_bounds(lines), limits, blocks)
+    resampled = kernels.resample_lanes(lines, left, right)
+    lanes = kernels.LaneLines(resampled, kernels.line_bounds(lines), limits, blocks)
     # the lanes come in the order of the distance to their areas, which are not there
     point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
-    edges = nearest_lanes(np.arange(len(owner)), point, lines, anchor[0], anchor[1], LANES)
+    edges = kernels.nearest_lanes(
+        np.arange(len(owner)), point, lines, anchor[0], anchor[1], builder.LANES
+    )
     lights = file.take("in.light", len(owner), 4)
     once = np.ones(len(owner), np.int64)
     file.report.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
-    rows = lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, LANES)
+    rows = builder.lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, builder.LANES)
     route = [index.get(name, -1) for name in file["in.route"].tolist()]
-    on_route = lanes_on_route(lanes.blocks[edges], route)
+    on_route = builder.lanes_on_route(lanes.blocks[edges], route)
     ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), rows, strict=True))
     for name, array in list(ours.items()):
-        ours[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+        ours[f"route_{name}"] = np.zeros((builder.ROUTE_LANES, *array.shape[1:]), array.dtype)
         ours[f"route_{name}"][: len(on_route)] = array[on_route]
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
@@ -298,7 +281,7 @@ _SIZES = {"parameters": "", "parameters_encoder": "encoder"}
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(verify_manifest, NAME, _SIZES, _manifest),
+    "state_dict.json": partial(networks.verify_manifest, NAME, _SIZES, _manifest),
     "forward_*.npz": _verify_forward,
     "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare, (*PLANS, "ego_prediction")),
     "overflow_agents_*.npz": _verify_agents,

@@ -49,22 +49,30 @@ def _verify_brake(file: Source, scenes: Scenes) -> None:
 
 def _compare(loop: Loop) -> None:
     """Compare everything stored of one iteration."""
-    sight, choice = loop.planner.sight, loop.planner.choice
+    from shiftsim.planners.learned.pluto.network import Inputs
+
+    sight, choice, report = loop.planner.sight, loop.planner.choice, loop.file.report
     is_full = "agent_tokens" in loop.stored  # one of the iterations stored in full
     if is_full:
         _compare_sight(loop, sight)
-        _compare_network(loop)
+        batch = Inputs(*stack([loop.features], "cpu"))
+        plantf.compare_network(loop, batch, "trajectory", "candidate_trajectories")
     if choice is None:
-        loop.file.report.fail(f"{loop.name} reference lines", loop.where, "none found")
+        report.fail(f"{loop.name} reference lines", loop.where, "none found")
         return
     _compare_choice(loop, choice)
     if is_full:
         _compare_from_stored(loop, sight)
-    best = int(loop.row["best_index"])
-    if not _is_near_tie(loop, choice.best, best):
-        loop.compare("best proposal", choice.best, best)
-        loop.compare("emergency brake", choice.braked, bool(loop.row["emergency_brake"]))
-        loop.compare_plan(MOTION)
+    stored, best = loop.stored.below("post/"), int(loop.row["best_index"])
+    total = stored["rule"] + 0.3 * stored["lscore"]
+    first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
+    if choice.best != best and first - second <= NEAR_TIE:
+        what = f"proposal {choice.best} instead of {best}, scores {first:.6f} and {second:.6f}"
+        report.note(f"{loop.name} {loop.where}: near-tie, {what}")
+        return
+    loop.compare("best proposal", choice.best, best)
+    loop.compare("emergency brake", choice.braked, bool(loop.row["emergency_brake"]))
+    loop.compare_plan(MOTION)
 
 
 def _compare_sight(loop: Loop, sight: Sight) -> None:
@@ -102,17 +110,6 @@ def _by_place(positions: Any) -> Any:
     return np.lexsort(np.rint(np.asarray(positions, np.float64) * 100.0).T[::-1])
 
 
-def _compare_network(loop: Loop) -> None:
-    from shiftsim.planners.learned.pluto.network import Inputs
-
-    batch = Inputs(*stack([loop.features], "cpu"))
-    made = plantf.network_outputs(loop.name, loop.planner.network, batch)
-    left_out = ("trajectory", "candidate_trajectories")  # too large, not stored
-    ours = {name: value[0] for name, value in made.items() if name not in left_out}
-    stored = loop.stored.below("net/")
-    plantf.compare_outputs(stored, loop.where, loop.name, loop.variant, ours)
-
-
 def _compare_choice(loop: Loop, choice: Choice) -> None:
     """Compare proposals and scores that were made from the log on."""
     stored, scores = loop.stored.below("post/"), choice.scores
@@ -148,18 +145,6 @@ def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     scores = scoring.score(proposals, stored["lscore"], ego, world, place, PACIFICA)
     ours = {name: getattr(scores, field) for name, (field, _) in SCORES.items()}
     stored.match(loop.where, ours, EXACT, quantity=f"{loop.name} stored proposals'")
-
-
-def _is_near_tie(loop: Loop, ours: int, theirs: int) -> bool:
-    """Whether another proposal was chosen in a near-tie, which is listed."""
-    stored = loop.stored.below("post/")
-    total = stored["rule"] + 0.3 * stored["lscore"]
-    first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
-    if ours == theirs or first - second > NEAR_TIE:
-        return False
-    what = f"proposal {ours} instead of {theirs}, scores {first:.6f} and {second:.6f}"
-    loop.file.report.note(f"{loop.name} {loop.where}: near-tie, {what}")
-    return True
 
 
 _BUILDER = {"radius": RADIUS, "max_agents": MAX_AGENTS, "build_reference_line": True}
