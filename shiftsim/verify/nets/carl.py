@@ -10,8 +10,8 @@ from shiftsim.planners.learned.carl.view import CHANNELS, in_picture, picture_fr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
+from shiftsim.verify.nets import networks
 from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, match_case, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
@@ -39,14 +39,15 @@ _RECORDED = ("measurements", "action", "alpha", "beta", "value")
 
 
 def _manifest(network: Any) -> dict[str, Any]:
-    return {"checkpoint": None, "hyper": network.RELEASED, "drive_overrides": _DRIVE}
+    prose = dict.fromkeys(("file", "container", "prefix", "loading", "config"), networks.PROSE)
+    return {"checkpoint": prose, "hyper": network.RELEASED, "drive_overrides": _DRIVE}
 
 
 def _verify_forward(file: Source, scenes: Scenes) -> None:
     """The network on stored inputs, with each variant of the weights."""
     names = ("bev_semantics", "measurements", "value_measurements")
     inputs = [file[f"in.{name}"][None] for name in names]
-    for variant in match_case(file, NAME):
+    for variant in networks.match_case(file, NAME):
         parts, heads = _outputs(variant, *inputs)
         for start, ours in (("out.", parts), (f"out.{variant}.", heads)):
             file.below(start).match(f"{file.name} {variant}", ours, BOUNDS, quantity=NAME)
@@ -59,7 +60,7 @@ def _outputs(
     import torch
     from torch.distributions import Beta
 
-    network = make_network(NAME, variant)
+    network = networks.make_network(NAME, variant)
     see, feel, tell = (torch.from_numpy(array) for array in (pictures, measured, critic))
     with torch.inference_mode():
         encoder = network.features_extractor
@@ -74,7 +75,7 @@ def _outputs(
 
 
 def _verify_decoding(file: Source, scenes: Scenes) -> None:
-    match_meta(file, NAME, {"columns": list(FILE_COLUMNS), "dt": 0.1})
+    networks.match_meta(file, NAME, {"columns": list(FILE_COLUMNS), "dt": 0.1})
     states = file.take("in.state", -1, NUM_STATE)
     after, commands = np.empty(states.shape), np.empty((len(states), 2))
     for row, (ego, action) in enumerate(zip(states, file["in.action"], strict=True)):
@@ -137,7 +138,7 @@ def _drawn(planner: Carl, road: VectorMap, seen: Observation) -> dict[str, list[
 
 
 FILES = {
-    "state_dict.json": partial(verify_manifest, NAME, COUNTS, _manifest),
+    "state_dict.json": partial(networks.verify_manifest, NAME, COUNTS, _manifest),
     "forward_*.npz": _verify_forward,
     "action_decode.npz": _verify_decoding,
     "closed_loop_*.npz": partial(verify_loop, Carl, _compare, ("command", *_RECORDED)),

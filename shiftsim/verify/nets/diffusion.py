@@ -16,7 +16,7 @@ from shiftsim.planners.learned.deterministic import keyed_normals
 from shiftsim.planners.learned.diffusion import features as builder
 from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
-from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import networks
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
@@ -65,14 +65,10 @@ def start_noise(key: str) -> np.ndarray:
 class KeyedPlanner(DiffusionPlanner):
     """The planner with the start noise of the reference files."""
 
-    def reset(self, scene: SceneInfo) -> None:
-        """Prepare for a scenario."""
-        super().reset(scene)
-        self._token = scene.token
-
     def features(self, observation: Observation) -> builder.Features:
         """What the network reads."""
-        noise = start_noise(f"{self._token}:{observation.iteration}")
+        _, token = self._key
+        noise = start_noise(f"{token}:{observation.iteration}")
         return replace(super().features(observation), noise=noise)
 
 

@@ -53,8 +53,8 @@ def verify_manifest(
 ) -> None:
     """Compare the manifest `state_dict.json` of a network: names, shapes, types, rules and weights.
 
-    Fields that count, count the trainable weights if they say so. Of the others, a pattern stands
-    for every text that it matches, and None for what need not be compared.
+    Fields that count, count the trainable weights if they say so. In the others a pattern stands
+    for every text that it matches.
     """
     report, module = manifest.report, network_module(planner)
     network = module.build_network(None)
@@ -87,16 +87,11 @@ def verify_manifest(
         for name in check:
             first = weights[name].ravel()[: len(check[name])].astype(float)
             report.compare(f"{planner} selfcheck", name, first, check[name])
+    ours = {name: _filled(value, manifest[name]) for name, value in make_others(module).items()}
     for field, pattern in counts.items():
         counted = parameters if "trainable" in field else built
-        size = sum(built[name].size for name in counted if re.match(pattern, name))
-        manifest.match(manifest.name, {field: size}, quantity=f"{planner} manifest")
-    for field, value in make_others(module).items():
-        if value is None:
-            manifest.note("description", field)
-        else:
-            ours = {field: _filled(value, manifest[field])}
-            manifest.match(manifest.name, ours, quantity=f"{planner} manifest")
+        ours[field] = sum(built[name].size for name in counted if re.match(pattern, name))
+    manifest.match(manifest.name, ours, quantity=f"{planner} manifest")
     manifest.used.add("planner")
 
 

@@ -98,9 +98,9 @@ def compare_features(
     }
     loop.match(names)
     # samples that are absent hold the origin of the map, seen from the ego
-    cos, sin = np.cos(ego[2]), np.sin(ego[2])
+    cos, sin, there = np.cos(ego[2]), np.sin(ego[2]), agents.valid
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
-    there, absent = agents.valid, {"position": origin, "heading": -ego[2]}
+    absent = {"position": origin, "heading": -ego[2]}
     for name in HISTORIES:
         ours, theirs = getattr(agents, name), loop.stored[f"feature/agent.{name}"]
         loop.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)

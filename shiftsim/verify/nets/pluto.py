@@ -20,17 +20,16 @@ from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
 EXACT = 1e-8  # what follows from stored candidates and predictions alone
 MOTION = 1e-2  # m/s, m/s^2: derivatives of poses 0.1 s apart
-SCORE = 1e-4
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
-SCORES = {  # stored array → field of `Scores`, tolerance where proposals are made from the log on
-    "rollout": ("driven", POSITION),
-    "progress": ("progress", POSITION),
-    "rule": ("rule", SCORE),
-    "weighted": ("terms", SCORE),
-    "multi": ("factors", 0.0),
-    "fault_t": ("fault_times", EXACT),
-    "footprints": ("flags", 0.0),
-    "speed_limit": ("speed_limits", 0.0),
+SCORES = (  # stored arrays, in the order of the fields of `Scores` behind the total
+    *("rule", "multi", "weighted", "progress", "fault_t", "rollout", "footprints", "speed_limit"),
+)
+POSES = np.array([POSITION, POSITION, loops.HEADING])
+BOUNDS: dict[str, Any] = {  # where proposals are made from the log on
+    **{"cand": POSES, "agents_pred": POSES, "progress": POSITION},
+    "rollout": np.append(POSES, [POSITION] * (NUM_STATE - len(POSES))),
+    **dict.fromkeys(("lscore", "rule", "weighted"), 1e-4),
+    "fault_t": EXACT,
 }
 
 
@@ -112,19 +111,16 @@ def _by_place(positions: Any) -> Any:
 
 def _compare_choice(loop: Loop, choice: Choice) -> None:
     """Compare proposals and scores that were made from the log on."""
-    stored, scores = loop.stored.below("post/"), choice.scores
+    stored = loop.stored.below("post/")
     ours = {
-        "cand": (choice.poses, POSITION),
-        "lscore": (choice.learned, SCORE),
-        "agents_pred": (choice.agents.poses, POSITION),
-        "agents_vel": (choice.agents.speeds, OUTPUT[loop.variant]),
-        **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
+        "cand": choice.poses,
+        "lscore": choice.learned,
+        "agents_pred": choice.agents.poses,
+        "agents_vel": choice.agents.speeds,
+        **dict(zip(SCORES, choice.scores[1:], strict=True)),
     }
-    for name, (value, atol) in ours.items():
-        if name in stored:
-            loop.compare(name, value, stored[name], atol)
-            if name in ("cand", "rollout", "agents_pred"):
-                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], loops.HEADING)
+    ours = {name: value for name, value in ours.items() if name in stored}
+    loop.match(ours, {**BOUNDS, "agents_vel": OUTPUT[loop.variant]}, "post/")
     # what follows from the other stored scores
     parts = (stored["multi"], stored["weighted"], stored["progress"])
     progress, rule = scoring.aggregate(*parts)
@@ -143,7 +139,7 @@ def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     place = scoring.Place(sight.drivable, scenario.map.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
     scores = scoring.score(proposals, stored["lscore"], ego, world, place, PACIFICA)
-    ours = {name: getattr(scores, field) for name, (field, _) in SCORES.items()}
+    ours = dict(zip(SCORES, scores[1:], strict=True))
     stored.match(loop.where, ours, EXACT, quantity=f"{loop.name} stored proposals'")
 
 

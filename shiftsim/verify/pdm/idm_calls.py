@@ -7,7 +7,7 @@ import numpy as np
 from shiftsim.errors import DataError
 from shiftsim.geometry.frames import wrap_angle
 from shiftsim.planners.idm.planner import STEP_US, STEPS, Idm
-from shiftsim.sim.planner import Observation, observe_log, scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.verify.files import TOLERANCE, Source
 from shiftsim.verify.pdm.routes import verify_cases
 from shiftsim.verify.worlds import object_columns
@@ -23,8 +23,24 @@ def _compare(call: Source, where: str, scenario: Scenario) -> None:
     planner.reset(scene_info(scenario))
     planner.plan(observe_log(scenario, first, samples=1))
     seen = observe_log(scenario, iteration, samples=1)
-    _compare_inputs(call, where, scenario, seen)
     centers, speeds = planner.roll_out(seen)
+    # what the call recorded of its inputs is also in the log
+    tracks, lights = seen.tracks, seen.traffic_lights.items()
+    inputs = {
+        "route": list(scenario.route),
+        "time_us": seen.time_us,
+        "ego_center": seen.ego.center,
+        "ego_rear_velocity": seen.ego.values[[VX, VY]],
+        "red_connectors": sorted(name for name, status in lights if status == LightStatus.RED),
+    }
+    call.match(where, inputs, TOLERANCE, quantity="IDM input")
+    index = sorted(np.flatnonzero(tracks.valid[0]).tolist(), key=tracks.tokens.__getitem__)
+    columns = object_columns(tracks, np.zeros(len(index), np.int64), np.array(index, np.int64))
+    columns["token"], columns["type"] = columns["track_token"], map(str.lower, columns["type"])
+    things = sorted(call.each("objects"), key=lambda thing: str(thing["token"]))
+    for name in ("token", "type", "x", "y", "heading", "length", "width", "vx", "vy"):
+        theirs, mine = [thing[name] for thing in things], list(columns[name])
+        call.report.compare(f"IDM input {name}", where, mine, theirs, atol=TOLERANCE)
     route, path = planner.route_plan, planner.path
     assert route is not None
     assert path is not None
@@ -43,26 +59,6 @@ def _compare(call: Source, where: str, scenario: Scenario) -> None:
     call.report.compare("IDM plan time", where, times, rows[:, 0].astype(np.int64))
     plan = np.column_stack([centers, speeds])
     call.report.compare("IDM plan", where, plan, rows[:, 1:], atol=TOLERANCE)
-
-
-def _compare_inputs(call: Source, where: str, scenario: Scenario, seen: Observation) -> None:
-    """What the call recorded of its inputs is also in the log."""
-    tracks, lights = seen.tracks, seen.traffic_lights.items()
-    ours = {
-        "route": list(scenario.route),
-        "time_us": seen.time_us,
-        "ego_center": seen.ego.center,
-        "ego_rear_velocity": seen.ego.values[[VX, VY]],
-        "red_connectors": sorted(name for name, status in lights if status == LightStatus.RED),
-    }
-    call.match(where, ours, TOLERANCE, quantity="IDM input")
-    index = sorted(np.flatnonzero(tracks.valid[0]).tolist(), key=tracks.tokens.__getitem__)
-    columns = object_columns(tracks, np.zeros(len(index), np.int64), np.array(index, np.int64))
-    columns["token"], columns["type"] = columns["track_token"], map(str.lower, columns["type"])
-    things = sorted(call.each("objects"), key=lambda thing: str(thing["token"]))
-    for name in ("token", "type", "x", "y", "heading", "length", "width", "vx", "vy"):
-        theirs, mine = [thing[name] for thing in things], list(columns[name])
-        call.report.compare(f"IDM input {name}", where, mine, theirs, atol=TOLERANCE)
 
 
 verify_idm_calls = partial(verify_cases, _compare)

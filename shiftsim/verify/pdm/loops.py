@@ -13,7 +13,7 @@ from shiftsim.sim.planner import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation
-from shiftsim.verify.pdm.steps import STEP_TOLERANCE, Planned, compare_scores, step_arrays
+from shiftsim.verify.pdm.steps import STEP_TOLERANCE, compare_scores, step_arrays
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
@@ -24,14 +24,8 @@ _TABLES = (
     *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects", "ego"),
     *("steps", "proposals"),
 )
-_DRIVEN = {  # column of proposals.parquet → index in a state row
-    "sim_x": state.X,
-    "sim_y": state.Y,
-    "sim_heading": state.HEADING,
-    "sim_vx": state.VX,
-    "sim_ax": state.AX,
-    "sim_steering": state.STEERING,
-}
+_DRIVEN = ("sim_x", "sim_y", "sim_heading", "sim_vx", "sim_ax", "sim_steering")
+_ENDS = [state.X, state.Y, state.HEADING, state.VX, state.AX, state.STEERING]  # likewise
 
 
 def verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None = None) -> None:
@@ -104,10 +98,10 @@ def _compare_calls(
         }
         row.match(at, ours, quantity="PDM step")
         row.match(at, {"best_score": theirs["score"].max()}, TOLERANCE, quantity="PDM")
-        ends = {column: step.driven.states[:, -1, number] for column, number in _DRIVEN.items()}
+        ends = dict(zip(_DRIVEN, step.driven.states[:, -1, _ENDS].T, strict=True))
         theirs.match(at, ends, STEP_TOLERANCE, quantity="PDM")
-        planned = Planned(seen.ego[index], sight.tokens, sight.forecast, sight.place, step)
-        if compare_scores(at, planned, theirs, (int(row["best"]), bool(row["braked"]))):
+        choice = (int(row["best"]), bool(row["braked"]))
+        if compare_scores(at, seen.ego[index], sight, step, theirs, choice):
             file.report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
         if f"proposals_{index}" in file:
             ids = [*road.edges.ids, *road.car_parks.ids]

@@ -1,7 +1,7 @@
 """Planning steps of PDM-Closed: those recorded with all their inputs, and how any is compared."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm import forecast as around
 from shiftsim.planners.pdm.parameters import DEFAULT
+from shiftsim.planners.pdm.planner import Seen
 from shiftsim.planners.pdm.rollout import Scene
 from shiftsim.planners.pdm.route import offset_poses
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
@@ -35,16 +36,6 @@ SCORE_COLUMNS = (  # of the reference, in the order of the fields of `Scores`
 SCORE_TOLERANCES = {"score": TOLERANCE, "progress": TOLERANCE, "progress_raw": STEP_TOLERANCE}
 
 
-class Planned(NamedTuple):
-    """One step that was planned: from which ego state, what it saw, and what it came to."""
-
-    ego: FloatArray
-    tokens: list[str]
-    forecast: around.Forecast
-    place: Place
-    step: Step
-
-
 def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
     """Plan one recorded step again and compare everything.
 
@@ -53,12 +44,13 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     """
     inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
-    planned, collided = _plan(inputs)
-    step, scores = planned.step, planned.step.scores
+    ego = np.array(inputs["ego_state"], np.float64)
+    seen, collided, step = _plan(inputs, ego)
+    scores = step.scores
     ours = {
-        "map_tokens": planned.tokens,
+        "map_tokens": seen.tokens,
         "collided_ids": collided,
-        "map_boxes": planned.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]],
+        "map_boxes": seen.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]],
         "trajectory_time_us": int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1),
         **step_arrays(step),
     }
@@ -66,7 +58,8 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     rows = [file["scores"], *file.take("multi", 3, -1), *file.take("weighted", 3, -1)]
     rows += [file[name] for name in SCORE_COLUMNS[7:]]
     theirs = Source("PDM", "score", dict(zip(SCORE_COLUMNS, rows, strict=True)), report)
-    if compare_scores(where, planned, theirs, (int(file["best"]), bool(file["braked"]))):
+    choice = (int(file["best"]), bool(file["braked"]))
+    if compare_scores(where, ego, seen, step, theirs, choice):
         file.match(where, {"trajectory_rear": step.poses}, STEP_TOLERANCE)
     file.note("compared where the same proposal is chosen", "trajectory_rear")
     inputs.finish()
@@ -84,9 +77,8 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     }
 
 
-def _plan(inputs: Source) -> tuple[Planned, list[str]]:
-    """The step, and what the ego touches at its start."""
-    ego = np.array(inputs["ego_state"], np.float64)
+def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
+    """What is seen, what of it the ego touches at the start, and the step."""
     center = center_poses(ego[None, :3])[0]
     things, parts = inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
@@ -114,7 +106,7 @@ def _plan(inputs: Source) -> tuple[Planned, list[str]]:
     targets = limit * np.array(DEFAULT.speed_fractions)
     scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
     step = plan_step(ego, targets, scene, place, PACIFICA, DEFAULT)
-    return Planned(ego, tokens, forecast, place, step), [tokens[i] for i in hit]
+    return Seen(forecast, tokens, place, -1), [tokens[i] for i in hit], step
 
 
 def step_arrays(step: Step) -> dict[str, np.ndarray]:
@@ -129,38 +121,41 @@ def step_arrays(step: Step) -> dict[str, np.ndarray]:
     return {**rolled, "simulated": step.driven.states, "ego_areas": step.scores.flags}
 
 
-def compare_scores(where: str, planned: Planned, theirs: Source, choice: tuple[int, bool]) -> bool:
-    """Compare sub-scores, scores, choice and brake decision of one step.
-
-    `choice` is the number of the recorded best proposal, and whether the emergency brake came
-    instead. Returns whether both chose the same plan, so that plans can be compared.
-    """
-    ours, report = _settled(where, planned, theirs), theirs.report
+def compare_scores(
+    where: str,
+    ego: FloatArray,  # (11,) ego state
+    seen: Seen,
+    step: Step,
+    theirs: Source,
+    choice: tuple[int, bool],  # number of the best proposal, whether the emergency brake came
+) -> bool:
+    """Compare scores, choice and brake decision of a step; whether both chose the same plan."""
+    ours, report = _settled(where, seen, step, theirs), theirs.report
     values = dict(zip(SCORE_COLUMNS, ours, strict=False))  # not the flags behind the scores
     theirs.match(where, values, SCORE_TOLERANCES, quantity="PDM")
     best = int(np.argmax(ours.total))
     report.compare("PDM choice", where, best, choice[0])
-    is_slow = np.hypot(planned.ego[VX], planned.ego[VY]) <= DEFAULT.brake_speed
+    is_slow = np.hypot(ego[VX], ego[VY]) <= DEFAULT.brake_speed
     braked = bool(is_slow and DT * ours.collision_index[best] <= DEFAULT.brake_time)
     report.compare("PDM brake", where, braked, choice[1])
-    return (planned.step.best, planned.step.braked) == choice
+    return (step.best, step.braked) == choice
 
 
-def _settled(where: str, planned: Planned, theirs: Source) -> Scores:
+def _settled(where: str, seen: Seen, step: Step, theirs: Source) -> Scores:
     """Our scores, with those times to collision of theirs that hang on an unstable bearing.
 
     The bearing is an arccos of a number that may round beyond 1 where an object is exactly ahead or
     behind; then it is overlooked. Either outcome is accepted there, and named.
     """
-    ours, given, index = planned.step.scores, theirs["ttc"], theirs["ttc_idx"]
-    states, others = planned.step.driven.states, planned.forecast.others
+    ours, given, index = step.scores, theirs["ttc"], theirs["ttc_idx"]
+    states, others = step.driven.states, seen.forecast.others
     exempt = (ours.ttc != given) | (ours.ttc_index != index)
     if exempt.any():
         counted = others._replace(centroids=others.centroids + ASIDE)
         overlooked = others._replace(ignored=others.ignored | _in_line(states, others))
         outcomes = [
-            score(states, planned.place, seen, ego_box(PACIFICA), DEFAULT).ttc_index
-            for seen in (counted, overlooked)
+            score(states, seen.place, boxes, ego_box(PACIFICA), DEFAULT).ttc_index
+            for boxes in (counted, overlooked)
         ]
         exempt &= (index == outcomes).any(axis=0) & (np.isfinite(index) == (given < 1.0))
     for row in np.flatnonzero(exempt).tolist():
