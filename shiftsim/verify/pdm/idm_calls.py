@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.planners.idm.planner import STEP_US, STEPS, Idm
+from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.planners.idm import STEP_US, STEPS, Idm
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.verify.files import TOLERANCE, Source
 from shiftsim.verify.pdm.routes import verify_cases
