@@ -27,6 +27,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from hypothesis import Phase, settings
 from mutations import Mutant, mutants_of, names_of, sample
 
 TESTS = Path(__file__).resolve().parent
@@ -216,7 +217,7 @@ class FirstFailure:
 def run_tests(tests: list[str], quiet: bool = True) -> str:
     """The first test that fails, or nothing."""
     failure = FirstFailure()
-    options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not thorough and not long"]
+    options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", "not thorough and not long"]
     code = pytest.main([*options, *tests], plugins=[failure])
     if code not in (0, 1):
         return f"pytest ended with {int(code)}"
@@ -246,6 +247,12 @@ class Runner:
     def __init__(self, workers: int) -> None:
         self.workers = workers
         self.running: dict[int, tuple[str, int, float]] = {}
+        # looking for the smallest example that fails would take minutes without compiled kernels
+        phases = (Phase.explicit, Phase.generate)
+        settings.register_profile(
+            "mutants", max_examples=25, deadline=None, derandomize=True, phases=phases
+        )
+        os.environ["HYPOTHESIS_PROFILE"] = "mutants"
         files = [test for module in modules() for test in tests_of(module)]
         if failed := run_tests(list(dict.fromkeys(files))):
             raise SystemExit(f"fails without any change: {failed}")
