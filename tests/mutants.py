@@ -306,7 +306,7 @@ def equal_mutants() -> set[str]:
 
 
 def main() -> None:
-    """Run a sample and print what survived; kept results are not made again, survivors are."""
+    """Run a sample and print what survived; what was killed is not run again, survivors are."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -346,11 +346,11 @@ def main() -> None:
         if options.kept:
             with options.kept.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-    report(rows, chosen)
+    raise SystemExit(report(rows, chosen))
 
 
-def report(rows: dict[str, dict[str, Any]], chosen: list[Mutant]) -> None:
-    """Print the rate and the survivors."""
+def report(rows: dict[str, dict[str, Any]], chosen: list[Mutant]) -> int:
+    """Print the rate and the survivors; 1 if one of them is not listed as equal."""
     found = [rows[mutant.name] for mutant in chosen if mutant.name in rows]
     survived = [row["mutant"] for row in found if row["result"] == "survived"]
     known = equal_mutants()
@@ -358,6 +358,7 @@ def report(rows: dict[str, dict[str, Any]], chosen: list[Mutant]) -> None:
         print(f"{'equal   ' if name in known else 'SURVIVED'} {name}")
     killed = len(found) - len(survived)
     print(f"{killed} of {len(found)} killed ({killed / max(len(found), 1):.1%}) of {len(chosen)}")
+    return int(not known.issuperset(survived))
 
 
 if __name__ == "__main__":

@@ -55,12 +55,21 @@ class Mutant:
     module: str
     owner: str  # the top-level name that it belongs to
     change: str  # text before -> text after
-    statement: ast.stmt = field(compare=False, repr=False)  # the changed top-level statement
+    original: ast.stmt = field(compare=False, repr=False)  # the top-level statement
+    number: int = field(compare=False, repr=False)  # which of its changes
 
     @property
     def name(self) -> str:
         """What identifies it."""
         return f"{self.module.removeprefix('shiftsim.')} {self.owner}: {self.change}"
+
+    @property
+    def statement(self) -> ast.stmt:
+        """A changed copy of the top-level statement."""
+        for number, _ in enumerate(_changes(self.original)):
+            if number == self.number:  # the original is changed until the next one is asked for
+                copy = deepcopy(self.original)
+        return ast.fix_missing_locations(copy)
 
 
 def mutants_of(module: str, source: str) -> list[Mutant]:
@@ -70,12 +79,12 @@ def mutants_of(module: str, source: str) -> list[Mutant]:
         owner = ", ".join(names_of(statement))
         if not owner or owner == "__all__":
             continue
-        for before, after, changed in _changes(statement):
+        for number, (before, after) in enumerate(_changes(statement)):
             change = f"`{before}` -> `{after}`"
             seen[owner, change] += 1
             if seen[owner, change] > 1:
                 change += f" ({seen[owner, change]})"
-            found.append(Mutant(module, owner, change, changed))
+            found.append(Mutant(module, owner, change, statement, number))
     return found
 
 
@@ -95,32 +104,30 @@ def names_of(statement: ast.stmt) -> list[str]:
     return []
 
 
-def _changes(statement: ast.stmt) -> Iterator[tuple[str, str, ast.stmt]]:
-    """Text before, text after, and a changed copy of the statement."""
-    for path in _places(statement, ()):
+def _changes(statement: ast.stmt) -> Iterator[tuple[str, str]]:
+    """Text before and after every change; the statement is changed until the next is asked for."""
+    for path in list(_places(statement, ())):
         parent, name, index = path[-1]
         node = _get(*path[-1])
-        around = _context(path)
+        around, before = _context(path)
         for new in _replacements(node, parent, name):
-            before = _text(_get(*around))
             _put(parent, name, index, ast.copy_location(new, node))
-            after, changed = _text(_get(*around)), deepcopy(statement)
+            if before != (after := _text(_get(*around))):
+                yield before, after
             _put(parent, name, index, node)
-            if before != after:
-                yield before, after, ast.fix_missing_locations(changed)
 
 
 Place = tuple[ast.AST, str, int | None]  # a node, one of its fields, and the place in a list
 
 
-def _context(path: tuple[Place, ...]) -> Place:
+def _context(path: tuple[Place, ...]) -> tuple[Place, str]:
     """The largest piece of text around the end of a path that still fits a line."""
     for place in path:
         node = _get(*place)
-        simple = isinstance(node, ast.expr | ast.stmt) and not hasattr(node, "body")
-        if (simple or isinstance(node, ast.IfExp)) and len(_text(node)) <= 80:
-            return place
-    return path[-1]
+        is_long = hasattr(node, "body") and not isinstance(node, ast.IfExp)
+        if isinstance(node, ast.expr | ast.stmt) and not is_long and len(_text(node)) <= 80:
+            return place, _text(node)
+    return path[-1], _text(_get(*path[-1]))
 
 
 def _text(node: ast.AST) -> str:
