@@ -217,7 +217,16 @@ class FirstFailure:
 def run_tests(tests: list[str], quiet: bool = True) -> str:
     """The first test that fails, or nothing."""
     failure = FirstFailure()
-    options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", "not thorough and not long"]
+    options = [
+        "-x",
+        "-q",
+        "--tb=no",
+        "--disable-warnings",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not thorough and not long",
+    ]
     code = pytest.main([*options, *tests], plugins=[failure])
     if code not in (0, 1):
         return f"pytest ended with {int(code)}"

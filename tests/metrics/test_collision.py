@@ -8,7 +8,7 @@ from rollouts import boxes, states_of, straight_poses
 from strategies import seeds
 from worlds import join_tracks
 
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
 from shiftsim.metrics.collision import COLLISION_TYPES, Contacts, classify, collide, judge, set_box
 from shiftsim.metrics.result import Collision, Violation
@@ -139,6 +139,18 @@ def test_up_to_five_centimetres_per_second_count_as_standing(
         collision.flat_ego(states, PACIFICA), collision.flat_tracks(ahead)
     )
     assert COLLISION_TYPES[contacts.types[0]] == kind
+
+
+def test_a_track_at_exactly_the_angle_is_not_behind() -> None:
+    x, y = 8.0 * np.cos(BEHIND), 8.0 * np.sin(BEHIND)  # the bearing is BEHIND to the last bit
+    states = states_of(np.zeros((4, 3)), 3.0)
+    for nearer, kind in ((0.0, "active_lateral"), (-1e-9, "active_rear")):
+        beside = boxes(4, (x, y + nearer, 0.0), size=(12.0, 6.0))
+        beside.velocities[..., 0] = 3.0
+        contacts = collision.first_contacts(
+            collision.flat_ego(states, PACIFICA), collision.flat_tracks(beside)
+        )
+        assert COLLISION_TYPES[contacts.types[0]] == kind
 
 
 def test_contacts_are_judged_by_type_and_by_the_lanes_at_their_own_sample() -> None:

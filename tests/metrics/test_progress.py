@@ -91,8 +91,11 @@ def slow_in_lane(lines: list, route: EdgeLists, points: np.ndarray) -> list[floa
 def test_progress_in_the_lane_is_that_of_a_slow_version(seed: int) -> None:
     rng = np.random.default_rng(seed)
     _, lines = random_chain(rng, 3)
-    points = np.c_[np.cumsum(rng.uniform(-6.0, 9.0, 30)), rng.uniform(-4.0, 4.0, (30, 2))]
+    # at an arc length of 0 nothing is known: most points must lie beyond the start of the lines
+    x = 5.0 + np.cumsum(rng.uniform(-3.0, 6.0, 30))
+    points = np.c_[x, rng.uniform(-4.0, 4.0, (30, 2))]
     edges = np.repeat(rng.integers(0, 3, 10), 3)
+    edges[:9] = 0
     route = EdgeLists(edges[:, None], (rng.random(30) < 0.8).astype(np.int64))
     road = SimpleNamespace(baselines=make_polylines(lines))
     out = progress.lane_progress(road, route, points)
@@ -124,6 +127,8 @@ BLOCKS = SimpleNamespace(
         ([[0, 2], [2], [3]], [0, 3]),
         ([[2, 3], [3, 4], [4], [0]], [2, 0]),
         ([[2, 3], [2, 0], [3], [1]], [2, 1]),  # as does the third with the first
+        ([[2], [4, 3]], [2]),  # the first edge of a list decides
+        ([[0], [2], [0]], [0, 2, 0]),
         ([[0], [2], [5]], [0, 2, 5]),  # back in the first block
         ([[], []], []),
     ],

@@ -109,7 +109,7 @@ def random_walk(rng: np.random.Generator, samples: int) -> np.ndarray:
     y = np.clip(rng.uniform(1.0, 15.0) + np.cumsum(rng.normal(0.0, 1.0, samples)), -3.0, 19.0)
     jumps = rng.random(samples) < 0.1
     y[jumps] = rng.uniform(-5.0, 21.0, int(jumps.sum()))
-    return np.c_[x, y]
+    return np.c_[x, y][:: rng.choice([1, -1])]
 
 
 @given(seeds)

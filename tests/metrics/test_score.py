@@ -23,6 +23,10 @@ def test_the_score_is_the_product_times_the_weighted_mean() -> None:
     assert closed_loop_score(own) == pytest.approx(0.225 * (16 * mean + 0.5) / 17, abs=1e-12)
 
 
+def test_one_metric_of_weight_one_is_the_score() -> None:
+    assert closed_loop_score({"own": 0.5}) == 0.5
+
+
 def test_multipliers_alone_score_nothing() -> None:
     assert closed_loop_score(dict.fromkeys(MULTIPLIERS, 1.0)) == 0.0
 

@@ -113,6 +113,12 @@ def test_without_any_allowance_the_smallest_counts() -> None:
     assert part.row.score == pytest.approx(1.0 - 1e-5 / 1e-3, abs=1e-9)
 
 
+def test_a_rollout_without_duration_loses_nothing() -> None:
+    part = judge(np.array([3.0]), TIMES[:1], NUPLAN)
+    assert part.row.score == 1.0
+    assert part.row.violation is not None
+
+
 def test_no_violation_has_no_statistics_but_the_verdict() -> None:
     part = judge(np.zeros(11), TIMES, NUPLAN)
     assert part.row[:3] == (NAME, 1.0, 0.0)

@@ -11,7 +11,7 @@ from rollouts import boxes, states_of
 from strategies import seeds
 from worlds import join_tracks
 
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
 from shiftsim.metrics.result import Collision, Violation
 from shiftsim.metrics.thresholds import NUPLAN
@@ -140,6 +140,16 @@ def test_at_an_at_fault_collision_the_time_is_zero_and_the_partner_the_first_tha
     np.testing.assert_allclose(ttc.values[[2, 4]], 0.0)
     assert (ttc.values[[0, 1, 3]] > 1.0).all()
     assert judge(ttc, TIMES, NUPLAN).row.violation == Violation(2, int(TIMES[2]), "c", 0.0)
+
+
+def test_a_track_at_exactly_the_angle_is_not_behind() -> None:
+    x, y = 8.0 * np.cos(BEHIND), 8.0 * np.sin(BEHIND)  # the bearing is BEHIND to the last bit
+    states = states_of(np.zeros((5, 3)), 0.01)
+    for nearer, seen in ((0.0, True), (-1e-9, False)):
+        other = boxes(5, (x, y + nearer, -np.deg2rad(30.0)))
+        other.velocities[..., 0] = 9.0
+        ttc, _ = measured(states, other, np.zeros(5, np.bool_))
+        assert np.isfinite(ttc.values).all() == seen
 
 
 def test_static_objects_do_not_move() -> None:

@@ -121,6 +121,18 @@ def test_a_profile_has_its_values_at_its_times_and_ends(step_us, count, rng):
         assert lqr.profile_at(profile, NOW, step_us, NOW / 1e6 + offset) == value
 
 
+@given(st.integers(NOW, 2 * NOW), st.sampled_from([STEP_US, 33_333]))
+def test_values_at_sample_times_do_not_suffer_from_rounding(start_us, step_us):
+    # microseconds / 1e6 * 1e6 may fall below the number that it was
+    profile = np.array([3.0, -5.0, 11.0, 2.0, 29.0, -7.0] * 5)
+
+    for index in range(30):
+        seconds = (start_us + index * step_us) / 1e6
+        for at in (np.nextafter(seconds, 0.0), seconds, np.nextafter(seconds, np.inf)):
+            read = lqr.profile_at(profile, start_us, step_us, at)
+            assert read == pytest.approx(profile[index], abs=1e-3)
+
+
 def slow_rate(ref, speed, steering, accel, params):
     """The steering rate by matrices: the end of the horizon is linear in the rate."""
     dt = params.step_us / 1e6
@@ -199,6 +211,19 @@ def test_the_reference_is_read_from_plan_and_profiles(seed, count, params):
     ahead = (now - NOW) / 1e6 + params.step_us / 1e6 * np.arange(params.horizon + 1)
     assert ref.speed == pytest.approx(np.interp(ahead[-1], knots, speed), abs=1e-5)
     np.testing.assert_allclose(ref.curvature, np.interp(ahead[:-1], knots, curvature), atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "now"), [(2, NOW), (3, NOW - 1), (1, NOW)])
+def test_without_a_reference_nothing_is_commanded(count, now):
+    time_us, states = straight(10.0, count)
+    state = np.ones(NUM_STATE)
+
+    ref = lqr.reference(now, state, time_us, states, lqr.NUPLAN)
+
+    assert ref.status == (lqr.TOO_SHORT if count == 2 else lqr.NOT_COVERED)
+    assert ref[1:4] == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(ref.curvature, np.zeros(10))
+    assert lqr.track(now, state, time_us, states, lqr.NUPLAN) == (ref.status, 0.0, 0.0)
 
 
 def test_three_poses_are_enough_and_need_no_explanation():
