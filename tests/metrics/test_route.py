@@ -104,8 +104,9 @@ class Crossing:
 
 
 def random_walk(rng: np.random.Generator, samples: int) -> np.ndarray:
-    """Points (samples, 2) from the left to the right, with jumps now and then."""
-    x = np.sort(rng.uniform(5.0, 55.0, samples))
+    """Points (samples, 2) across the map, one way or the other, with jumps now and then."""
+    # also walks that begin or end on the connectors
+    x = np.sort(rng.uniform(rng.choice([5.0, 25.0]), rng.choice([35.0, 55.0]), samples))
     y = np.clip(rng.uniform(1.0, 15.0) + np.cumsum(rng.normal(0.0, 1.0, samples)), -3.0, 19.0)
     jumps = rng.random(samples) < 0.1
     y[jumps] = rng.uniform(-5.0, 21.0, int(jumps.sum()))

@@ -124,13 +124,14 @@ def test_a_profile_has_its_values_at_its_times_and_ends(step_us, count, rng):
 @given(st.integers(NOW, 2 * NOW), st.sampled_from([STEP_US, 33_333]))
 def test_values_at_sample_times_do_not_suffer_from_rounding(start_us, step_us):
     # microseconds / 1e6 * 1e6 may fall below the number that it was
-    profile = np.array([3.0, -5.0, 11.0, 2.0, 29.0, -7.0] * 5)
+    profile = np.tan(np.arange(30.0))  # no round numbers, which would hide the last bit
 
     for index in range(30):
         seconds = (start_us + index * step_us) / 1e6
         for at in (np.nextafter(seconds, 0.0), seconds, np.nextafter(seconds, np.inf)):
             read = lqr.profile_at(profile, start_us, step_us, at)
-            assert read == pytest.approx(profile[index], abs=1e-3)
+            assert read == pytest.approx(profile[index], rel=1e-3, abs=1e-2)
+        assert lqr.profile_at(profile, start_us, step_us, seconds) == profile[index]
 
 
 def slow_rate(ref, speed, steering, accel, params):
