@@ -12,7 +12,6 @@ that cannot be noticed.
 import argparse
 import ast
 import contextlib
-import hashlib
 import json
 import os
 import resource
@@ -336,21 +335,20 @@ def main() -> None:
         for line in options.kept.read_text().splitlines():
             row = json.loads(line)
             rows[row["mutant"]] = row
-    versions = {module: hashlib.md5(source_of(module).encode()).hexdigest() for module in modules()}
     runner = Runner(options.workers)
     if options.check:
         runner.check()
 
     def is_done(mutant: Mutant) -> bool:
         row = rows.get(mutant.name, {})
-        return row.get("result") == "killed" and row.get("version") == versions[mutant.module]
+        return row.get("result") == "killed" and row.get("version") == mutant.version
 
     # what was never run comes before what survived
     waiting = sorted((m for m in chosen if not is_done(m)), key=lambda m: m.name in rows)
     in_time = takewhile(lambda _: time.monotonic() - began < options.seconds, waiting)
-    module_of = {mutant.name: mutant.module for mutant in chosen}
+    versions = {mutant.name: mutant.version for mutant in chosen}
     for row in runner.run(in_time):
-        row["version"] = versions[module_of[row["mutant"]]]
+        row["version"] = versions[row["mutant"]]
         rows[row["mutant"]] = row
         if options.kept:
             with options.kept.open("a") as file:

@@ -64,6 +64,11 @@ class Mutant:
         return f"{self.module.removeprefix('shiftsim.')} {self.owner}: {self.change}"
 
     @property
+    def version(self) -> str:
+        """A digest of the statement as it is without the change."""
+        return hashlib.md5(ast.unparse(self.original).encode()).hexdigest()
+
+    @property
     def statement(self) -> ast.stmt:
         """A changed copy of the top-level statement."""
         for number, _ in enumerate(_changes(self.original)):

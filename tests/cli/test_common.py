@@ -6,8 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from shiftsim.cli import app
-from shiftsim.cli.common import with_settings
+from shiftsim.cli import app, with_settings
 from shiftsim.runs.config import RunConfig, make_config
 
 

@@ -11,8 +11,7 @@ from worlds import join_tracks
 from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
 from shiftsim.metrics.collision import COLLISION_TYPES, Contacts, classify, collide, judge, set_box
-from shiftsim.metrics.result import Collision, Violation
-from shiftsim.metrics.thresholds import NUPLAN, Thresholds
+from shiftsim.metrics.result import NUPLAN, Collision, Thresholds, Violation
 from shiftsim.world.state import PACIFICA, VY, AgentKind, Tracks
 
 TIMES = 1_000_000 + 100_000 * np.arange(12, dtype=np.int64)

@@ -12,8 +12,7 @@ from shiftsim.metrics.comfort import (
     judge,
     within_bounds,
 )
-from shiftsim.metrics.result import Violation
-from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN
+from shiftsim.metrics.result import DEEPPLAN, NUPLAN, Violation
 from shiftsim.world.state import AX, AY, HEADING, NUM_STATE, YAW_ACCEL, YAW_RATE
 
 

@@ -9,9 +9,8 @@ from hypothesis import given
 from strategies import seeds
 
 from shiftsim.metrics.drivable_area import DrivableArea, judge, measure
-from shiftsim.metrics.result import Violation
+from shiftsim.metrics.result import NUPLAN, Violation
 from shiftsim.metrics.route import EdgeLists
-from shiftsim.metrics.thresholds import NUPLAN
 from shiftsim.world.layers import Layer, make_layer
 
 TIMES = 1_000_000 + 100_000 * np.arange(3, dtype=np.int64)

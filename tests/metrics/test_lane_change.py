@@ -8,8 +8,8 @@ from hypothesis import given
 from strategies import seeds
 
 from shiftsim.metrics.lane_change import NAME, LaneChanges, judge, lane_changes
+from shiftsim.metrics.result import NUPLAN
 from shiftsim.metrics.route import EdgeLists
-from shiftsim.metrics.thresholds import NUPLAN
 from shiftsim.world.layers import make_lists
 
 EDGES = 6

@@ -11,9 +11,8 @@ from strategies import seeds
 from shiftsim.errors import MapError
 from shiftsim.metrics import progress
 from shiftsim.metrics.progress import Progress, expert_chain, judge, judge_direction, windowed
-from shiftsim.metrics.result import Violation
+from shiftsim.metrics.result import NUPLAN, Thresholds, Violation
 from shiftsim.metrics.route import EdgeLists
-from shiftsim.metrics.thresholds import NUPLAN, Thresholds
 from shiftsim.world.layers import make_layer, make_polylines
 
 TIMES = 1_000_000 + 100_000 * np.arange(30, dtype=np.int64)

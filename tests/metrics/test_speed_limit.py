@@ -8,10 +8,9 @@ from hypothesis import given
 from strategies import seeds
 
 from shiftsim.errors import MapError
-from shiftsim.metrics.result import Violation
+from shiftsim.metrics.result import NUPLAN, Thresholds, Violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.metrics.speed_limit import NAME, judge, overspeed
-from shiftsim.metrics.thresholds import NUPLAN, Thresholds
 from shiftsim.world.layers import make_lists, make_polygons
 
 LANES, EDGES = 4, 8

@@ -13,8 +13,7 @@ from worlds import join_tracks
 
 from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
-from shiftsim.metrics.result import Collision, Violation
-from shiftsim.metrics.thresholds import NUPLAN
+from shiftsim.metrics.result import NUPLAN, Collision, Violation
 from shiftsim.metrics.time_to_collision import TimeToCollision, judge, time_to_collision
 from shiftsim.world.layers import make_layer
 from shiftsim.world.state import PACIFICA, AgentKind, Tracks

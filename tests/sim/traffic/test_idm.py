@@ -17,7 +17,8 @@ from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.idm.scene import IdmParameters
 from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks
 

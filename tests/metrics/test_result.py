@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 
-from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN, thresholds_of
+from shiftsim.metrics.result import DEEPPLAN, NUPLAN, thresholds_of
 
 DEVKIT = {
     "name": "nuplan",
