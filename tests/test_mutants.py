@@ -60,18 +60,18 @@ def test_a_sample_hardly_changes_with_the_source() -> None:
     assert len(set(chosen) & set(sample(after, 8, 1))) >= 6
 
 
-def run(*options: str) -> None:
-    """Run the script; it must find no survivor that is not listed, and enough that are noticed."""
+def run(*options: str) -> float:
+    """Run the script, which must find no survivor that is not listed; per cent that are noticed."""
     command = [sys.executable, str(SCRIPT), "--workers", "1", *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=SCRIPT.parent.parent)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     rate = re.search(r"killed \((.*)%\)", done.stdout)
     assert rate is not None
-    assert float(rate[1]) >= RATE
+    return float(rate[1])
 
 
 @pytest.mark.thorough
-def test_a_few_mutants_are_noticed() -> None:
+def test_a_few_mutants_are_noticed_or_listed_as_equal() -> None:
     run("--count", "24")
 
 
@@ -82,4 +82,4 @@ def test_the_list_of_equal_mutants_names_no_others() -> None:
 
 @pytest.mark.long
 def test_four_hundred_mutants_are_noticed() -> None:
-    run("--count", "400", "--check")
+    assert run("--count", "400", "--check") >= RATE
