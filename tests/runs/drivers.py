@@ -124,3 +124,30 @@ class Together(LearnedPlanner):
 
     def decode(self, output, observation):
         return self.inner.plan(observation)
+
+
+class Remembers(ConstantVelocity):
+    """Plans differently after every scenario that it has driven, and says so."""
+
+    def __init__(self):
+        print("made")
+        self.driven = []
+
+    def reset(self, scene):
+        print("reset")
+        os.write(1, b"as a library writes\n")
+        self.driven.append(scene.token)
+
+    def plan(self, observation):
+        plan = super().plan(observation)
+        plan.states[:, 1] += 0.1 * len(self.driven)
+        return plan
+
+
+class RemembersInItsClass(Remembers):
+    """As above, where no copy can help."""
+
+    driven = []  # noqa: RUF012
+
+    def __init__(self):
+        pass
