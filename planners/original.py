@@ -31,7 +31,7 @@ class Original:
                 stream = io.BytesIO()
                 _Writer(stream, self._shared).dump(self.planner)
                 self._content = stream.getvalue()
-                close_planner(self.copy())
+                self.release(self.copy())
 
     def copy(self) -> Planner:
         """A planner for one scenario: a fork, or a copy that shares the weights, or a new one."""
@@ -44,7 +44,7 @@ class Original:
 
     def release(self, copied: Planner) -> None:
         """Let a copy release what it holds; a fork has nothing of its own."""
-        if not isinstance(copied, BatchPlanner):
+        if copied is not self.planner and not isinstance(copied, BatchPlanner):
             close_planner(copied)
 
     def close(self) -> None:
@@ -64,7 +64,8 @@ class _Writer(pickle.Pickler):
     def persistent_id(self, value: object) -> int | None:
         """The place of a shared object."""
         fixed = isinstance(value, np.ndarray) and not value.flags.writeable
-        if not fixed and not isinstance(value, self._network):
+        apart = getattr(type(value), "shares_nothing", False)  # has a copy per scenario elsewhere
+        if not (fixed or apart or isinstance(value, self._network)):
             return None
         self._shared.append(value)
         return len(self._shared) - 1

@@ -188,6 +188,8 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     name = planner_name(source)
     if isinstance(source, str):
         fingerprint = planner_fingerprint(source, arguments)
+    elif hasattr(source, "identify"):
+        fingerprint = source.identify()
     else:
         fingerprint = _object_fingerprint(source, arguments)
     found = RunPlanner(name, source, arguments, fingerprint)

@@ -151,3 +151,25 @@ class RemembersInItsClass(Remembers):
 
     def __init__(self):
         pass
+
+
+class Odd(ConstantVelocity):
+    """Does something odd at iteration 3, something else in every scenario."""
+
+    def __init__(self, odd):
+        self.odd = odd
+
+    def reset(self, scene):
+        self.what = self.odd.get(scene.token, "")
+
+    def plan(self, observation):
+        if observation.iteration == 3:
+            if self.what == "exits":
+                os._exit(7)
+            if self.what == "raises":
+                raise KeyError("lane")
+            if self.what == "leaves":
+                raise SystemExit(3)
+            if self.what == "none":
+                return None
+        return super().plan(observation)
