@@ -59,9 +59,9 @@ class Isolated:
             PlannerError: It cannot be made.
         """
         self.close()
-        found: dict[str, Any] = self._started()[0]
+        found, declares = self._started()
         self.close()
-        return found
+        return {**found, "sees_recording": True} if declares else dict(found)
 
     @property
     def sees_recording(self) -> bool:

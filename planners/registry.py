@@ -20,7 +20,7 @@ from typing import Any, cast
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
-from shiftsim.sim.planner import BatchPlanner, Planner
+from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
 
 # planners of another interface: prefix -> module with install() and factory(class)
 _ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
@@ -204,7 +204,10 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
         ) from error
     _require_methods(name, planner)
     close_planner(planner)
-    return replace(found, in_batches=isinstance(planner, BatchPlanner))
+    if not hasattr(source, "identify") and sees_recording(planner):
+        fingerprint = {**fingerprint, "sees_recording": True}
+    in_batches = isinstance(planner, BatchPlanner)
+    return replace(found, fingerprint=fingerprint, in_batches=in_batches)
 
 
 def planner_name(source: Any) -> str:
