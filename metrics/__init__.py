@@ -9,7 +9,18 @@ from dataclasses import replace
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import load_attribute
-from shiftsim.metrics.result import Collision, MetricRow, Series, Statistic, Violation
+from shiftsim.metrics.result import (
+    DEEPPLAN,
+    NUPLAN,
+    PROFILES,
+    Collision,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    Violation,
+    thresholds_of,
+)
 from shiftsim.metrics.score import (
     MULTIPLIERS,
     SHORT_NAMES,
@@ -19,7 +30,6 @@ from shiftsim.metrics.score import (
     judge,
     measure,
 )
-from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN, PROFILES, Thresholds, thresholds_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 

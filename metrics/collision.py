@@ -12,8 +12,14 @@ import numpy as np
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import BEHIND, bearing, boxes_to_corners, front_touches
 from shiftsim.geometry.rings import convex_intersect
-from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Statistic, Violation
-from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.metrics.result import (
+    Collision,
+    MetricPart,
+    MetricRow,
+    Statistic,
+    Thresholds,
+    Violation,
+)
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     AgentKind,

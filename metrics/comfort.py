@@ -13,8 +13,14 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import DataError
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
-from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.metrics.result import (
+    MetricPart,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    first_violation,
+)
 from shiftsim.world.state import AX, AY, HEADING, center_accelerations
 
 NAME = "ego_is_comfortable"

@@ -6,9 +6,15 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.rings import boundary_distance_below
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
+from shiftsim.metrics.result import (
+    MetricPart,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    first_violation,
+)
 from shiftsim.metrics.route import EdgeLists
-from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import BoolArray, IntArray, kernel, lean_kernel
-from shiftsim.metrics.result import MetricPart, MetricRow, Statistic
+from shiftsim.metrics.result import MetricPart, MetricRow, Statistic, Thresholds
 from shiftsim.metrics.route import EdgeLists, has
-from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.layers import Lists
 from shiftsim.world.map import VectorMap
 

@@ -10,9 +10,15 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
+from shiftsim.metrics.result import (
+    MetricPart,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    first_violation,
+)
 from shiftsim.metrics.route import EdgeLists, driven_route
-from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.layers import Polygons, Polylines, contains, project_on_line
 from shiftsim.world.map import NONE, VectorMap
 

@@ -21,9 +21,16 @@ from shiftsim.metrics import (
     time_to_collision,
 )
 from shiftsim.metrics.comfort import MIN_SAMPLES, ComfortSignals, comfort_signals
-from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Series, Statistic
+from shiftsim.metrics.result import (
+    Collision,
+    MetricPart,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    thresholds_of,
+)
 from shiftsim.metrics.route import EdgeLists, corner_routes, driven_route
-from shiftsim.metrics.thresholds import Thresholds, thresholds_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import STATE_COLUMNS, VehicleParameters, center_poses

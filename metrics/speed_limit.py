@@ -4,9 +4,15 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
-from shiftsim.metrics.result import MetricPart, MetricRow, Series, Statistic, first_violation
+from shiftsim.metrics.result import (
+    MetricPart,
+    MetricRow,
+    Series,
+    Statistic,
+    Thresholds,
+    first_violation,
+)
 from shiftsim.metrics.route import EdgeLists, Lanes, lanes_of
-from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.map import VectorMap
 
 NAME = "speed_limit_compliance"

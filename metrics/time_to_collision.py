@@ -21,9 +21,9 @@ from shiftsim.metrics.result import (
     MetricRow,
     Series,
     Statistic,
+    Thresholds,
     first_violation,
 )
-from shiftsim.metrics.thresholds import Thresholds
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks

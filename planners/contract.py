@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from shiftsim.arrays import FloatArray
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.planners.original import Original
 from shiftsim.sim.plan_check import SHORT, find_fault, is_short
 from shiftsim.sim.planner import Observation, SceneInfo, observe_log, scene_info
@@ -39,7 +39,7 @@ _HINTS = {  # by the name of the rule: what to do
     "inputs untouched": "work on copies: the arrays of scene and observation belong to the "
     "simulator",
     "starts at the ego": "poses are the rear axle in the map frame, from observation.ego.pose on; "
-    "shiftsim.geometry.frames.from_frame brings ego-frame poses there",
+    "shiftsim.geometry.boxes.from_frame brings ego-frame poses there",
     "heading": "headings are radians in the map frame, counter-clockwise from +x",
     "deterministic": "seed random numbers in reset(), from scene.token for example",
     "survives reset": "clear all state of the scenario before in reset()",

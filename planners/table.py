@@ -64,7 +64,7 @@ _ENTRIES = (
     PlannerEntry(
         "idm",
         "rule-based",
-        f"{_HERE}.idm.planner:Idm",
+        f"{_HERE}.idm:Idm",
         "nuPlan's IDM planner: follows the route's lanes behind the nearest object",
         ("target_velocity", *_IDM),
     ),

@@ -3,8 +3,6 @@
 import sys
 from typing import TYPE_CHECKING, Any
 
-from shiftsim._version import __version__ as __version__
-
 if TYPE_CHECKING:
     from shiftsim.api import Run as Run
     from shiftsim.api import open_run as open_run
@@ -26,6 +24,7 @@ if TYPE_CHECKING:
     from shiftsim.world.state import Tracks as Tracks
     from shiftsim.world.state import Trajectory as Trajectory
 
+__version__ = "0.1.0"
 # public name -> where it is; imported when it is first used, so that `import shiftsim` is instant
 _PUBLIC = {
     "Command": "shiftsim.world.state:Command",

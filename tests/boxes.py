@@ -3,8 +3,7 @@
 import numpy as np
 
 from shiftsim.arrays import kernel
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.geometry.rings import convex_intersect
 
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.layers import Layer, make_layer
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
 

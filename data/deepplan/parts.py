@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim._version import __version__
+from shiftsim import __version__
 from shiftsim.data.deepplan.recording import convert_recording
 from shiftsim.data.deepplan.windows import ConversionConfig
 from shiftsim.data.dsc3d.recording import Annotations, Site, read_recording

@@ -12,7 +12,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.deepplan.windows import ROW_S, Runs, rows_of
 from shiftsim.data.dsc3d.recording import Annotations
 from shiftsim.data.recording import EgoTrace, Recording
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 

@@ -16,7 +16,8 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.states import ego_states
 from shiftsim.data.deepplan.windows import ROW_S
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks, TrafficLights
 

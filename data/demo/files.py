@@ -12,7 +12,7 @@ from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES
 from shiftsim.data.demo.scenes import DemoSite, Scene, demo_sites, traffic_of
 from shiftsim.data.demo.traffic import DT, Box
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
 
 _FRAME_RATE, _FRAME_DISTANCE = 25.0, 2
 _GROUND = 512.0  # m, altitude of everything

@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
 
 _MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
 _MAX_SPEED = 200.0  # m/s along an axis

@@ -13,7 +13,8 @@ from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
 from shiftsim.data.nuplan.sqlite import open_database
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 
 _MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
 _BIKE_LANE = 1

@@ -20,7 +20,8 @@ from shiftsim.data.opendrive.preparation import prepare
 from shiftsim.data.opendrive.records import OpenDrive
 from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
 from shiftsim.data.polygons import largest_part
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons

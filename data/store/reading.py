@@ -6,8 +6,9 @@ The layout and every column are described in `shiftsim.data.store.schema`.
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,11 +17,13 @@ from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.review import REVIEW, read_reviews, require_blocks
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from shiftsim.data.store.review import Reviews
 
 _OPEN_FILES = 64  # recordings and egos whose files stay open
 
@@ -33,7 +36,7 @@ class ScenarioStore:
         source: Where others find it: the folder, or the URL it is copied from.
         tokens: Tokens of all scenarios, sorted.
         hash: Digest of the content; equal content has an equal hash.
-        reviews: What people say of the scenarios; an overlay that is not part of the hash.
+        is_reviewed: Whether people said something of the scenarios, in `reviews`.
     """
 
     def __init__(
@@ -47,7 +50,9 @@ class ScenarioStore:
         self.hash = str(manifest["hash"])
         self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
-        self.reviews = read_reviews(path)
+        self.is_reviewed = (path / tables.REVIEW).is_file()
+        if self.is_reviewed:
+            len(self.reviews)  # a damaged file is noticed now
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
@@ -61,6 +66,13 @@ class ScenarioStore:
 
     def __iter__(self) -> Iterator[Scenario]:
         return (self.read(token) for token in self.tokens)
+
+    @cached_property
+    def reviews(self) -> "Reviews":
+        """What people say of the scenarios; an overlay that is not part of the hash."""
+        from shiftsim.data.store.review import read_reviews
+
+        return read_reviews(self.path)
 
     @property
     def cities(self) -> tuple[str, ...]:
@@ -93,10 +105,12 @@ class ScenarioStore:
             DataError: The store has no such scenario, or a file is missing or damaged.
         """
         scenario = self.read_recorded(token)
-        review = self.reviews.get(token)
+        review = self.reviews.get(token) if self.is_reviewed else None
         if review is None or review.route is None:
             return scenario
-        require_blocks(scenario.map, review, str(self.path / REVIEW))
+        from shiftsim.data.store.review import require_blocks
+
+        require_blocks(scenario.map, review, str(self.path / tables.REVIEW))
         return replace(scenario, route=review.route)
 
     def read_recorded(self, token: str) -> Scenario:

@@ -11,8 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import fs
 
-from shiftsim.data.store.review import REVIEW
-from shiftsim.data.store.tables import MANIFEST, SCENARIOS, digest, read_manifest
+from shiftsim.data.store.tables import MANIFEST, REVIEW, SCENARIOS, digest, read_manifest
 from shiftsim.errors import DataError
 from shiftsim.files import remote_store_folder
 

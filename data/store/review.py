@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import DataError
 from shiftsim.files import whole_file
 from shiftsim.world.map import VectorMap
 
-REVIEW = "review/review.jsonl"
 ACCEPT, REJECT, UNDECIDED = "accept", "reject", ""
 _DECISIONS = (ACCEPT, REJECT, UNDECIDED)
 

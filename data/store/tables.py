@@ -16,6 +16,7 @@ from shiftsim.files import whole_file
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
+REVIEW = "review/review.jsonl"
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
 _FOOTER = "shiftsim"

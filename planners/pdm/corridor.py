@@ -7,17 +7,19 @@ import shapely
 from shapely.ops import substring
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.corridors import (
+from shiftsim.geometry.polylines import (
     BAND,
     CLEAR,
     HIT,
     OPEN,
+    Path,
     Stretch,
     corridor_polygon,
+    project,
     side_of,
+    window,
     without_repeats,
 )
-from shiftsim.geometry.polylines import Path, project, window
 from shiftsim.geometry.rings import centroid
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
 

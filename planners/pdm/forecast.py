@@ -7,8 +7,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
-from shiftsim.geometry.boxes import box_corners
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.rings import centroid
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks

@@ -30,7 +30,7 @@ from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import known_blocks
-from shiftsim.planners.routes.lanes import centerline, red_lanes
+from shiftsim.planners.routes.graph import centerline, red_lanes
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import NUM_STATE, Trajectory

@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import box_corners, circle_around
-from shiftsim.geometry.corridors import HIT
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.geometry.polylines import Path, pose_at, project
+from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
+from shiftsim.geometry.polylines import HIT, Path, pose_at, project
 from shiftsim.geometry.rings import ring_distance
 from shiftsim.planners.pdm.corridor import Corridor, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks

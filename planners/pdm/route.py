@@ -10,8 +10,14 @@ from shiftsim.errors import PlannerError
 from shiftsim.planners.proposals.areas import Areas, covering, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
-from shiftsim.planners.routes.lanes import HINT, deviation, lane_at, lanes_of
-from shiftsim.planners.routes.search import Search, search_cheapest
+from shiftsim.planners.routes.graph import (
+    HINT,
+    Search,
+    deviation,
+    lane_at,
+    lanes_of,
+    search_cheapest,
+)
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import FloatArray, kernel, lean_kernel
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.dynamics.lqr import (
     NUPLAN,

@@ -13,8 +13,7 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
-from shiftsim.planners.routes.lanes import HINT, deviation
-from shiftsim.planners.routes.search import search_levels
+from shiftsim.planners.routes.graph import HINT, deviation, search_levels
 from shiftsim.world.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
 from shiftsim.world.map import VectorMap
 

@@ -1,32 +1,223 @@
 """The command line: parse, call the API, print. Nothing heavy is imported before it is needed.
 
+First what several commands share: options, progress, JSON. Options are made from the settings of a
+run: a field of `RunConfig` is an option. Then the table of all commands and the main function.
+
 Errors are two lines, the fact and what to do; `--debug` (before or after the command) shows the
 traceback. Exit codes: 0 all well, 1 usage or settings, 2 data, 3 finished with failed or missing
 tasks, 130 interrupted; `verify` has its own.
 """
 
+import inspect
+import json
 import os
+import shutil
 import sys
-from collections.abc import Sequence
-from functools import cache
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import fields
+from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import typer
 
-from shiftsim.cli.common import new_app
 from shiftsim.errors import DataError, ShiftsimError
+from shiftsim.runs.config import RunConfig, parse_argument
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def new_app(help: str = "", **settings: Any) -> typer.Typer:
+    """A group of commands."""
+    settings = {"add_completion": False, **settings}
+    return typer.Typer(
+        help=help or None,
+        rich_markup_mode=None,  # square brackets in help texts are defaults, not markup
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        **settings,
+    )
+
+
+def say(text: str = "") -> None:
+    """One line of output."""
+    typer.echo(text)
+
+
+def say_json(value: Any) -> None:
+    """A value as JSON; what JSON does not know becomes text."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+
+
+@contextmanager
+def output_kept() -> Iterator[None]:
+    """What planners print within goes to the standard error: the output is the command's own.
+
+    That holds for worker processes that begin within, and for what is no Python, as well.
+    """
+    sys.stdout.flush()
+    before = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+
+
+def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
+    """What was found, as JSON or line by line."""
+    if as_json:
+        say_json(values)
+    else:
+        for line in lines:
+            say(line)
+
+
+def plural(count: int, noun: str) -> str:
+    """`1 task`, `2 tasks`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def terminal_width() -> int:
+    """Columns of the terminal; 0 where the output goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+
+
+Advance = Callable[[int, int, str], None]
+
+
+@contextmanager
+def progress_bar(*, quiet: bool) -> Iterator[Advance]:
+    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
+    if quiet:
+        yield lambda done, total, note: None
+    elif sys.stderr.isatty():
+        yield from _bar()
+    else:
+        yield _lines()
+
+
+def _bar() -> Iterator[Advance]:
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("ETA"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=None)
+
+        def advance(done: int, total: int, note: str) -> None:
+            bar.update(task, completed=done, total=total, description=note)
+
+        yield advance
+
+
+def _lines() -> Advance:
+    began = time.monotonic()
+    last = [0]
+
+    def advance(done: int, total: int, note: str) -> None:
+        tenth = 10 * done // total if total else 10
+        if tenth > last[0]:
+            last[0] = tenth
+            elapsed = time.monotonic() - began
+            left = elapsed / done * (total - done) if done else 0.0
+            tail = f"  {note}" if note else ""
+            text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
+            typer.echo(text, err=True)
+
+    return advance
+
+
+Settings: TypeAlias = dict[str, Any]
+_FIELDS = {item.name: item for item in fields(RunConfig)}
+ALL = tuple(_FIELDS)
+_KIND = inspect.Parameter.KEYWORD_ONLY  # those with a default may come first
+
+
+def with_settings(
+    *names: str, **helps: str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of settings, at the place of its parameter `settings`.
+
+    The command gets those that were given, as `RunConfig` wants them; arguments of planners are
+    texts still, for `planner_arguments`. `helps` are other help texts for some of them.
+    """
+    options = [_option(name, helps.get(name)) for name in names]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            parameters += options if name == "settings" else [parameter.replace(kind=_KIND)]
+
+        @wraps(command)
+        def call(**values: Any) -> None:
+            raw = {name: values.pop(name) for name in names}
+            settings = {n: _parsed(n, value) for n, value in raw.items() if value not in (None, [])}
+            command(settings=settings, **values)
+
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        return call
+
+    return decorate
+
+
+def _option(name: str, text: str | None) -> inspect.Parameter:
+    item = _FIELDS[name]
+    option = item.metadata["option"]
+    kind: Any = item.type
+    if get_origin(kind) is dict or (get_origin(kind) is tuple and not option.parse):
+        kind = list[get_args(kind)[0]]  # type: ignore[misc]
+    elif option.parse:
+        kind = str
+    flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
+    return inspect.Parameter(
+        name,
+        _KIND,
+        default=None,
+        annotation=Annotated[kind | None, typer.Option(*flags, help=text or option.help)],
+    )
+
+
+def _parsed(name: str, value: Any) -> Any:
+    parse = _FIELDS[name].metadata["option"].parse
+    return parse(value) if parse else value
+
+
+def planner_arguments(
+    texts: Sequence[str], before: Mapping[str, Any], planners: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Arguments by planner, those of the command line put over what a file says."""
+    arguments = {name: dict(table) for name, table in before.items()}
+    for text in texts:
+        owner, name, value = parse_argument(text, tuple(planners))
+        arguments.setdefault(owner, {})[name] = value
+    return arguments
+
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
 _COMMANDS = {
-    "demo": "running:demo",
+    "demo": "demo:demo",
     "run": "running:run",
-    "score": "running:score",
-    "merge": "running:merge",
+    "score": "deriving:score",
+    "merge": "deriving:merge",
     "bench": "bench:bench",
     "report": "reading:report",
     "explain": "reading:explain",
@@ -89,7 +280,7 @@ def _options(
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:
-        from shiftsim._version import __version__
+        from shiftsim import __version__
 
         typer.echo(__version__)
         raise typer.Exit

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, plural, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json
 from shiftsim.cli.running import DryRun, interruptible
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ device batch_size strict workers timeout executor scheduler retry_failed out sav
 allow_partial""".split()
 
 
-@common.with_settings(
+@cli.with_settings(
     *_SETTINGS,
     store="Own scenarios: name or folder (demo).",
     split="Name or file (the whole store; demo-mini of the demo).",
@@ -36,7 +36,7 @@ allow_partial""".split()
 )
 def bench(
     track: Annotated[str, typer.Argument(help="semantic-shift or state-drift.")],
-    settings: common.Settings,
+    settings: cli.Settings,
     val14: Annotated[
         str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14 (left out).")
     ] = None,
@@ -59,7 +59,7 @@ def bench(
     out = settings.pop("out", "")
     if texts := settings.pop("planner_args", None):
         planners = settings.get("planners", ())
-        settings["planner_args"] = common.planner_arguments(texts, {}, planners)
+        settings["planner_args"] = cli.planner_arguments(texts, {}, planners)
     plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
     if not as_json:
         _announce(plan)
@@ -115,7 +115,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     for table in tables:
         if table.name.partition("_")[0] in shown:
             say()
-            say(render(table, "text", width=common.terminal_width()))
+            say(render(table, "text", width=cli.terminal_width()))
     say()
     say(f" report: {plan.folder / 'report'} ({plural(len(files), 'file')})")
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
@@ -87,7 +87,7 @@ def _token_list(text: str) -> list[str]:
 
 
 @app.command()
-@common.with_settings("workers")
+@cli.with_settings("workers")
 def dsc3d(
     source: Annotated[
         Path, typer.Argument(metavar="SRC", help="Folder with data_meta.json, annotations, map.")
@@ -119,7 +119,7 @@ def dsc3d(
         Path | None, typer.Option(help="All thresholds in TOML; flags win over it.")
     ] = None,
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -136,7 +136,8 @@ def dsc3d(
 
     from shiftsim.data.deepplan.convert import convert_dsc3d
     from shiftsim.files import store_path
-    from shiftsim.runs.workers import default_workers, map_unordered
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
 
     flags = {
         "country": country,

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Advance, Debug, Json, Quiet, progress_bar, say, show
+from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
 
 REFERENCE = PACKAGE / "verify" / "reference"
@@ -91,8 +91,8 @@ class Diagnosis:
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
     from shiftsim.arrays import cache_folder
+    from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
-    from shiftsim.runs.workers import default_workers
     from shiftsim.verify import verify
     from shiftsim.verify.warmup import warm_up
 

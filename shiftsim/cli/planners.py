@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Json, new_app, output_kept, plural, say, say_json, show
+from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")

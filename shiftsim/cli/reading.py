@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.report.figures import Figure
@@ -94,7 +94,7 @@ def report(
         say(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return
-    say("\n\n".join(render(one, kind, width=common.terminal_width()) for one in tables))
+    say("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
     if kind == "text" and not table:
         _say_worst(opened, worst)
 
@@ -177,4 +177,4 @@ def diff(
     from shiftsim.runs.results import open_run
 
     found = diff_runs(open_run(first), open_run(second), limit=limit)
-    common.show(found.to_dict(), diff_lines(found), as_json=as_json)
+    cli.show(found.to_dict(), diff_lines(found), as_json=as_json)

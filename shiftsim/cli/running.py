@@ -1,4 +1,4 @@
-"""Commands that simulate or score: run, demo, score, merge."""
+"""`shiftsim run`, and what commands that make a run share."""
 
 import shlex
 import signal
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, output_kept, plural, progress_bar, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from shiftsim.runs.results import Run
 
 _UNFINISHED, _INTERRUPTED = 3, 130
-_DEMO_PLANNERS = ("log-future", "idm", "constant-velocity")
-_DEMO_NOISE = ("none", "ou-high")
 _MAX_NAMED_FAILURES = 5
 _BEFORE = {
     "new": "nothing there yet",
@@ -33,9 +31,9 @@ Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win o
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
-@common.with_settings(*common.ALL)
+@cli.with_settings(*cli.ALL)
 def run(
-    settings: common.Settings,
+    settings: cli.Settings,
     config: Config = None,
     dry_run: DryRun = False,
     quiet: Quiet = False,
@@ -51,7 +49,7 @@ def run(
     before = values.get("planner_args", {})
     values |= settings
     if texts:
-        values["planner_args"] = common.planner_arguments(texts, before, values.get("planners", ()))
+        values["planner_args"] = cli.planner_arguments(texts, before, values.get("planners", ()))
     made = make_config(values, where=str(config) if config else "run")
     run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
 
@@ -187,93 +185,3 @@ def _show(finished: "Run", *, allow_partial: bool) -> None:
     say(f" results: {finished.path}")
     if finished.manifest["config"]["save_rollouts"] == "all":
         say(f" replay:  shiftsim view {finished.path}")
-
-
-@common.with_settings("workers", "limit")
-def demo(
-    out: Annotated[Path | None, typer.Option(help="Folder of the demo store.")] = None,
-    *,
-    settings: common.Settings,
-    quiet: Quiet = False,
-    debug: Debug = False,
-) -> None:
-    """Generate small recordings, convert them, run three planners clean and disturbed."""
-    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
-    from shiftsim.files import store_path
-    from shiftsim.runs.config import DEFAULT_STORE, make_config
-    from shiftsim.verify.warmup import warm_up
-
-    folder = out or store_path(DEFAULT_STORE)
-    if not folder.exists():
-        say(f"generating and converting recordings, compiling kernels → {folder}")
-        with warm_up():
-            demo_store(folder)
-    values: dict[str, Any] = {
-        "planners": list(_DEMO_PLANNERS),
-        "noise": list(_DEMO_NOISE),
-        "store": str(folder) if out else DEFAULT_STORE,
-        "split": DEMO_SPLIT,
-        **settings,
-    }
-    try:
-        run_config(make_config(values, where="demo"), dry_run=False, quiet=quiet, as_json=False)
-    finally:
-        named = f" --store {folder}" if out else ""
-        say()
-        say("next:")
-        say(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
-        say(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
-        say("  shiftsim report runs/<id>        shiftsim view runs/<id>")
-        say("  shiftsim explain runs/<id> TOKEN")
-        say("  shiftsim planners list           shiftsim --help")
-
-
-@common.with_settings(
-    "thresholds",
-    "metrics",
-    "store",
-    "out",
-    "workers",
-    "allow_partial",
-    store="Store. [the one of the run]",
-)
-def score(
-    source: Annotated[Path, typer.Argument(metavar="RUN", help="A run with stored rollouts.")],
-    settings: common.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Score stored rollouts again, under another threshold profile, without simulating."""
-    from shiftsim.runs.derive import rescore
-    from shiftsim.runs.results import open_run
-
-    run = open_run(source)
-    allow_partial = settings.pop("allow_partial", False)
-    with progress_bar(quiet=quiet or as_json) as advance:
-        finished = rescore(
-            run,
-            **{"thresholds": run.manifest["config"]["thresholds"], **settings},
-            on_progress=lambda progress: advance(progress.done, progress.total, ""),
-            argv=sys.argv,
-        )
-    leave_with(finished, allow_partial=allow_partial, as_json=as_json)
-
-
-def merge(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="The shards of one run.")],
-    out: Annotated[
-        str | None, typer.Option(help="Run folder. [that of the shards without number]")
-    ] = None,
-    allow_partial: Annotated[
-        bool, typer.Option("--allow-partial", help="Accept missing shards; labelled so.")
-    ] = False,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Join runs made with --shard: the same tables as without."""
-    from shiftsim.runs.derive import merge_runs
-    from shiftsim.runs.results import open_run
-
-    merged = merge_runs([open_run(path) for path in runs], out=out, allow_partial=allow_partial)
-    leave_with(merged, allow_partial=allow_partial, as_json=as_json)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shiftsim.cli import common
-from shiftsim.cli.common import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim import cli
+from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
@@ -44,7 +44,7 @@ def check(
         raise typer.Exit(_DATA)
 
 
-@common.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
+@cli.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
 def filter_scenarios(
     store: Store,
     min_path: Annotated[float | None, typer.Option(help="Shortest path [m]. [5]")] = None,
@@ -52,7 +52,7 @@ def filter_scenarios(
         float | None, typer.Option(help="Least share of it along the route. [0.5]")
     ] = None,
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -105,7 +105,7 @@ def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
 
 
-def _chosen(store: "ScenarioStore", settings: common.Settings) -> tuple[str, ...]:
+def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
     from shiftsim.runs.filter import read_verdicts
@@ -128,7 +128,7 @@ def _chosen(store: "ScenarioStore", settings: common.Settings) -> tuple[str, ...
     return store.reviews.usable(store.tokens, usable)
 
 
-@common.with_settings("split", "all_scenarios")
+@cli.with_settings("split", "all_scenarios")
 def make_split(
     store: Store,
     out: Annotated[
@@ -141,7 +141,7 @@ def make_split(
     per_type: Annotated[int | None, typer.Option(min=1, help="At most N of every type.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="At most N in all.")] = None,
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -168,12 +168,12 @@ def make_split(
 
 
 @export.command("nuplan")
-@common.with_settings("split", "all_scenarios")
+@cli.with_settings("split", "all_scenarios")
 def export_to_nuplan(
     store: Store,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -215,7 +215,7 @@ def export_to_nuplan(
     )
 
 
-@common.with_settings("split", "all_scenarios")
+@cli.with_settings("split", "all_scenarios")
 def show_stats(
     store: Store,
     by: Annotated[str, typer.Option(help="city or type.")] = "city",
@@ -227,7 +227,7 @@ def show_stats(
         Path | None, typer.Option(help="Draw bars into this file (.png, .svg, .pdf).")
     ] = None,
     *,
-    settings: common.Settings,
+    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli.common import Debug, Quiet, plural, progress_bar, say
+from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
 
 if TYPE_CHECKING:
     from shiftsim.view.build import Gallery
@@ -108,7 +108,7 @@ def inspect(
     debug: Debug = False,
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
-    from shiftsim.data.store.review import REVIEW
+    from shiftsim.data.store.tables import REVIEW
     from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.review.server import ReviewServer
     from shiftsim.view.review.service import ReviewService

@@ -6,9 +6,11 @@ The options of the command line are made from the fields, too.
 """
 
 import math
+import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, get_args, get_origin
 
 from shiftsim.errors import ConfigError, one_of
@@ -234,3 +236,39 @@ def parse_shard(text: str) -> tuple[int, int]:
     if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)
     raise ConfigError(f"shard {text!r} is not i/n with i from 1 to n", hint="for example 2/16")
+
+
+def default_workers(memory_each: float = 0.5e9) -> int:
+    """One worker process per core, as long as they fit into the memory [bytes]."""
+    free, cores = _free_memory(), _cores()
+    return max(1, min(cores, int(free // memory_each) if free else cores))
+
+
+def _cores() -> int:
+    """Cores that this process may use, also in a container that gets only a share of them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    quota, _, period = _first_line("/sys/fs/cgroup/cpu.max").partition(" ")
+    if quota.isdecimal() and period.isdecimal():
+        return max(1, min(cores or 1, int(quota) // int(period)))
+    return cores or 1
+
+
+def _free_memory() -> float:
+    """Memory that this process could still take [bytes], 0 where unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return 0.0
+    free = next((float(x.split()[1]) * 1024 for x in lines if x.startswith("MemAvailable")), 0.0)
+    limit = _first_line("/sys/fs/cgroup/memory.max")
+    used = _first_line("/sys/fs/cgroup/memory.current")
+    if limit.isdecimal() and used.isdecimal():
+        free = min(free, float(limit) - float(used))
+    return free
+
+
+def _first_line(path: str) -> str:
+    try:
+        return Path(path).read_text().partition("\n")[0]
+    except OSError:
+        return ""

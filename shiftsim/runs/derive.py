@@ -10,8 +10,8 @@ from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.runs.config import RunConfig, make_config, parse_shard
-from shiftsim.runs.execute import Progress, record
+from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
+from shiftsim.runs.execute import Progress, ended, record
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
 from shiftsim.runs.prepare import RUNS, run_name
@@ -19,7 +19,7 @@ from shiftsim.runs.results import MISSING, OK, Run, TaskResult, open_run, stored
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_run_store
 from shiftsim.runs.task import Batch, Scenarios, attempt, score_rollout
-from shiftsim.runs.workers import default_workers, map_unordered
+from shiftsim.runs.workers import map_unordered
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
@@ -202,7 +202,7 @@ def rescore(
             def add(result: TaskResult) -> None:
                 writer.add(result, stored=run.rollout_places[result.task])
 
-            record(outcomes, add, Progress(0, len(done), 0), on_progress)
+            record(map(ended, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
     finally:

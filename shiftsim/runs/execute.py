@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shiftsim.errors import DataError
 from shiftsim.planners.registry import planner_name
@@ -21,10 +21,10 @@ from shiftsim.runs.results import FAILED, OK, TIMEOUT, Run, TaskResult, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_named_store, write_bundle
 from shiftsim.runs.task import Batch, TaskRunner
-from shiftsim.runs.workers import Outcome, map_unordered
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 
-Outcomes: TypeAlias = Generator[Outcome[Batch, list[TaskResult]], None, None]
+if TYPE_CHECKING:
+    from shiftsim.runs.workers import MakeFunction, Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,19 +121,22 @@ def _do_batches(prepared: Prepared, writer: RunWriter, on_progress: Watch) -> bo
     total = len(prepared.tasks)
     progress = Progress(total - sum(len(batch.tasks) for batch in todo), total, 0)
     try:
-        with closing(_outcomes(prepared, todo)) as outcomes:
-            record(outcomes, writer.add, progress, on_progress)
+        with closing(_results(prepared, todo)) as results:
+            record(results, writer.add, progress, on_progress)
     except KeyboardInterrupt:
         return True
     return False
 
 
 def record(
-    outcomes: Outcomes, add: Callable[[TaskResult], None], progress: Progress, on_progress: Watch
+    batches: Iterable[list[TaskResult]],
+    add: Callable[[TaskResult], None],
+    progress: Progress,
+    on_progress: Watch,
 ) -> None:
-    """Put what workers give back on disk as it comes, and tell how far the run is."""
-    for outcome in outcomes:
-        for result in ended(outcome):
+    """Put results on disk as they come, batch by batch, and tell how far the run is."""
+    for results in batches:
+        for result in results:
             add(result)
             progress = progress.after(result)
         on_progress(progress)
@@ -155,9 +158,26 @@ def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: boo
     return out
 
 
-def _outcomes(prepared: Prepared, batches: Sequence[Batch]) -> Outcomes:
+def _results(
+    prepared: Prepared, batches: Sequence[Batch]
+) -> Generator[list[TaskResult], None, None]:
+    """The results of each batch, in whatever order they end."""
     config = prepared.config
     make = partial(TaskRunner, config, prepared.store, prepared.planners, prepared.noises)
+    if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
+        with closing(make()) as run_batch:
+            for batch in batches:
+                yield run_batch(batch)
+        return
+    with closing(_outcomes(prepared, make, batches)) as outcomes:
+        yield from map(ended, outcomes)
+
+
+def _outcomes(
+    prepared: Prepared, make: "MakeFunction[Batch, list[TaskResult]]", batches: Sequence[Batch]
+) -> "Generator[Outcome[Batch, list[TaskResult]], None, None]":
+    """What becomes of each batch in worker processes."""
+    config = prepared.config
     leading = min(len(prepared.planners), len(batches))
     if config.executor == "dask":
         from shiftsim.runs.cluster import map_on_cluster
@@ -170,6 +190,8 @@ def _outcomes(prepared: Prepared, batches: Sequence[Batch]) -> Outcomes:
             limit=config.timeout,
             pieces=Batch.split,
         )
+    from shiftsim.runs.workers import map_unordered
+
     return map_unordered(
         make,
         batches,
@@ -181,7 +203,7 @@ def _outcomes(prepared: Prepared, batches: Sequence[Batch]) -> Outcomes:
     )
 
 
-def ended(outcome: Outcome[Batch, list[TaskResult]]) -> list[TaskResult]:
+def ended(outcome: "Outcome[Batch, list[TaskResult]]") -> list[TaskResult]:
     """The results of a batch, whose worker may have died."""
     if outcome.result is not None:
         return outcome.result

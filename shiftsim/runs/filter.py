@@ -24,12 +24,13 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
+from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Split
 from shiftsim.runs.task import Scenarios, attempt
-from shiftsim.runs.workers import default_workers, map_unordered
+from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from shiftsim._version import __version__
+from shiftsim import __version__
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
@@ -24,12 +24,11 @@ from shiftsim.planners.registry import (
     run_planner,
     takes_argument,
 )
-from shiftsim.runs.config import RunConfig, Value, parse_shard
+from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
-from shiftsim.runs.workers import default_workers
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import make_traffic, traffic_name
 
@@ -193,7 +192,10 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     verdicts, usable = None, known
     if whole and not config.all_scenarios:
         verdicts = _verdicts(config, store)
-        usable = store.reviews.usable(known, verdicts.accepted if verdicts else known)
+        accepted = set(verdicts.accepted if verdicts else known)
+        usable = tuple(token for token in known if token in accepted)
+        if store.is_reviewed:
+            usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
     tokens = split.tokens[: config.limit] if config.limit else split.tokens
     store_tokens = set(known)
@@ -212,7 +214,7 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     determining = {"store": store.hash, "tokens": token_hash(tokens)}
     if verdicts is not None:
         determining["filter"] = verdicts.hash
-    if store.reviews.hash:
+    if store.is_reviewed and store.reviews.hash:
         determining["review"] = store.reviews.hash
     present = [token for token in tokens if token in store_tokens]
     return Chosen(split.name, present, missing, len(known) - len(usable), determining)

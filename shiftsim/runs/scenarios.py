@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
-from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.files import read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, Literal, TypeVar
 
@@ -88,42 +87,6 @@ def map_unordered(
         yield from pool.run(tasks, alone)
     finally:
         pool.close()
-
-
-def default_workers(memory_each: float = 0.5e9) -> int:
-    """One worker process per core, as long as they fit into the memory [bytes]."""
-    free, cores = _free_memory(), _cores()
-    return max(1, min(cores, int(free // memory_each) if free else cores))
-
-
-def _cores() -> int:
-    """Cores that this process may use, also in a container that gets only a share of them."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    quota, _, period = _first_line("/sys/fs/cgroup/cpu.max").partition(" ")
-    if quota.isdecimal() and period.isdecimal():
-        return max(1, min(cores or 1, int(quota) // int(period)))
-    return cores or 1
-
-
-def _free_memory() -> float:
-    """Memory that this process could still take [bytes], 0 where unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return 0.0
-    free = next((float(x.split()[1]) * 1024 for x in lines if x.startswith("MemAvailable")), 0.0)
-    limit = _first_line("/sys/fs/cgroup/memory.max")
-    used = _first_line("/sys/fs/cgroup/memory.current")
-    if limit.isdecimal() and used.isdecimal():
-        free = min(free, float(limit) - float(used))
-    return free
-
-
-def _first_line(path: str) -> str:
-    try:
-        return Path(path).read_text().partition("\n")[0]
-    except OSError:
-        return ""
 
 
 def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T, R], None, None]:

@@ -23,7 +23,7 @@ from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.lanes import LaneKey, section_borders
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.verify.files import Groups, Source, read_fields, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.world.map import VectorMap

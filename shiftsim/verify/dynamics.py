@@ -13,7 +13,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, comfort_signals, within_bounds
-from shiftsim.metrics.thresholds import PROFILES
+from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step

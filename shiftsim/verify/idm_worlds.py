@@ -12,7 +12,7 @@ from shiftsim.verify.files import Source, read_fields
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, make_scenario, read_map, read_objects
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights
+from shiftsim.world.state import VY, AgentKind, LightStatus, Tracks, TrafficLights
 
 TOLERANCE = 1e-6  # m, rad, m/s
 VEHICLE_COLUMNS = ("token", "x", "y", "heading", "vx", "vy", "path_speed", "route_edge_ids")
@@ -24,7 +24,8 @@ def verify_idm_world(path: Path, report: Report) -> None:
         world, name = read_fields(path, report, "idm_world"), path.stem
         world.note("label", "world")
         scenario, expected = _make_scenario(world), world.each("expected")[0]
-        tracks, traffic = scenario.tracks, IdmTraffic()
+        tracks = scenario.tracks.rows(np.arange(scenario.num_iterations))  # a copy, to be driven
+        traffic = IdmTraffic()
         traffic.start(scenario, tracks, 0)
         order = order_observed(tracks.kinds, tracks.valid[0])
         ours = {
@@ -39,14 +40,19 @@ def verify_idm_world(path: Path, report: Report) -> None:
                 traffic.step(iteration - 1, scenario.ego[iteration - 1], tracks, iteration)
             columns = dict(zip(VEHICLE_COLUMNS, zip(*rows, strict=True), strict=True))
             theirs = Source("idm_world", "column", columns, report)
-            _compare_vehicles(f"{name} {iteration}", traffic, scenario, iteration, theirs)
+            _compare_vehicles(f"{name} {iteration}", traffic, scenario, tracks, iteration, theirs)
         world.finish()
 
 
 def _compare_vehicles(
-    where: str, traffic: IdmTraffic, scenario: Scenario, iteration: int, theirs: Source
+    where: str,
+    traffic: IdmTraffic,
+    scenario: Scenario,
+    tracks: Tracks,
+    iteration: int,
+    theirs: Source,
 ) -> None:
-    tracks, routes = scenario.tracks, traffic.routes
+    routes = traffic.routes
     index = np.array(list(routes), np.int64)
     vehicles = np.flatnonzero(tracks.valid[iteration] & (tracks.kinds == AgentKind.VEHICLE))
     theirs.report.compare("idm_world tracks", where, vehicles, index)

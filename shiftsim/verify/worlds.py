@@ -11,7 +11,8 @@ from shiftsim.errors import DataError
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import Source
 from shiftsim.world import state
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks, TrafficLights
 

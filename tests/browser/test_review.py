@@ -5,7 +5,7 @@ import pytest
 from stores import write_toy_store
 
 import shiftsim
-from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.tables import REVIEW
 from shiftsim.view.review.server import ReviewServer
 from shiftsim.view.review.service import ReviewService
 

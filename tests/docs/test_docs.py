@@ -40,7 +40,7 @@ from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
-from shiftsim.runs import workers
+from shiftsim.runs import config
 from shiftsim.runs.results import TABLES
 
 DOCS = REPOSITORY / "docs"
@@ -124,7 +124,7 @@ def desk(material: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("MPLBACKEND", "agg")
-    monkeypatch.setattr(workers, "_cores", lambda: 1)  # no worker processes: kernels stay warm
+    monkeypatch.setattr(config, "_cores", lambda: 1)  # no worker processes: kernels stay warm
     before, search, finders = set(sys.modules), list(sys.path), list(sys.meta_path)
     yield tmp_path
     sys.path[:], sys.meta_path[:] = search, finders

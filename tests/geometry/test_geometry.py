@@ -8,7 +8,7 @@ from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
 from shiftsim.arrays import kernel
-from shiftsim.geometry import boxes, frames, polylines, rings
+from shiftsim.geometry import boxes, polylines, rings
 
 NUM_PAIRS = 60_000  # twice, at both offsets: more than 1e5 pairs of each kind
 
@@ -187,9 +187,9 @@ def test_corners_run_front_left_rear_left_rear_right_front_right():
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])
     poses = np.array([[3.0, -4.0, heading], [motion[2], motion[1], 0.5]])
-    back = to_frame(frames.from_frame(poses, origin), origin)
+    back = to_frame(boxes.from_frame(poses, origin), origin)
     np.testing.assert_allclose(back[:, :2], poses[:, :2], atol=1e-9)
-    assert np.abs(frames.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
+    assert np.abs(boxes.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
 
 
 @given(seeds)
@@ -202,7 +202,7 @@ def test_intersection_of_boxes_is_symmetric(seed):
 
 @given(angles)
 def test_wrapped_angles_lie_in_the_half_open_range(angle):
-    wrapped = frames.wrap_angle(angle + 6 * np.pi)
+    wrapped = boxes.wrap_angle(angle + 6 * np.pi)
     assert -np.pi <= wrapped < np.pi
     assert abs(np.sin(wrapped - angle)) < 1e-12
 

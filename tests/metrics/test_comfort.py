@@ -6,7 +6,7 @@ from scipy.signal import savgol_filter
 
 from shiftsim.errors import DataError
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, comfort_signals, within_bounds
-from shiftsim.metrics.thresholds import DEEPPLAN, NUPLAN
+from shiftsim.metrics.result import DEEPPLAN, NUPLAN
 from shiftsim.world.state import AX, AY, HEADING, NUM_STATE, YAW_ACCEL, YAW_RATE
 
 

@@ -10,7 +10,7 @@ from worlds import straight_road
 
 from shiftsim.errors import ConfigError, DataError, MapError
 from shiftsim.metrics import MetricRow, compute_metrics, judge, measure
-from shiftsim.world.map import BlockSpec, EdgeSpec, build_map
+from shiftsim.world.build import BlockSpec, EdgeSpec, build_map
 
 LOG = rollout(states_of(straight_poses(20), 10.0))
 

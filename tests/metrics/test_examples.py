@@ -6,7 +6,7 @@ from rollouts import boxes, rollout, states_of, straight_poses
 from worlds import join_tracks, straight_road
 
 from shiftsim.metrics import MetricResult, MetricRow, compute_metrics, judge, measure
-from shiftsim.metrics.thresholds import Thresholds
+from shiftsim.metrics.result import Thresholds
 from shiftsim.world.state import VX, AgentKind, Tracks
 
 K = 60

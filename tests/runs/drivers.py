@@ -2,6 +2,7 @@
 
 import os
 import time
+import typing
 from pathlib import Path
 
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
@@ -144,13 +145,18 @@ class Remembers(ConstantVelocity):
         return plan
 
 
-class RemembersInItsClass(Remembers):
-    """As above, where no copy can help."""
+class RemembersInItsClass(ConstantVelocity):
+    """Plans by how many scenarios were driven in this process: no copy helps, one alone is fine."""
 
-    driven = []  # noqa: RUF012
+    driven: typing.ClassVar = set()
 
-    def __init__(self):
-        pass
+    def reset(self, scene):
+        self.driven.add(scene.token)
+
+    def plan(self, observation):
+        plan = super().plan(observation)
+        plan.states[:, 1] += 0.1 * len(self.driven)
+        return plan
 
 
 class Odd(ConstantVelocity):

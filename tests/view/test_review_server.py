@@ -6,7 +6,7 @@ import pytest
 from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.review import REVIEW
+from shiftsim.data.store.tables import REVIEW
 from shiftsim.view.review.server import HOST, MAX_BODY, TOKEN_HEADER, ReviewServer
 from shiftsim.view.review.service import ReviewService
 

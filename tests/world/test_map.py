@@ -12,7 +12,8 @@ from strategies import seeds
 from worlds import straight_road
 
 from shiftsim.errors import ConfigError, MapError
-from shiftsim.world.map import NONE, AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import NONE
 
 
 def lane(name, block="1", **changes):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.geometry.frames import from_frame
+from shiftsim.geometry.boxes import from_frame
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.diffusion.features import (
     FeatureBuilder,

@@ -1,7 +1,7 @@
 """Layers and attention whose rows do not depend on how many rows, or scenes, there are.
 
 A scene then gets the same numbers alone and in a batch, where the library computes a row of a large
-product in one way; the ways for one to three rows, or a single column, are not taken on a CPU.
+product in one way; the ways for fewer than 16 rows, or a single column, are not taken on a CPU.
 Scenes of different sizes lie one after another, without any padding between them.
 """
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-ROWS, COLUMNS = 4, 2  # from which on a product is computed in the way of large ones
+ROWS, COLUMNS = 16, 2  # from which on a product is computed in the way of large ones
 _CUBIC, _TWICE = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the GELU by tanh
 
 

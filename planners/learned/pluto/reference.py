@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.geometry.boxes import meets_bounds
-from shiftsim.geometry.frames import wrap_angles
+from shiftsim.geometry.boxes import meets_bounds, wrap_angles
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
-from shiftsim.planners.routes.lanes import LanePath, deviation, lane_path, sub_path
+from shiftsim.planners.routes.graph import LanePath, deviation, lane_path, sub_path
 from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 

@@ -7,7 +7,7 @@ follows from the new ones. Speed may become negative; only the steering angle is
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.world.state import (
     AX,
     AY,

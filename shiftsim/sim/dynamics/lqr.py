@@ -22,7 +22,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
@@ -290,7 +290,7 @@ def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[f
     return accel, steering_rate(ref, speed, state[STEERING], accel, params)
 
 
-@lean_kernel
+@kernel
 def track(
     now_us: int,
     state: FloatArray,

@@ -9,7 +9,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.world.state import (
     HEADING,

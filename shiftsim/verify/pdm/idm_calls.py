@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.geometry.frames import wrap_angle
-from shiftsim.planners.idm.planner import STEP_US, STEPS, Idm
+from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.planners.idm import STEP_US, STEPS, Idm
 from shiftsim.sim.planner import Observation, observe_log, scene_info
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report

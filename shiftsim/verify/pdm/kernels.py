@@ -16,7 +16,7 @@ from shiftsim.planners.pdm.route import offset_poses
 from shiftsim.planners.pdm.step import brake_poses
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
-from shiftsim.planners.routes.search import search_cheapest, search_levels
+from shiftsim.planners.routes.graph import search_cheapest, search_levels
 from shiftsim.verify.files import TOLERANCE, Source, read_arrays, read_json, verify_files
 from shiftsim.verify.pdm.steps import verify_step, verify_summary
 from shiftsim.verify.report import Report

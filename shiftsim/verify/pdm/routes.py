@@ -11,7 +11,7 @@ from shiftsim.planners.pdm import route as routes
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.places import ego_box
-from shiftsim.planners.routes.lanes import centerline
+from shiftsim.planners.routes.graph import centerline
 from shiftsim.verify.files import TOLERANCE, Source, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario

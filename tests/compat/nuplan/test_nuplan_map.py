@@ -7,8 +7,8 @@ from worlds import straight_road
 
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.errors import MapError
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.layers import make_polylines
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, build_map
 
 from nuplan.common.actor_state.state_representation import (  # isort: skip  # the names exist now
     Point2D,

@@ -8,13 +8,13 @@ from worlds import straight_road
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import (
-    REVIEW,
     Review,
     Reviews,
     read_reviews,
     route_problems,
     write_reviews,
 )
+from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import DataError
 
 

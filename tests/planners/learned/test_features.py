@@ -32,7 +32,8 @@ from shiftsim.planners.learned.map_features import (
 )
 from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.sim.planner import History
-from shiftsim.world.map import AreaSpec, VectorMap, build_map
+from shiftsim.world.build import AreaSpec, build_map
+from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AX, AY, VX, VY, LightStatus, Tracks, TrafficLights
 
 ORIGIN = np.zeros(3)

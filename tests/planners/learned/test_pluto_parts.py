@@ -19,7 +19,7 @@ from shiftsim.planners.learned.pluto.reference import (
 from shiftsim.planners.learned.pluto.scoring import Place, aggregate, normalise, on_road, score
 from shiftsim.planners.learned.pluto.world import Agents, make_world, static_objects
 from shiftsim.planners.proposals.contacts import Others, is_at_fault
-from shiftsim.world.map import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.state import AX, NUM_STATE, PACIFICA, VX, AgentKind, center_poses
 
 NOBODY = Agents(np.zeros((0, 81, 3)), np.zeros((0, 81)), np.zeros((0, 2)))

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straight_road
 
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.geometry.corridors import HIT
-from shiftsim.geometry.polylines import make_path
+from shiftsim.geometry.polylines import HIT, make_path
 from shiftsim.planners.pdm.corridor import corridor_shape, fill_corridor, make_corridor
 from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters

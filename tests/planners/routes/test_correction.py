@@ -15,8 +15,8 @@ from shiftsim.planners.routes.correction import (
     find_start,
     known_blocks,
 )
+from shiftsim.world.build import build_map
 from shiftsim.world.layers import square_around
-from shiftsim.world.map import build_map
 
 
 def names(road, blocks):

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import shapely
+
 from nuplan.common.maps.abstract_map import AbstractMap
 from nuplan.common.maps.maps_datatypes import SemanticMapLayer, StopLineType
-
 from shiftsim.arrays import FloatArray
 from shiftsim.compat.nuplan.bridge.map_objects import KINDS, BridgeLaneConnector
 from shiftsim.world.layers import Layer, nearest_of

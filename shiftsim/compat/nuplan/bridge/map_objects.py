@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
+
 from nuplan.common.actor_state.state_representation import Point2D, StateSE2
 from nuplan.common.maps.abstract_map_objects import (
     Intersection,
@@ -16,7 +17,6 @@ from nuplan.common.maps.abstract_map_objects import (
     StopLine,
 )
 from nuplan.common.maps.maps_datatypes import IntersectionType, LaneConnectorType, StopLineType
-
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import MapError
 from shiftsim.world.layers import Layer, Lists

@@ -10,7 +10,6 @@ from typing import Any
 from nuplan.common.actor_state.state_representation import StateSE2
 from nuplan.planning.simulation.observation.observation_type import DetectionsTracks
 from nuplan.planning.simulation.planner.abstract_planner import PlannerInitialization
-
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
 from shiftsim.errors import ConfigError, PlannerError

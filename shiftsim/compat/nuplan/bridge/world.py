@@ -4,6 +4,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+
 from nuplan.common.actor_state.agent import Agent
 from nuplan.common.actor_state.ego_state import EgoState
 from nuplan.common.actor_state.oriented_box import OrientedBox
@@ -22,7 +23,6 @@ from nuplan.planning.simulation.simulation_time_controller.simulation_iteration 
 )
 from nuplan.planning.simulation.trajectory.abstract_trajectory import AbstractTrajectory
 from nuplan.planning.simulation.trajectory.interpolated_trajectory import InterpolatedTrajectory
-
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, SceneInfo

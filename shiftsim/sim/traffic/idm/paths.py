@@ -9,8 +9,7 @@ unwrapped along the path and wrapped when a pose is read.
 import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.boxes import box_corners
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import interpolate, point_on_polyline, vertex_heading
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (

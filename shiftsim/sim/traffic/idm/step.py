@@ -3,7 +3,7 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
-from shiftsim.geometry.frames import wrap_angle
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
 from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
 from shiftsim.sim.traffic.idm.paths import extend_route, move_agent, set_box

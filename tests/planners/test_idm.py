@@ -11,10 +11,9 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.corridors import CLEAR, HIT, OPEN
-from shiftsim.planners.idm.corridor import UNKNOWN, Objects, find_lead, find_sides
-from shiftsim.planners.idm.planner import Idm
-from shiftsim.planners.routes.search import search_levels
+from shiftsim.geometry.polylines import CLEAR, HIT, OPEN
+from shiftsim.planners.idm import UNKNOWN, Idm, Objects, find_lead, find_sides
+from shiftsim.planners.routes.graph import search_levels
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.layers import make_lists
 from shiftsim.world.state import VX, AgentKind, TrafficLights

@@ -1,1 +1,0 @@
-"""DeepPlan's conversion of aerial recordings."""

@@ -1,1 +1,0 @@
-"""Generated towns and their recordings."""

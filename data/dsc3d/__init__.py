@@ -1,1 +1,0 @@
-"""Recordings in the format of DSC3D."""

@@ -1,1 +1,0 @@
-"""nuPlan's logs and maps, in both directions."""

@@ -1,1 +1,0 @@
-"""nuPlan's IDM planner."""

@@ -1,1 +1,0 @@
-"""Adapters of learned planners, and what they share."""

@@ -1,1 +1,0 @@
-"""What PDM-Closed and PLUTO share to score proposals."""

@@ -1,1 +1,0 @@
-"""Routes: blocks corrected, lanes along them, and the searches both need."""

@@ -1,1 +1,0 @@
-"""Planners written against other simulators' interfaces."""

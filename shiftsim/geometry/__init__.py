@@ -1,1 +1,0 @@
-"""Kernels that two subsystems need, each once: boxes, rings, polylines, frames."""

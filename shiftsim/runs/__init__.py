@@ -1,1 +1,0 @@
-"""Many rollouts: settings, tasks, workers, and the folder of a run."""

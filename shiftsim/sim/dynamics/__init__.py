@@ -1,1 +1,0 @@
-"""Vehicle dynamics: kinematic bicycle, LQR tracker, perfect tracking."""

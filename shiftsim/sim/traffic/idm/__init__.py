@@ -1,1 +1,0 @@
-"""Reactive traffic: nuPlan's IDM agents."""

@@ -1,1 +1,0 @@
-"""Replay: rollouts of one scenario as one HTML page that needs no server and no network."""

@@ -1,1 +1,0 @@
-"""What exists: states, maps, layers of a map, scenarios."""
