@@ -48,7 +48,7 @@ class Loop:
         self.ego = file.take("ego/current", -1, state.NUM_STATE)
         self.past = file.take("ego/initial_history", HISTORY_SAMPLES, state.NUM_STATE)
         self.number = 0
-        planner.reset(scene_info(self.scenario))
+        planner.reset(scene_info(self.scenario, planner=planner))
 
     @property
     def where(self) -> str:

@@ -79,7 +79,7 @@ def _compare_calls(
     where: str, seen: Seen, steps: Source, proposals: Source, facts: Source, file: Source
 ) -> None:
     planner, report = PdmClosed(), file.report
-    planner.reset(scene_info(seen.scenario))
+    planner.reset(scene_info(seen.scenario, planner=planner))
     count = len(seen.ego)
     times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
     steps.match(where, {"iteration": np.arange(count)})
