@@ -144,7 +144,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         scene, sight = self._scene, self.sight
         assert scene is not None
         assert sight is not None
-        ego, tracks = observation.history.ego[-1], observation.history.tracks
+        ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         poses, learned = proposals.best_proposals(output, ego[:3])
         seen, rows = sight.agents, sight.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
