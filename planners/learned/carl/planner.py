@@ -75,7 +75,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         scene = self._scene
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
-        ego = observation.history.ego[-1]
+        ego = observation.history.ego[-1].copy()
         center = state.center_poses(ego[:3], scene.vehicle)
         velocity = state.center_velocities(ego, scene.vehicle)
         if self._on_route is None:
