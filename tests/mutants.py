@@ -224,7 +224,7 @@ def run_tests(tests: list[str], quiet: bool = True) -> str:
         "-p",
         "no:cacheprovider",
         "-m",
-        "not thorough and not long",
+        "not slow and not thorough and not long",
     ]
     code = pytest.main([*options, *tests], plugins=[failure])
     if code not in (0, 1):
