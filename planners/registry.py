@@ -8,8 +8,8 @@ import copy
 import hashlib
 import importlib
 import inspect
+import logging
 import pickle
-import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of
+from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
+from shiftsim.files import import_named
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
 from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
@@ -34,6 +35,7 @@ _CANNOT_MAKE = (
     RuntimeError,
     OSError,
     ImportError,
+    SystemExit,
 )
 _NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedError, RuntimeError)
 
@@ -86,10 +88,8 @@ def planner_factory(spec: str) -> Any:
             f"planner {spec!r} is not of the form package.module:Class",
             hint="for example my_package.my_module:MyPlanner",
         )
-    if entry is None and (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)
     try:
-        module = importlib.import_module(module_name)
+        module = import_named(module_name)
     except MissingExtraError:
         raise
     except ImportError as error:
@@ -231,10 +231,14 @@ def takes_argument(source: Any, name: str) -> bool:
 
 
 def close_planner(planner: object) -> None:
-    """Let a planner release what it holds."""
+    """Let a planner release what it holds; where it cannot, its results are there nevertheless."""
     close = getattr(planner, "close", None)
     if callable(close):
-        close()
+        try:
+            close()
+        except (Exception, SystemExit) as error:
+            name = type(planner).__name__
+            logging.getLogger(__name__).warning("%s.close(): %s", name, readable(error))
 
 
 def _class_of(source: Any) -> Any:

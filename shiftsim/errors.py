@@ -3,6 +3,9 @@
 import difflib
 from collections.abc import Iterable
 
+_MAX_TEXT = 100_000  # characters
+_MAX_MESSAGE = 1000  # characters
+
 
 class ShiftsimError(Exception):
     """Base of all errors that a user can cause or repair.
@@ -12,12 +15,20 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        super().__init__(message)
+        super().__init__(_in_one_line(message))
         self.hint = hint
 
     def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
         """Keep the hint when the error travels between processes."""
         return type(self), (str(self), self.hint)
+
+
+def _in_one_line(message: str) -> str:
+    """The message; texts of other libraries and values of damaged files in it may be long."""
+    if len(message) <= _MAX_MESSAGE and "\n" not in message:
+        return message
+    text = " ".join(message.split())
+    return text if len(text) <= _MAX_MESSAGE else f"{text[:700]} … {text[-250:]}"
 
 
 class ConfigError(ShiftsimError):
@@ -54,6 +65,17 @@ class InvalidTrajectoryError(PlannerError):
 
 class MissingExtraError(ShiftsimError, ImportError):
     """An optional dependency is not installed."""
+
+
+def readable(value: object) -> str:
+    """A value as text that every file can hold, whatever its `__str__` does; cut where too long."""
+    try:
+        text = str(value)
+    except (Exception, SystemExit) as error:
+        text = (
+            f"{type(value).__name__}, which has no text: its __str__ raises {type(error).__name__}"
+        )
+    return text[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

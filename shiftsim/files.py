@@ -1,22 +1,25 @@
 """Where users' files are, and how files are read and written: settings in TOML, whole files only.
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
-half written: `whole_file` is the one way to replace one. `sources` says what a module of ours is
-made of, so that caches and runs notice when it changes.
+half written: `whole_file` is the one way to replace one. What a file that may be anybody's names is
+looked for inside its folder only, with `below`. `sources` says what a module of ours is made of, so
+that caches and runs notice when it changes.
 """
 
+import json
 import os
 import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, BinaryIO
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(
@@ -48,16 +51,70 @@ def remote_store_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
 
 
+def below(folder: Path, name: str) -> Path:
+    """The place of something in a folder by its relative path.
+
+    Raises:
+        DataError: It is outside of the folder, by its name or by a link.
+    """
+    place = folder / name
+    try:
+        if place.resolve().is_relative_to(folder.resolve()):
+            return place
+    except (OSError, ValueError, RuntimeError):  # a circle of links, a zero byte
+        pass
+    raise DataError(
+        f"{str(folder)!r}: {name!r} is outside of this folder",
+        hint="do not trust that folder: a file in it names, or is a link to, something elsewhere",
+    )
+
+
+def draft(path: Path) -> Path:
+    """Where a file is written before it takes its place; nothing is there, not even a link."""
+    partial = path.with_name(f".{path.name}.tmp")
+    partial.unlink(missing_ok=True)
+    return partial
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A file to be written, which then takes its place: whole or not at all."""
-    partial = path.with_name(f".{path.name}.tmp")
+    partial = draft(path)
     try:
         yield partial
         partial.replace(path)
     except BaseException:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # the error that counts is the first one
+            partial.unlink(missing_ok=True)
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one step, in UTF-8.
+
+    Half a surrogate pair, for which UTF-8 has no bytes, is written as JSON would escape it.
+    """
+    with whole_file(path) as partial:
+        partial.write_text(text, "utf-8", errors="backslashreplace", newline="")
+
+
+def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
+    """Where each line is, in words, and its JSON value; blank lines are left out.
+
+    A line ends at a line feed and nowhere else: JSON may hold the other separators of Unicode.
+
+    Raises:
+        DataError: A line is not JSON in UTF-8.
+    """
+    for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
+        where = f"{path}: line {number}"
+        if line.strip():
+            try:
+                yield where, json.loads(line.decode())
+            except (ValueError, RecursionError) as error:
+                raise DataError(
+                    f"{where}: not JSON: {error}", hint="repair or remove that line"
+                ) from error
 
 
 def locked(path: Path) -> BinaryIO:
@@ -101,6 +158,33 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def fresh_python(command: str, *words: str) -> tuple[list[str], dict[str, str]]:
+    """Words and environment that start an interpreter which knows this package.
+
+    What lies in the current folder is no code to it.
+    """
+    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
+    paths = os.pathsep.join(filter(None, search))
+    return [sys.executable, "-P", "-c", command, *words], {**os.environ, "PYTHONPATH": paths}
+
+
+def import_named(module: str) -> ModuleType:
+    """A module by its name; one that the user has named may lie in the current folder.
+
+    Nothing else is ever imported from there: a stray file is not code.
+
+    Raises:
+        ImportError: There is none, or it ends the process.
+    """
+    own = not module.startswith("shiftsim.")
+    if own and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+    try:
+        return import_module(module)
+    except SystemExit as error:  # else the command would end as if all were well
+        raise ImportError(f"it leaves with SystemExit: {error.code}", name=module) from error
+
+
 def load_attribute(what: str, name: str, hint: str) -> Any:
     """What a user names as `module:attribute`; `what` it is and the hint go into the message.
 
@@ -109,7 +193,7 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
     """
     module, _, attribute = name.partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
 

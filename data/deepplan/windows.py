@@ -15,6 +15,7 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.dsc3d.recording import Annotations
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.world.ranges import SETTINGS
 
 ROW_S = 0.05  # s between rows of a converted recording
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
@@ -96,6 +97,8 @@ def _check_type(name: str, value: Any) -> None:
     is_good, wanted = special.get(name, (is_number, "a number from 0 on"))
     if not is_good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+    if name in SETTINGS and value is not None and not SETTINGS[name].holds(float(value)):
+        raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
 
 
 def _are_texts(*values: object) -> bool:

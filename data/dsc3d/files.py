@@ -1,5 +1,6 @@
 """Columns of a DSC3D recording: read without trust, and refused with the place and the reason."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,19 +9,13 @@ import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import DSC3D, require
 
 POSITION = ("translation_x", "translation_y", "translation_z")
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 DIMENSION = ("dimension_x", "dimension_y", "dimension_z")
 VELOCITY = ("velocity_x", "velocity_y")
-# Far beyond any recording: what exceeds it is damaged, in another unit or hostile.
-_LARGEST = {  # absolute values
-    **dict.fromkeys(POSITION, 1e5),  # m from the local origin
-    **dict.fromkeys(ROTATION, 100.0),  # rad
-    **dict.fromkeys(DIMENSION, 500.0),  # m
-    "frame_id": 2.0**53,
-    "track_id": 2.0**53,
-}
+REPAIR = "get the recording again from its source, or repair the file"
 
 
 def read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
@@ -29,7 +24,7 @@ def read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
     Raises:
         ConversionError: The file is missing, not Parquet, or has more rows than `max_rows`.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # a name may be too long to ask for
         raise ConversionError(f"{path} is missing", "copy the whole recording folder")
     try:
         file = pq.ParquetFile(path)
@@ -43,7 +38,7 @@ def read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
         file = pq.ParquetFile(path, read_dictionary=names_only)  # long names are not repeated
         return file.read(names, use_threads=False)
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise ConversionError(f"{path}: not a readable Parquet file ({error})") from error
+        raise ConversionError(f"{path}: not a readable Parquet file ({error})", REPAIR) from error
 
 
 def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
@@ -53,23 +48,14 @@ def numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
         ConversionError: It is missing, or a value cannot be.
     """
     if key not in table.column_names:
-        raise ConversionError(f"{path}: column {key!r} is missing")
+        raise ConversionError(f"{path}: column {key!r} is missing", REPAIR)
     column = table[key]
     if column.null_count:
-        raise ConversionError(f"{path}: column {key!r} holds {column.null_count} nulls")
+        raise ConversionError(f"{path}: column {key!r} holds {column.null_count} nulls", REPAIR)
     try:
         values = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=False)
     except (pa.ArrowException, ValueError, TypeError) as error:
-        raise ConversionError(f"{path}: column {key!r} is {column.type}, need numbers") from error
-    largest = _LARGEST.get(key, np.inf)
-    bad = np.flatnonzero(~np.isfinite(values))
-    what, hint = "not a finite number", "repair or delete the rows; no position can be made up"
-    if not len(bad):
-        bad = np.flatnonzero(np.abs(values) > largest)
-        what = f"beyond ±{largest:g}"
-        hint = "check the unit of the column, and that the file is whole"
-    if len(bad):
-        place = f"{path}: column {key!r}, row {bad[0]}"
-        value = f"{values[bad[0]]:g} is {what} ({len(bad)} such values)"
-        raise ConversionError(f"{place}: {value}", hint)
+        what = f"{path}: column {key!r} is {column.type}, need numbers"
+        raise ConversionError(what, REPAIR) from error
+    require(DSC3D, key, values, f"{path}: column", error=ConversionError)
     return values

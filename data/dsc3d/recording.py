@@ -16,7 +16,15 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.dsc3d.files import DIMENSION, POSITION, ROTATION, VELOCITY, numbers, read_table
+from shiftsim.data.dsc3d.files import (
+    DIMENSION,
+    POSITION,
+    REPAIR,
+    ROTATION,
+    VELOCITY,
+    numbers,
+    read_table,
+)
 from shiftsim.data.dsc3d.motion import (
     believed_velocities,
     held_headings,
@@ -24,6 +32,7 @@ from shiftsim.data.dsc3d.motion import (
     track_medians,
 )
 from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import DSC3D, require
 from shiftsim.world.state import AgentKind
 
 _CATEGORIES = {
@@ -45,7 +54,6 @@ _MAX_DURATION = 12 * 3600.0  # s
 _MAX_TRACKS = 100_000
 _MAX_AT_ONCE = 5_000  # boxes in a frame
 _MAX_NAMES = 1_000  # distinct categories
-_MAX_OFFSET = 2e7  # m, of UTM coordinates
 
 
 @dataclass(frozen=True)
@@ -126,10 +134,10 @@ def open_site(src: Path) -> Site:
     path = found[0] / "data_meta.json"
     try:
         if path.stat().st_size > _MAX_META:
-            raise ConversionError(f"{path} is larger than {_MAX_META} bytes")
+            raise ConversionError(f"{path} is larger than {_MAX_META} bytes", REPAIR)
         meta = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError, RecursionError) as error:
-        raise ConversionError(f"{path}: not readable as JSON ({error})") from error
+        raise ConversionError(f"{path}: not readable as JSON ({error})", REPAIR) from error
     version = str(_key(meta, "interface_version", path))
     if version.split(".")[0] != "1":
         raise ConversionError(
@@ -153,7 +161,7 @@ def open_site(src: Path) -> Site:
             ),
         )
     except (TypeError, ValueError, OverflowError) as error:
-        raise ConversionError(f"{path}: a value has the wrong type ({error})") from error
+        raise ConversionError(f"{path}: a value has the wrong type ({error})", REPAIR) from error
     _check_site(site, path)
     return site
 
@@ -166,7 +174,7 @@ def find_map(site: Site, given: Path | None = None) -> Path:
     """
     if given is not None:
         if not given.is_file():
-            raise ConversionError(f"map {given} does not exist")
+            raise ConversionError(f"map {given} does not exist", REPAIR)
         return given
     others = sorted((site.folder / "map").glob("*.xodr"))
     for path in (site.folder / "map/map.xodr", *others, site.folder / "map.xodr"):
@@ -197,11 +205,13 @@ def read_recording(
     order = np.lexsort((row_frames, ids))
     track_ids, track = np.unique(ids[order], return_inverse=True)
     if len(track_ids) > _MAX_TRACKS:
-        raise ConversionError(f"{path}: {len(track_ids)} tracks, more than {_MAX_TRACKS}")
+        raise ConversionError(f"{path}: {len(track_ids)} tracks, more than {_MAX_TRACKS}", REPAIR)
     frame = _frame_index(frame_ids, row_frames[order], path)
     most = int(np.bincount(frame).max())
     if most > _MAX_AT_ONCE:
-        raise ConversionError(f"{path}: {most} boxes in one frame, more than {_MAX_AT_ONCE}")
+        raise ConversionError(
+            f"{path}: {most} boxes in one frame, more than {_MAX_AT_ONCE}", REPAIR
+        )
     twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(frame) == 0))
     if len(twice):
         one = f"track_id {track_ids[track[twice[0]]]} occurs twice"
@@ -252,13 +262,13 @@ def normalise_category(name: str) -> str:
 def _key(data: Any, dotted: str, path: Path) -> Any:
     for key in dotted.split("."):
         if not isinstance(data, dict) or key not in data:
-            raise ConversionError(f"{path}: key {dotted!r} is missing")
+            raise ConversionError(f"{path}: key {dotted!r} is missing", REPAIR)
         data = data[key]
     return data
 
 
 def _check_site(site: Site, path: Path) -> None:
-    is_place = (np.abs(site.offset) <= _MAX_OFFSET).all()
+    is_place = DSC3D["reference_utm.offset"].holds(site.offset).all()
     is_positive = 0 < site.frame_rate < np.inf and site.frame_distance > 0
     for is_good, what in (
         (1 <= site.zone <= 60, f"reference_utm.zone {site.zone!r} is not a UTM zone (1-60)"),
@@ -268,27 +278,32 @@ def _check_site(site: Site, path: Path) -> None:
         (site.recordings, "no recordings are listed under locations"),
     ):
         if not is_good:
-            raise ConversionError(f"{path}: {what}")
+            raise ConversionError(f"{path}: {what}", REPAIR)
+    for key, value in (("frame_rate", site.frame_rate), ("frame_distance", site.frame_distance)):
+        require(DSC3D, key, value, f"{path}: key", error=ConversionError)
     for name in site.recordings:
         if Path(name).name != name or name in ("", ".", ".."):
-            raise ConversionError(f"{path}: recording name {name!r} is not a plain folder name")
+            raise ConversionError(
+                f"{path}: recording name {name!r} is not a plain folder name", REPAIR
+            )
 
 
 def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArray, int]:
     table = read_table(path, ("frame_id", "time"), _MAX_FRAMES)
     ids = numbers(table, "frame_id", path).astype(np.int64)
     if len(ids) < 2:
-        raise ConversionError(f"{path}: {len(ids)} frames, need at least 2")
+        raise ConversionError(f"{path}: {len(ids)} frames, need at least 2", REPAIR)
     if (np.diff(ids) <= 0).any():
-        raise ConversionError(f"{path}: frame_id must increase strictly")
+        raise ConversionError(f"{path}: frame_id must increase strictly", REPAIR)
     apart = site.frame_distance
     if ((ids - ids[0]) % apart).any():
-        raise ConversionError(f"{path}: frame ids are not {apart} (frame_distance) apart")
+        raise ConversionError(f"{path}: frame ids are not {apart} (frame_distance) apart", REPAIR)
     if "time" not in table.column_names or not pa.types.is_timestamp(table["time"].type):
-        raise ConversionError(f"{path}: column 'time' with time stamps is missing")
+        raise ConversionError(f"{path}: column 'time' with time stamps is missing", REPAIR)
     if table["time"].null_count:
-        raise ConversionError(f"{path}: column 'time' holds nulls")
+        raise ConversionError(f"{path}: column 'time' holds nulls", REPAIR)
     stamps = table["time"].cast(pa.timestamp("us", "UTC")).cast(pa.int64()).to_numpy()
+    require(DSC3D, "time", stamps, f"{path}: column", error=ConversionError)
     clock = (ids - ids[0]) / site.frame_rate
     if clock[-1] > _MAX_DURATION:
         raise ConversionError(
@@ -303,12 +318,12 @@ def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArr
 
 def _frame_index(frame_ids: IntArray, wanted: IntArray, path: Path) -> IntArray:
     if not len(wanted):
-        raise ConversionError(f"{path}: the recording has no objects")
+        raise ConversionError(f"{path}: the recording has no objects", REPAIR)
     index = np.searchsorted(frame_ids, wanted)
     found = frame_ids[np.minimum(index, len(frame_ids) - 1)] == wanted
     if not found.all():
         what = f"frame_id {int(wanted[~found][0])} is not listed in frames.parquet"
-        raise ConversionError(f"{path}: {what} ({int((~found).sum())} such rows)")
+        raise ConversionError(f"{path}: {what} ({int((~found).sum())} such rows)", REPAIR)
     return index.astype(np.int64)
 
 
@@ -317,7 +332,9 @@ def _track_sizes(
 ) -> FloatArray:
     if not (sizes > 0).all():
         box = sizes[~(sizes > 0).all(axis=1)][0].tolist()
-        raise ConversionError(f"{path}: a box has the dimensions {box}; all must be positive")
+        raise ConversionError(
+            f"{path}: a box has the dimensions {box}; all must be positive", REPAIR
+        )
     first = np.searchsorted(track, np.arange(num_tracks))
     varying = (np.abs(sizes - sizes[first][track]) > 1e-3).any(axis=1)
     out = sizes[first].copy()
@@ -332,20 +349,20 @@ def _track_categories(
     table: pa.Table, order: IntArray, track: IntArray, path: Path, warnings: Counter[str]
 ) -> tuple[str, ...]:
     if "category" not in table.column_names:
-        raise ConversionError(f"{path}: column 'category' is missing")
+        raise ConversionError(f"{path}: column 'category' is missing", REPAIR)
     try:
         encoded = table["category"].unify_dictionaries().combine_chunks()
         if not pa.types.is_dictionary(encoded.type):
             encoded = encoded.cast(pa.string()).dictionary_encode()
         encoded = encoded.cast(pa.dictionary(pa.int32(), pa.string()))
     except (pa.ArrowException, ValueError) as error:
-        raise ConversionError(f"{path}: column 'category' does not hold names") from error
+        raise ConversionError(f"{path}: column 'category' does not hold names", REPAIR) from error
     if encoded.null_count:
-        raise ConversionError(f"{path}: column 'category' holds {encoded.null_count} nulls")
+        raise ConversionError(f"{path}: column 'category' holds {encoded.null_count} nulls", REPAIR)
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.combine_chunks()
     if len(encoded.dictionary) > _MAX_NAMES:
-        raise ConversionError(f"{path}: more than {_MAX_NAMES} categories")
+        raise ConversionError(f"{path}: more than {_MAX_NAMES} categories", REPAIR)
     names = [normalise_category(str(name)) for name in encoded.dictionary.to_pylist()]
     codes = encoded.indices.to_numpy()[order].astype(np.int64)
     votes = np.zeros((int(track[-1]) + 1, len(names)), np.int64)

@@ -6,11 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.nuplan.log import Log, as_numbers, read_rows, token_text
+from shiftsim.data.nuplan.log import Log, as_numbers, note_implausible, read_rows, token_text
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
 
+_COLUMNS = {
+    **{"x": "x_m", "y": "y_m", "heading": "heading_rad", "vx": "vx_mps", "vy": "vy_mps"},
+    **{"length": "length_m", "width": "width_m"},
+}
 _KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
 
 
@@ -26,7 +30,7 @@ class Boxes:
     values: FloatArray
 
 
-def read_boxes(log: Log, first: int, last: int) -> Boxes:
+def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = None) -> Boxes:
     """Objects of the rows first … last - 1.
 
     Raises:
@@ -55,6 +59,8 @@ def read_boxes(log: Log, first: int, last: int) -> Boxes:
     token = [token_text(rows[i][1], log.path, "track") for i in order.tolist()]
     boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
     _check_boxes(log, boxes)
+    counts = Counter[str]() if flaws is None else flaws
+    note_implausible(log, "lidar_box", _COLUMNS, boxes.values[:, :7], counts)
     return boxes
 
 

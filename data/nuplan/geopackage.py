@@ -17,6 +17,7 @@ import shapely
 
 from shiftsim.data.nuplan.sqlite import Database, Value, write_database
 from shiftsim.errors import DataError
+from shiftsim.world.ranges import MAP_EXTENT, NUPLAN_MAP, require
 
 REPAIR = "the map is damaged or not a nuPlan map; get it again from its source"
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)
@@ -55,7 +56,9 @@ class LayerTable:
     def integers(self, column: str, default: int) -> list[int]:
         """A column of codes; `default` where it is empty."""
         values = self.columns[column]
-        return [default if v is None else int(_id(v, self.name, column)) for v in values]
+        codes = [default if v is None else int(_id(v, self.name, column)) for v in values]
+        require(NUPLAN_MAP, column, np.array(codes, np.float64), f"layer {self.name!r}: column")
+        return codes
 
 
 class GeoPackage:
@@ -93,6 +96,8 @@ class GeoPackage:
             raise DataError(f"{where}: broken geometry: {error}", REPAIR) from error
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             raise DataError(f"{where}: a coordinate is not finite in epsg:{self.epsg}", REPAIR)
+        if len(x):
+            require(MAP_EXTENT, "extent", max(np.ptp(x), np.ptp(y)), f"{where}: its")
         projected = shapely.set_coordinates(shapes, np.column_stack([x, y]))
         ids = [_id(v, name, "fid") for v in raw["fid"]]
         return LayerTable(name, ids, list(projected), raw)

@@ -4,7 +4,7 @@ Columns with pickled content are never read.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.nuplan.sqlite import Database, open_database
 from shiftsim.errors import ConversionError, DataError
+from shiftsim.world.ranges import NUPLAN_LOG, STORE, require
 from shiftsim.world.state import NUM_STATE, LightStatus, TrafficLights
 
 LIDAR_CHANNEL = "MergedPointCloud"
@@ -30,6 +31,10 @@ _TABLES = {
     "lidar_box": "lidar_pc_token track_token x y yaw vx vy length width height",
     "scenario_tag": "lidar_pc_token type",
     "traffic_light_status": "lidar_pc_token lane_connector_id status",
+}
+_EGO_COLUMNS = {
+    **{"x": "x_m", "y": "y_m", "heading": "heading_rad", "vx": "vx_mps", "vy": "vy_mps"},
+    **{"acceleration_x": "ax_mps2", "acceleration_y": "ay_mps2"},
 }
 _LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
 _UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
@@ -122,6 +127,7 @@ def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]])
         time_us = np.array([row[1] for row in rows], np.int64)
     except (TypeError, ValueError, OverflowError) as error:
         raise _damaged(path, f"lidar_pc.timestamp is not an integer: {error}") from error
+    require(STORE, "time_us", time_us, f"{path}: lidar_pc")
     twice = np.flatnonzero(np.diff(time_us) <= 0)
     if len(twice):
         at = int(twice[0])
@@ -147,6 +153,25 @@ def as_numbers(path: Path, what: str, rows: Sequence[Sequence[object]]) -> Float
         return np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
         raise _damaged(path, f"{what} holds something that is no number: {error}") from error
+
+
+def note_implausible(
+    log: Log, table: str, columns: Mapping[str, str], values: FloatArray, flaws: Counter[str]
+) -> None:
+    """Count what is implausible in rows (K, C) of a table, as nuPlan runs it.
+
+    `columns` names the C columns, each with the one of a store that must be able to hold it.
+
+    Raises:
+        ConversionError: It cannot.
+    """
+    for index, (name, stored) in enumerate(columns.items()):
+        where = f"{log.path}: {table} {name!r} as"
+        is_speed = stored.endswith("_mps")
+        require(STORE, stored, values[:, index], where, error=ConversionError, may_be_nan=is_speed)
+        allowed = NUPLAN_LOG[f"{table} {name}"]
+        beyond = int((~allowed.holds(values[:, index])).sum())
+        flaws[f"{table}: {name} beyond {allowed}"] += beyond
 
 
 def has_goals(log: Log) -> BoolArray:
@@ -191,7 +216,7 @@ def _yaw(quaternions: FloatArray) -> FloatArray:
     return np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def read_ego(log: Log, first: int, last: int) -> FloatArray:
+def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None) -> FloatArray:
     """Ego states (R, 11) of the rows first … last - 1.
 
     nuPlan rule 415: steering, yaw rate and their rates are 0.
@@ -218,6 +243,8 @@ def read_ego(log: Log, first: int, last: int) -> FloatArray:
             f"{log.path}: ego_pose of lidar_pc {log.tokens[first + int(bad[0])]!r} is not finite",
             hint="leave this scenario out or repair the log",
         )
+    counts = Counter[str]() if flaws is None else flaws
+    note_implausible(log, "ego_pose", _EGO_COLUMNS, states[:, :7], counts)
     return states
 
 

@@ -15,6 +15,7 @@ from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
+from shiftsim.world.ranges import NUPLAN_MAP, require
 
 _MIN_OVERLAP = 1.0  # m^2; neighbouring polygons share borders up to rounding
 _BIKE_LANE = 1
@@ -269,6 +270,8 @@ def _speed(table: LayerTable, row: int) -> float | None:
     if not isinstance(value, int | float):
         what = f"speed_limit_mps of fid {table.ids[row]} is {value!r}"
         raise DataError(f"layer {table.name!r}: {what}", hint=REPAIR)
+    where = f"layer {table.name!r}: fid {table.ids[row]}:"
+    require(NUPLAN_MAP, "speed_limit_mps", float(value), where)
     return float(value)
 
 

@@ -127,10 +127,10 @@ def read_span(
         log_name=name,
         city=log.map_name,
         time_us=log.time_us[first:last].copy(),
-        tracks=make_tracks(read_boxes(log, first, last), first, last, flaws),
+        tracks=make_tracks(read_boxes(log, first, last, flaws), first, last, flaws),
         lights=read_lights(log, first, last, flaws),
     )
-    return recording, EgoTrace(name, EGO, 0, read_ego(log, first, last))
+    return recording, EgoTrace(name, EGO, 0, read_ego(log, first, last, flaws))
 
 
 def read_scenario(

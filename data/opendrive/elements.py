@@ -10,6 +10,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.records import Outline, Repeat, RoadObject, Signal
 from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import CHECK, OPENDRIVE
 
 CUBIC = ("a", "b", "c", "d")
 _LEADING_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)")
@@ -32,15 +33,27 @@ class Reader:
         """Count one thing that was repaired or left out."""
         self.warnings[kind] += 1
 
-    def number(self, element: Any, name: str, default: float = 0.0) -> float:
-        """An attribute as a number; may be NaN or infinite where the file says so."""
+    def number(
+        self, element: Any, name: str, default: float = 0.0, *, may_be_any: bool = False
+    ) -> float:
+        """An attribute as a number in its range.
+
+        One that is not finite, or with `may_be_any` any number at all, is left to the caller.
+        """
         text = element.get(name)
         if text is None:
             return default
         try:
-            return float(text)
+            value = float(text)
         except ValueError:
-            pass
+            value = self._rescued(element, name, text)
+        allowed = OPENDRIVE[f"{element.tag} {name}"]
+        if may_be_any or allowed.low <= value <= allowed.high or not np.isfinite(value):
+            return value
+        what = f"{element.tag} (line {element.sourceline}) has {name}={text[:40]!r}"
+        raise self.error(f"{what}, not within {allowed}", CHECK)
+
+    def _rescued(self, element: Any, name: str, text: str) -> float:
         found = _LEADING_NUMBER.match(text.replace(",", ".", 1))
         if found is None:
             raise self.error(
@@ -49,6 +62,14 @@ class Reader:
             )
         self.warn("badly written number")
         return float(found[1])
+
+    def finite(self, element: Any, name: str, default: float = 0.0) -> float:
+        """An attribute as a finite number in its range."""
+        value = self.number(element, name, default)
+        if not np.isfinite(value):
+            what = f"{element.tag} (line {element.sourceline}) has {name}={value}"
+            raise self.error(what, "write a finite number there")
+        return value
 
     def integer(self, element: Any, name: str) -> int | None:
         """An attribute as an integer; None where it is missing or not one."""
@@ -84,9 +105,9 @@ def read_object(element: Any, reader: Reader) -> RoadObject:
     outlines = [_read_outline(outline, reader) for outline in element.iter("outline")]
     return RoadObject(
         **{key: element.get(key, "") for key in ("id", "type", "subtype", "name")},
-        s=reader.number(element, "s"),
-        t=reader.number(element, "t"),
-        heading=reader.number(element, "hdg"),
+        s=reader.finite(element, "s"),
+        t=reader.finite(element, "t"),
+        heading=reader.finite(element, "hdg"),
         length=_optional(element, "length", reader),
         width=_optional(element, "width", reader),
         outlines=tuple(outline for outline in outlines if outline is not None),
@@ -110,13 +131,13 @@ def _read_outline(element: Any, reader: Reader) -> Outline | None:
 
 
 def _read_repeat(element: Any, reader: Reader) -> Repeat:
-    t_start = reader.number(element, "tStart")
+    t_start = reader.finite(element, "tStart")
     return Repeat(
-        reader.number(element, "s"),
-        reader.number(element, "length"),
-        reader.number(element, "distance"),
+        reader.finite(element, "s"),
+        reader.finite(element, "length"),
+        reader.finite(element, "distance"),
         t_start,
-        reader.number(element, "tEnd", t_start),
+        reader.finite(element, "tEnd", t_start),
     )
 
 
@@ -146,8 +167,8 @@ def read_signal(element: Any, reader: Reader) -> Signal:
         type=kind,
         subtype=subtype,
         dynamic=element.get("dynamic") == "yes",
-        s=reader.number(element, "s"),
-        t=reader.number(element, "t"),
+        s=reader.finite(element, "s"),
+        t=reader.finite(element, "t"),
         orientation=element.get("orientation", "none"),
         value=value,
         width=_optional(element, "width", reader),

@@ -9,6 +9,7 @@ from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.curves import ReferenceLine, length_error
 from shiftsim.data.opendrive.lanes import border_is_mirrored
 from shiftsim.errors import MapError
+from shiftsim.world.ranges import MAP_EXTENT, require
 
 GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
@@ -33,6 +34,9 @@ def prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
         _note_gaps(road, warnings)
         _note_lanes(road, warnings)
         roads[name] = _placed(road, od.offset) if od.offset else road
+    starts = [(g.x, g.y) for road in roads.values() for g in road.geometries]
+    extent = np.ptp(starts, axis=0).max() if starts else 0.0
+    require(MAP_EXTENT, "extent", extent, f"{od.source}: the roads'", error=MapError)
     total = sum(
         (road.section_end(index) - section.s) * len(section.lanes)
         for road in roads.values()

@@ -18,10 +18,9 @@ from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.elements import CUBIC, Reader, read_object, read_signal
 from shiftsim.data.opendrive.records import OpenDrive, Road
 from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import OPENDRIVE
 
 MAX_BYTES = 200_000_000
-MAX_COORDINATE = 1e8  # m, beyond any projection of the earth
-MAX_LENGTH = 1e5  # m, of one road
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
 _TOP_LEVEL = ("OpenDRIVE", "header", "road", "junction")
@@ -137,9 +136,7 @@ def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
     shift = element.find("offset")
     offset = None
     if shift is not None:
-        offset = tuple(reader.number(shift, key) for key in ("x", "y", "z", "hdg"))
-        if not np.isfinite(offset).all():
-            raise reader.error(f"offset is {offset}", "write finite numbers")
+        offset = tuple(reader.finite(shift, key) for key in ("x", "y", "z", "hdg"))
     revision = (element.get("revMajor", ""), element.get("revMinor", ""))
     return revision, (geo.strip() or None) if geo else None, offset
 
@@ -197,9 +194,10 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
         shape: Any = next((e for e in child if e.tag in records.SHAPES), None)
         kind = records.LINE if shape is None else shape.tag
         reader.counts[f"geometry {kind}"] += 1
-        length = reader.number(child, "length")
-        s = reader.number(child, "s")
-        x, y, heading = (reader.number(child, k, np.nan) for k in ("x", "y", "hdg"))
+        length, s = (reader.number(child, k, may_be_any=True) for k in ("length", "s"))
+        x, y, heading = (
+            reader.number(child, k, np.nan, may_be_any=True) for k in ("x", "y", "hdg")
+        )
         if shape is None:
             reader.warn("geometry without a shape taken as a line")
         if kind == records.PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
@@ -209,7 +207,8 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
         if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
             reader.warn("road left out: geometry is not finite")
             return None
-        if max(abs(x), abs(y)) > MAX_COORDINATE or max(abs(s), length) > MAX_LENGTH:
+        place = {"s": s, "x": x, "y": y, "hdg": heading, "length": length}
+        if not all(OPENDRIVE[f"geometry {key}"].holds(value) for key, value in place.items()):
             reader.warn("road left out: geometry is out of this world")
             return None
         if length < TINY_LENGTH:
@@ -255,7 +254,7 @@ def _contact(element: Any) -> str | None:
 def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, ...]:
     types = []
     for element in elements:
-        s, speed = reader.number(element, "s"), element.find("speed")
+        s, speed = reader.finite(element, "s"), element.find("speed")
         limit = None if speed is None else _read_speed(speed, reader)
         types.append(
             records.RoadType(s, element.get("type", "unknown"), element.get("country", ""), limit)
@@ -266,7 +265,7 @@ def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, 
 def _read_speed(element: Any, reader: Reader) -> records.Speed:
     unit = element.get("unit", "")
     reader.counts[f"speed {unit or 'm/s'}"] += 1
-    begin = reader.number(element, "sOffset")
+    begin = reader.finite(element, "sOffset")
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
         return records.Speed(begin, None)
@@ -285,7 +284,8 @@ def _read_section(element: Any, reader: Reader) -> records.LaneSection:
         number = reader.integer(child, "id")
         if number is None:
             raise reader.error(
-                f"lane (line {child.sourceline}) has id={child.get('id')!r}", "number the lanes"
+                f"lane (line {child.sourceline}) has id={child.get('id', '')[:40]!r}",
+                "number the lanes",
             )
         if number == 0:
             continue
@@ -298,10 +298,7 @@ def _read_section(element: Any, reader: Reader) -> records.LaneSection:
     nearest = [min((abs(n) for n in numbers if n * sign > 0), default=1) for sign in (-1, 1)]
     if any(step != 1 for step in steps) or nearest != [1, 1]:
         reader.warn("lane numbers with holes")
-    start = reader.number(element, "s")
-    if not np.isfinite(start):
-        raise reader.error(f"laneSection (line {element.sourceline}) has s={start}", "correct s")
-    return records.LaneSection(max(start, 0.0), lanes)
+    return records.LaneSection(max(reader.finite(element, "s"), 0.0), lanes)
 
 
 def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:

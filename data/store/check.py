@@ -1,5 +1,6 @@
 """Is a store sound? Everything that can be said about it without knowing where it came from."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import MANIFEST, digest, read_manifest
 from shiftsim.errors import DataError
-from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, VX, VY, AgentKind, LightStatus
 
@@ -52,7 +53,7 @@ def check_store(path: str | Path) -> list[Problem]:
     for token in store.tokens:
         where = f"scenario {token}"
         try:
-            scene = store.read(token)
+            scene = store.read(token, plausible=False)
             problems += [Problem(where, what) for what in _check_scenario(scene)]
             problems += [Problem(where, what, is_error=False) for what in _unusual(scene)]
         except DataError as error:
@@ -63,7 +64,7 @@ def check_store(path: str | Path) -> list[Problem]:
 def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
     for name, expected in files.items():
         path = store / name
-        if not path.is_file():
+        if not os.path.isfile(path):  # a name may be too long to ask for
             yield Problem(name, "the file is missing")
         elif digest(path) != expected:
             yield Problem(name, f"the content is not what {MANIFEST} says")
@@ -76,31 +77,6 @@ def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
 
 
 def _check_map(road: VectorMap) -> Iterator[str]:
-    num_edges, num_blocks = len(road.edges), len(road.blocks)
-    for name, layer in (("edges", road.edges), ("blocks", road.blocks)):
-        if len(layer.index) != len(layer):
-            yield f"{name}: an id occurs twice"
-        if not np.isfinite(layer.polygons.xy).all():
-            yield f"{name}: a polygon is not finite"
-    if not np.isfinite(road.baselines.xy).all():
-        yield "a baseline is not finite"
-    if (np.diff(road.baselines.ptr) < 2).any():
-        yield "a baseline has fewer than two vertices"
-    links = {
-        "incoming": (road.incoming.items, num_edges),
-        "outgoing": (road.outgoing.items, num_edges),
-        "left_lane": (road.left_lane, num_edges),
-        "right_lane": (road.right_lane, num_edges),
-        "block_of": (road.block_of, num_blocks),
-        "block_edges": (road.block_edges.items, num_edges),
-        "block_incoming": (road.block_incoming.items, num_blocks),
-        "block_outgoing": (road.block_outgoing.items, num_blocks),
-        "stop_lines": (road.stop_lines.items, len(road.stop_polygons)),
-        "intersection_of": (road.intersection_of, len(road.intersections)),
-    }
-    for name, (items, count) in links.items():
-        if ((items < NONE) | (items >= count)).any():
-            yield f"{name} names something that does not exist"
     limits = road.speed_limits[~np.isnan(road.speed_limits)]
     if ((limits < 0.0) | (limits > _MAX_SPEED)).any():
         yield f"a speed limit is not within 0 … {_MAX_SPEED:g} m/s"

@@ -10,21 +10,12 @@ from typing import Any
 import pyarrow as pa
 
 from shiftsim.arrays import sealed
+from shiftsim.data.store.plausible import require_sound
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
-from shiftsim.world.map import VectorMap
+from shiftsim.world.map import LAYERS, VectorMap
 
-_LAYERS = (
-    "edges",
-    "blocks",
-    "intersections",
-    "stop_polygons",
-    "crosswalks",
-    "walkways",
-    "car_parks",
-    "drivable_areas",
-)
 _LINES = ("baselines", "left_boundaries", "right_boundaries")
 _LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
 _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its unit
@@ -33,6 +24,7 @@ _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its u
     " turn_type is_bike intersection_kinds stop_kinds".split()
 }
 _UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
+_NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
 _WIDTHS = {"xy": (2,), "bounds": (4,)}  # columns of the arrays that have two axes
 _WHOLE = ("xy", "arc", "bounds", "grid")  # float parts; all others hold integers
 
@@ -42,7 +34,7 @@ def _columns(name: str, kind: type[Any]) -> dict[str, str]:
 
 
 def _groups() -> dict[str, type[Any]]:
-    kinds = {name: Polygons for name in _LAYERS}
+    kinds = {name: Polygons for name in LAYERS}
     return {**kinds, **dict.fromkeys(_LINES, Polylines), **dict.fromkeys(_LISTS, Lists)}
 
 
@@ -54,7 +46,7 @@ def _schema() -> pa.Schema:
     for name, column in _ARRAYS.items():
         numbers = pa.float64() if name == "speed_limits" else pa.int64()
         out[column] = pa.bool_() if name in ("has_traffic_lights", "is_bike") else numbers
-    for name in _LAYERS:
+    for name in LAYERS:
         out[f"{name}_ids"] = pa.string()
     out["left_boundary_ids"] = out["right_boundary_ids"] = pa.string()
     return pa.schema(
@@ -78,13 +70,12 @@ def write_map(path: Path, road: VectorMap) -> None:
             values[column] = getattr(flat, part).reshape(-1)
     for name, column in _ARRAYS.items():
         values[column] = getattr(road, name)
-    for name in _LAYERS:
+    for name in LAYERS:
         values[f"{name}_ids"] = list(getattr(road, name).ids)
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
     columns = [_one_row(values[field.name], field.type) for field in SCHEMA]
-    notes = ("name", "epsg", "num_lanes", "num_roadblocks", "flaws")
-    footer = {name: getattr(road, name) for name in notes}
+    footer = {name: getattr(road, name) for name in _NOTES}
     write_blocks(path, [pa.Table.from_arrays(columns, schema=SCHEMA)], footer)
 
 
@@ -107,9 +98,11 @@ def read_map_file(path: Path) -> VectorMap:
     items = {name: _items(file.read(columns=[name])[name]) for name in SCHEMA.names}
     pa.default_memory_pool().release_unused()
     try:
-        return _assemble(file.footer, items)
+        road = _assemble(file.footer, items)
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
+    require_sound(road, str(path))
+    return road
 
 
 def _items(column: pa.ChunkedArray) -> Any:
@@ -127,11 +120,14 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
             for part, column in _columns(name, kind).items()
         }
         parts[name] = kind(**flat)
-    for name in _LAYERS:
+    for name in LAYERS:
         ids = items[f"{name}_ids"]
         if len(ids) != len(parts[name].poly_ptr) - 1:
             raise ValueError(f"{name}: {len(ids)} ids")
         parts[name] = Layer(ids, parts[name])
     parts.update({name: items[column] for name, column in _ARRAYS.items()})
+    for name, kind in _NOTES.items():
+        if type(footer[name]) is not kind:
+            raise TypeError(f"{name} in the footer is {footer[name]!r}")
     pairs = zip(items["left_boundary_ids"], items["right_boundary_ids"], strict=True)
     return VectorMap(boundary_ids=tuple(pairs), **parts, **footer)

@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
+from shiftsim.data.store.plausible import require_plausible, require_rows
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
+from shiftsim.world.ranges import STORE, require
 from shiftsim.world.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -54,9 +57,24 @@ class ScenarioStore:
         if self.is_reviewed:
             len(self.reviews)  # a damaged file is noticed now
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
+        self._check_table(f"{path / tables.SCENARIOS}: column")
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
         self._egos: dict[tuple[str, str], tables.Table] = {}
+
+    def _check_table(self, where: str) -> None:
+        if len(self._row_of) != len(self.tokens):
+            raise DataError(f"{where} 'token' holds one twice", tables.REPAIR)
+        for field in schema.SCENARIOS:
+            column = self._table[field.name]
+            if field.name == "goal_pose" and not set(
+                pc.list_value_length(column).unique().to_pylist()
+            ) <= {0, 3}:
+                raise DataError(f"{where} 'goal_pose' holds no pose", tables.REPAIR)
+            if field.name in STORE:
+                flat = column.combine_chunks()
+                values = flat.flatten() if pa.types.is_list(field.type) else flat
+                require(STORE, field.name, values.to_numpy(zero_copy_only=False), where)
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -94,17 +112,25 @@ class ScenarioStore:
                 f"store {self.path.name!r} has no scenario {token!r}",
                 hint="its `tokens` are the scenarios it has",
             )
-        return window_of(self._table.slice(self._row_of[token], 1).to_pylist()[0])
+        path = str(self.path / tables.SCENARIOS)
+        try:
+            window = window_of(self._table.slice(self._row_of[token], 1).to_pylist()[0])
+        except (ValueError, RecursionError) as error:
+            what = f"{path}: scenario {token!r}: metadata is not JSON: {error}"
+            raise DataError(what, tables.REPAIR) from error
+        require_rows(window, path)
+        return window
 
-    def read(self, token: str) -> Scenario:
+    def read(self, token: str, *, plausible: bool = True) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.
 
         A route that was corrected in the review takes the place of the recorded one.
 
         Raises:
-            DataError: The store has no such scenario, or a file is missing or damaged.
+            DataError: The store has no such scenario, or a file is missing or damaged, or, where
+                `plausible` is asked for, holds a number outside of its range.
         """
-        scenario = self.read_recorded(token)
+        scenario = self.read_recorded(token, plausible=plausible)
         review = self.reviews.get(token) if self.is_reviewed else None
         if review is None or review.route is None:
             return scenario
@@ -113,7 +139,7 @@ class ScenarioStore:
         require_blocks(scenario.map, review, str(self.path / tables.REVIEW))
         return replace(scenario, route=review.route)
 
-    def read_recorded(self, token: str) -> Scenario:
+    def read_recorded(self, token: str, *, plausible: bool = True) -> Scenario:
         """As `read`, without the review."""
         window = self.window(token)
         first, last = window.first_row, window.last_row
@@ -121,7 +147,10 @@ class ScenarioStore:
         states = ego_states(self._ego(window.log_name, window.ego), first, last)
         # The span starts at the window's first row, and so do the ego states.
         ego = EgoTrace(window.log_name, window.ego, 0, states)
-        return make_scenario(recording, ego, window, self.map(recording.city), offset=first)
+        scene = make_scenario(recording, ego, window, self.map(recording.city), offset=first)
+        if plausible:
+            require_plausible(scene, window.ego, self.recording_folder(window.log_name))
+        return scene
 
     def map(self, city: str) -> VectorMap:
         """A map; kept for the next scenario of that city.

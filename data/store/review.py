@@ -15,7 +15,7 @@ from typing import Any
 
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import DataError
-from shiftsim.files import whole_file
+from shiftsim.files import below, read_json_lines, whole_file
 from shiftsim.world.map import VectorMap
 
 ACCEPT, REJECT, UNDECIDED = "accept", "reject", ""
@@ -98,23 +98,17 @@ def read_reviews(store: Path) -> Reviews:
     if not path.is_file():
         return Reviews()
     out: dict[str, Review] = {}
-    for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
-        if not line.strip():
-            continue
-        review = _review(line, f"{path}: line {number}")
+    for where, values in read_json_lines(path):
+        review = _review(values, where)
         if review.token in out:
-            what = f"{path}: line {number}: scenario {review.token!r} is reviewed twice"
+            what = f"{where}: scenario {review.token!r} is reviewed twice"
             raise DataError(what, hint="keep one of the lines")
         out[review.token] = review
     return Reviews(out.values())
 
 
-def _review(line: str, where: str) -> Review:
+def _review(values: Any, where: str) -> Review:
     names = [item.name for item in fields(Review)]
-    try:
-        values = json.loads(line)
-    except ValueError as error:
-        raise DataError(f"{where}: not JSON: {error}", hint="repair or remove that line") from error
     if not isinstance(values, dict) or set(values) - set(names) or "token" not in values:
         raise DataError(f"{where}: not a review", hint=f"its fields are {', '.join(names)}")
     route = values.get("route")
@@ -135,10 +129,12 @@ def _review(line: str, where: str) -> Review:
 
 def write_reviews(store: Path, reviews: Reviews) -> Path:
     """Write the reviews of a store, whole or not at all; returns the file."""
-    path = store / REVIEW
+    path = below(store, REVIEW)
     path.parent.mkdir(exist_ok=True)
     lines = [json.dumps(asdict(reviews[token]), ensure_ascii=False) + "\n" for token in reviews]
-    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
+    # half a surrogate pair, for which UTF-8 has no bytes, is written as JSON escapes it
+    options: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
+    with whole_file(path) as partial, partial.open("w", **options) as file:
         file.write("".join(lines))
         file.flush()
         os.fsync(file.fileno())

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,14 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store import schema
 from shiftsim.errors import DataError
-from shiftsim.files import whole_file
+from shiftsim.files import below, whole_file, write_text
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
 REVIEW = "review/review.jsonl"
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
+_SHA256 = re.compile("[0-9a-f]{64}")
 _FOOTER = "shiftsim"
 _COMPRESSION, _LEVEL = "zstd", 1
 _REPEATING = ("length_m", "width_m", "log", "type", "city")  # columns of few values
@@ -31,17 +34,17 @@ def file_name(name: str) -> str:
 
 def map_file(store: Path, city: str) -> Path:
     """File of a map."""
-    return store / "maps" / f"{file_name(city)}.parquet"
+    return below(store, f"maps/{file_name(city)}.parquet")
 
 
 def report_file(store: Path, city: str) -> Path:
     """File of what is known about the conversion of a city."""
-    return store / "reports" / f"{file_name(city)}.json"
+    return below(store, f"reports/{file_name(city)}.json")
 
 
 def recording_folder(store: Path, recording: str) -> Path:
     """Folder of a recording."""
-    return store / "recordings" / file_name(recording)
+    return below(store, f"recordings/{file_name(recording)}")
 
 
 def ego_file(folder: Path, name: str) -> Path:
@@ -70,16 +73,19 @@ def read_manifest(store: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text("utf-8"))
         kind, version = manifest["format"], manifest["version"]
         files, content = manifest["files"], manifest["hash"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged: {error!r}", hint=REPAIR) from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DataError(f"{path}: damaged: {error!r}"[:400], hint=REPAIR) from error
     if kind != schema.FORMAT or version != schema.VERSION:
         raise DataError(
             f"{path}: format {kind!r}, version {version!r}, not {schema.FORMAT!r} version"
             f" {schema.VERSION}",
             hint="convert the data again with this version of shiftsim",
         )
-    if not isinstance(files, dict) or not isinstance(content, str):
+    if not isinstance(files, dict):
         raise DataError(f"{path}: damaged: no list of files", hint=REPAIR)
+    for name, value in {"hash": content, **files}.items():
+        if not isinstance(value, str) or not _SHA256.fullmatch(value):
+            raise DataError(f"{path}: damaged: {name!r} has no SHA-256 digest", hint=REPAIR)
     return manifest
 
 
@@ -115,8 +121,7 @@ def write_blocks(
 def write_json(path: Path, content: object) -> None:
     """Write a JSON file in one step."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", "utf-8")
+    write_text(path, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
 class Table:
@@ -131,8 +136,12 @@ class Table:
         self.path = path
         try:
             self._file = pq.ParquetFile(path, memory_map=True)
-        except (OSError, pa.ArrowException) as error:
-            what = "is missing" if not path.exists() else f"is not a readable Parquet file: {error}"
+        except (OSError, ValueError, pa.ArrowException) as error:
+            what = (
+                "is missing"
+                if not os.path.exists(path)
+                else f"is not a readable Parquet file: {error}"
+            )
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:
@@ -149,7 +158,9 @@ class Table:
         text = (self._file.metadata.metadata or {}).get(_FOOTER.encode(), b"{}")
         try:
             footer: dict[str, object] = json.loads(text)
-        except ValueError as error:
+            if not isinstance(footer, dict):
+                raise ValueError("not an object")
+        except (ValueError, RecursionError) as error:
             raise DataError(f"{self.path}: unreadable footer: {error}", hint=REPAIR) from error
         return footer
 
@@ -171,7 +182,11 @@ class Table:
         """
         groups = list(range(self.num_blocks)) if blocks is None else blocks
         try:
-            return self._file.read_row_groups(groups, columns or self._names, use_threads=False)
+            found = self._file.read_row_groups(groups, columns or self._names, use_threads=False)
+            for column in found.columns:
+                if pa.types.is_string(column.type):
+                    column.validate(full=True)  # that it is UTF-8
+            return found
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
 

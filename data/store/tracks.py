@@ -13,6 +13,7 @@ from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.store import schema
 from shiftsim.data.store.tables import FRAMES, REPAIR, TRACKS, Table, ego_file, write_blocks
 from shiftsim.errors import DataError
+from shiftsim.world.ranges import STORE, require
 from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
 
 
@@ -127,7 +128,9 @@ def open_recording(folder: Path) -> StoredRecording:
     """
     frames = Table(folder / FRAMES, schema.FRAMES)
     tracks = Table(folder / TRACKS, schema.TRACKS)
-    head, names = _footer(frames, "log", "city", "connectors"), _footer(tracks, "tokens", "kinds")
+    head = _footer(frames, {"log": str, "city": str, "connectors": [str]})
+    names = _footer(tracks, {"tokens": [str], "kinds": [int]})
+    require(STORE, "kinds", np.array(names["kinds"], np.float64), f"{tracks.path}: footer")
     kinds = np.array(names["kinds"], np.int64)
     if len(kinds) != len(names["tokens"]):
         raise DataError(f"{tracks.path}: kinds and tokens differ in number", hint=REPAIR)
@@ -135,10 +138,14 @@ def open_recording(folder: Path) -> StoredRecording:
     return StoredRecording(head["log"], head["city"], frames, tracks, connectors, tokens, kinds)
 
 
-def _footer(table: Table, *names: str) -> Mapping[str, Any]:
-    for name in names:
-        if name not in table.footer:
-            raise DataError(f"{table.path}: the footer has no {name!r}", hint=REPAIR)
+def _footer(table: Table, kinds: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The footer, with entries of the kinds wanted; `[str]` is a list of texts."""
+    for name, kind in kinds.items():
+        value: Any = table.footer.get(name)
+        is_list = isinstance(kind, list) and isinstance(value, list)
+        good = all(type(v) is kind[0] for v in value) if is_list else type(value) is kind
+        if not good:
+            raise DataError(f"{table.path}: the footer has no good {name!r}", hint=REPAIR)
     return table.footer
 
 
@@ -153,7 +160,7 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     Raises:
         DataError: The file is damaged or does not have the rows.
     """
-    start = int(_footer(table, "first_row")["first_row"])
+    start = int(_footer(table, {"first_row": int})["first_row"])
     if not start <= first < last <= start + table.num_rows:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
     rows = _rows(table, first - start, last - start)

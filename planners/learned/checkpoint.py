@@ -19,8 +19,15 @@ from shiftsim.files import checkpoint_folder
 from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
-from shiftsim.planners.learned.reader import Contents, read_contents, read_json_object, unreadable
+from shiftsim.planners.learned.reader import (
+    ARGS_HINT,
+    Contents,
+    read_contents,
+    read_json_object,
+    unreadable,
+)
 from shiftsim.planners.table import PUBLISHED
+from shiftsim.world.ranges import CHECKPOINT
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
 SUFFIXES = (".ckpt", ".pth", ".safetensors")
@@ -187,7 +194,8 @@ def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
         try:
             value = json.loads(contents.metadata["args"])
         except ValueError as error:
-            raise CheckpointError(f"checkpoint {str(path)!r}: args in it are not JSON") from error
+            what = f"checkpoint {str(path)!r}: args in it are not JSON"
+            raise CheckpointError(what, ARGS_HINT) from error
         return value if isinstance(value, dict) else None
     beside = path.parent / "args.json"
     return read_json_object(beside) if beside.is_file() else None
@@ -213,7 +221,10 @@ def checked_state(
 
     A CheckpointError says which is missing, unexpected, of another shape, or not finite.
     """
-    wanted = match.empty_state(planner, args)
+    try:
+        wanted = match.empty_state(planner, args)
+    except CheckpointError as error:
+        raise CheckpointError(f"checkpoint {str(found.path)!r}: {error}", error.hint) from error
     problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)
@@ -223,10 +234,14 @@ def checked_state(
             hint=f"it must be of the published network, project {PUBLISHED[planner].project}",
         )
     state = {name: found.state[name].detach().to(wanted[name].dtype) for name in wanted}
-    bad = [name for name, value in state.items() if not bool(value.isfinite().all())]
+    allowed = CHECKPOINT["weight"]
+    bad = [
+        n for n, value in state.items() if not bool((value.double().abs() <= allowed.high).all())
+    ]
     if bad:
+        what = f"{bad[0]} has values that are not finite or beyond {allowed}"
         raise CheckpointError(
-            f"checkpoint {str(found.path)!r}: {bad[0]} has values that are not finite",
+            f"checkpoint {str(found.path)!r}: {what}",
             hint="the training has diverged, or the file is damaged",
         )
     return state

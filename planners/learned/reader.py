@@ -35,6 +35,7 @@ _STORAGES = {  # names of typed storages in a torch file
     "BoolStorage": "bool",
 }
 _TORCH_HINT = "download it again, and compare its size with the one that its authors publish"
+ARGS_HINT = "use the args.json that was published with the checkpoint"
 _WRITTEN_HINT = "give the checkpoint that the training wrote"
 # what content of any kind makes code raise that takes it for granted
 MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
@@ -69,7 +70,7 @@ def read_contents(path: Path) -> Contents:
         return _read_legacy(path)
     if head[8:9] == b"{":
         return _read_safetensors(path)
-    raise CheckpointError(f"checkpoint {str(path)!r} {_what_else(head)}")
+    raise CheckpointError(f"checkpoint {str(path)!r} {_what_else(head)}", _WRITTEN_HINT)
 
 
 def unreadable(path: Path, error: OSError) -> CheckpointError:
@@ -163,7 +164,8 @@ def _root_of(archive: zipfile.ZipFile, path: Path) -> str:
     names = archive.namelist()
     roots = [name.removesuffix("/data.pkl") for name in names if name.endswith("/data.pkl")]
     if not roots:
-        raise CheckpointError(f"checkpoint {str(path)!r} is a zip file that torch has not saved")
+        what = f"checkpoint {str(path)!r} is a zip file that torch has not saved"
+        raise CheckpointError(what, _WRITTEN_HINT)
     if f"{roots[0]}/constants.pkl" in names:
         text = f"checkpoint {str(path)!r} is a TorchScript program, not a state_dict"
         raise CheckpointError(text, _WRITTEN_HINT)
@@ -279,8 +281,10 @@ def read_json_object(path: Path) -> dict[str, Any]:
     """A JSON file that holds one object, such as `args.json`; else a CheckpointError."""
     try:
         value = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{str(path)!r} cannot be read as JSON ({error})") from error
+    except (OSError, ValueError, RecursionError) as error:
+        what = f"{str(path)!r} cannot be read as JSON ({error})"
+        raise CheckpointError(what, ARGS_HINT) from error
     if not isinstance(value, dict):
-        raise CheckpointError(f"{str(path)!r} holds {type(value).__name__}, not an object")
+        what = f"{str(path)!r} holds {type(value).__name__}, not an object"
+        raise CheckpointError(what, ARGS_HINT)
     return value

@@ -19,7 +19,6 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from functools import cache, wraps
 from importlib import import_module
-from pathlib import Path
 from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import typer
@@ -289,8 +288,6 @@ def _options(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # own planners, noises, metrics and traffic beside the user's files
     debug = "--debug" in words
     try:
         code = _run([word for word in words if word != "--debug"], debug)

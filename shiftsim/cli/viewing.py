@@ -48,15 +48,16 @@ def view(
     debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
+    from shiftsim.files import below
     from shiftsim.view.build import page_name, write_site
 
     gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
-    folder = out or run / "view"
+    folder = out or below(run, "view")
     if token is not None:
         token = gallery.find(token)
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / page_name(token)
-        page.write_text(gallery.page(token), encoding="utf-8")
+        gallery.page(token).save(page)
     else:
         with progress_bar(quiet=quiet) as advance:
             count = write_site(

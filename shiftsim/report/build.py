@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from shiftsim.errors import one_of
+from shiftsim.files import write_text
 from shiftsim.report import data_tables, details, paper
 from shiftsim.report.figures import Figure
 from shiftsim.report.groups import Group, made_up_note
@@ -112,7 +113,7 @@ def write_report(
             files = {f"report.{ENDINGS[style]}": text}
         for name, text in files.items():
             path = folder / name.replace("/", "-")
-            path.write_text(f"{text}\n", encoding="utf-8")
+            write_text(path, f"{text}\n")
             out.append(path)
     return out
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from shiftsim.errors import MissingExtraError
+from shiftsim.files import whole_file
 
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
@@ -33,7 +34,9 @@ def new_figure(**settings: Any) -> Any:
 
 def save_picture(figure: Any, path: Path) -> None:
     """Write a figure without time stamps: the same picture has the same bytes."""
-    figure.savefig(path, dpi=150, metadata=_PLAIN.get(path.suffix.lower()))
+    kind = path.suffix.lower()
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=150, format=kind[1:] or None, metadata=_PLAIN.get(kind))
 
 
 class Style(NamedTuple):

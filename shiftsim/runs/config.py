@@ -5,6 +5,7 @@ known here are checked by the constructor; planners, stores and splits are check
 The options of the command line are made from the fields, too.
 """
 
+import json
 import math
 import os
 import tomllib
@@ -166,6 +167,12 @@ def _check(name: str, value: Any, kind: Any, option: Option) -> None:
         good, wanted = _is_a(value, kind), kind.__name__
     if not good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+    try:
+        json.dumps(value, ensure_ascii=False, default=str).encode()
+    except UnicodeEncodeError as error:
+        raise ConfigError(
+            f"{name} is {value!r}, which is not text in UTF-8", hint="give it another name"
+        ) from error
     if isinstance(value, tuple) and len(set(value)) != len(value):
         raise ConfigError(f"{name} {list(value)!r}: a value is listed twice")
     if option.choices:
@@ -173,6 +180,11 @@ def _check(name: str, value: Any, kind: Any, option: Option) -> None:
     if option.least is not None and not option.least <= value < math.inf:
         wrong = "it cannot be negative" if option.least == 0 else "it must be at least 1"
         raise ConfigError(f"{name} is {value!r}; {wrong}")
+    if option.least is not None:
+        from shiftsim.world.ranges import SETTINGS  # not needed to show the options
+
+        if not SETTINGS[name].low <= value <= SETTINGS[name].high:
+            raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
 
 
 def _is_a(value: object, kind: type) -> bool:

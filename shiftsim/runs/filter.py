@@ -23,6 +23,7 @@ import pyarrow as pa
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.files import below
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
 from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
@@ -182,13 +183,12 @@ def filter_store(
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
     number = max(1, min(workers or default_workers(), len(opened)))
-    (path / _UNFINISHED).parent.mkdir(exist_ok=True)
-    journal = Journal(path / _UNFINISHED, keep=True)
+    unfinished = below(path, _UNFINISHED)
+    unfinished.parent.mkdir(exist_ok=True)
+    journal = Journal(unfinished, keep=True)
     try:
-        unfinished = [
-            row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])
-        ]
-        rows = (*_finished(path, conditions), *unfinished)
+        kept = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        rows = (*_finished(path, conditions), *kept)
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file
+from shiftsim.files import below, draft, whole_file, write_text
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import (
     JOURNAL,
@@ -42,6 +42,7 @@ from shiftsim.runs.rollouts import (
     decode_rows,
     next_number,
     num_rows,
+    part_file,
     part_name,
     without_key,
 )
@@ -86,8 +87,8 @@ class RunWriter:
             ConfigError: Another process works on this folder.
         """
         self.path = path
-        self.rollouts = path / FOLDER
         path.mkdir(parents=True, exist_ok=True)
+        self.rollouts = below(path, FOLDER)
         self._journal = Journal(path / JOURNAL, keep=resume)
         self.ended = dict(self._entries())
         before = _finished(path)
@@ -103,7 +104,7 @@ class RunWriter:
     def _entries(self) -> Iterator[tuple[Task, Ended]]:
         for number, key, values, has_rollout in self._journal.items():
             place = values["place"] and Place(
-                self.rollouts / values["place"][0], *values["place"][1:]
+                part_file(self.rollouts, values["place"][0]), *values["place"][1:]
             )
             yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
 
@@ -136,8 +137,10 @@ class RunWriter:
         `expected` are all tasks of a complete run; `absent` says why one has no result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
-        tables = [_SortedTable(self.path / f"{name}.parquet", TABLES[name]) for name in TABLES]
+        tables: list[_SortedTable] = []
         try:
+            for name, schema in TABLES.items():
+                tables.append(_SortedTable(self.path / f"{name}.parquet", schema))
             places = self._write_rollouts()
             tasks = iter(sorted(expected))
             while chunk := list(islice(tasks, _CHUNK)):
@@ -208,8 +211,8 @@ class RunWriter:
         return places
 
     def _write_manifest(self, manifest: dict[str, Any]) -> None:
-        with whole_file(self.path / "manifest.json") as partial:
-            partial.write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        text = json.dumps(manifest, indent=2, ensure_ascii=False)
+        write_text(self.path / "manifest.json", f"{text}\n")
 
 
 def _entry(found: tuple[TaskResult, Place | None]) -> tuple[str, dict[str, Any]]:
@@ -240,7 +243,7 @@ class _SortedTable:
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self.path, self.schema = path, schema
-        self._partial = path.with_name(f".{path.name}.tmp")
+        self._partial = draft(path)
         self._writer = pq.ParquetWriter(self._partial, schema, **WRITE_OPTIONS)
         self._pending = schema.empty_table()
 
@@ -266,7 +269,8 @@ class _SortedTable:
         """Remove what is not finished."""
         with suppress(OSError):
             self._writer.close()
-        self._partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a draft is in nobody's way
+            self._partial.unlink(missing_ok=True)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import locked
+from shiftsim.files import below, locked
 
 _SETTINGS = (
     "page_size = 16384",
@@ -26,6 +26,8 @@ _SETTINGS = (
     "synchronous = normal",  # a power failure takes the last entries, and nothing else
     "wal_autocheckpoint = 0",
 )
+# any other error is one of the disk
+_DAMAGED = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _INSERT = "insert into entries (key, content, data) values (?, ?, ?)"
 
 
@@ -38,8 +40,8 @@ class Journal:
         Raises:
             ConfigError: Another process works with it.
         """
-        self.path = path
-        self._appended = path.with_name(f"{path.name}-wal")
+        self.path = below(path.parent, path.name)
+        self._appended = below(path.parent, f"{path.name}-wal")
         try:
             self._lock = locked(path)
         except BlockingIOError as error:
@@ -118,19 +120,22 @@ class Journal:
         with suppress(FileNotFoundError):
             os.truncate(self._appended, 0)  # else closing copies all of it
         self.close()
-        self.path.unlink()
         self._appended.unlink(missing_ok=True)
+        self.path.unlink()  # at last: whoever finds it comes here again
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.DatabaseError as error:
-            if error.sqlite_errorcode == sqlite3.SQLITE_FULL:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path)) from error
-            raise DataError(
-                f"{str(self.path)!r} is damaged: {error}", hint="remove it, and start again"
-            ) from error
+            if error.sqlite_errorcode & 0xFF in _DAMAGED:
+                raise DataError(
+                    f"{str(self.path)!r} is damaged: {error}", hint="remove it, and start again"
+                ) from error
+            full = error.sqlite_errorcode == sqlite3.SQLITE_FULL
+            number = errno.ENOSPC if full else errno.EIO
+            text = os.strerror(number) if full else str(error)
+            raise OSError(number, text, str(self.path)) from error
 
 
 def has_entries(path: Path) -> bool:

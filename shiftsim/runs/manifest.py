@@ -112,10 +112,7 @@ def state_of(folder: Path) -> State:
         DataError: The folder holds something else.
         ConfigError: It holds an unfinished run of an earlier version.
     """
-    # a killed process leaves halves of files, whose names begin with a dot
-    if not folder.exists() or (
-        folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
-    ):
+    if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
     manifest = read_manifest(folder)
     if has_entries(folder / _EARLIER_JOURNAL):
@@ -130,6 +127,15 @@ def state_of(folder: Path) -> State:
         return "unfinished"
     counts = manifest["counts"]
     return "complete" if counts["ok"] == counts["expected"] else "failed"
+
+
+def _has_content(folder: Path) -> bool:
+    """Whether there is more than what a process leaves that was killed before it had begun.
+
+    These are halves of files, whose names begin with a dot, and a journal without entries.
+    """
+    names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+    return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
 def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") -> State:

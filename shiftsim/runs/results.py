@@ -15,12 +15,22 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import FOLDER, Place, RolloutReader, Task, complete_rollout, describe
+from shiftsim.runs.rollouts import (
+    FOLDER,
+    Place,
+    RolloutReader,
+    Task,
+    complete_rollout,
+    describe,
+    part_file,
+)
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
 FORMAT_VERSION = 4
@@ -78,6 +88,20 @@ TABLES = {
 }
 
 
+_RANGES = {  # by column
+    **dict.fromkeys(("cls", *SHORT_NAMES), "score"),
+    **dict.fromkeys(_DURATIONS, "duration"),
+    **{name: name for name in ("degraded_steps", *PLACE[1:])},
+}
+_MANIFEST = {  # what is read of it, and its type
+    **dict.fromkeys(("state", "split", "store"), str),
+    **dict.fromkeys(("config", "counts", "determining", "determining.planners"), dict),
+    **dict.fromkeys((f"determining.{name}" for name in ("store", "traffic", "controller")), str),
+    "config.planners": list,
+    "determining.thresholds.name": str,
+}
+
+
 @dataclass(frozen=True, slots=True)
 class TaskResult:
     """What became of one task."""
@@ -112,7 +136,10 @@ class Run:
     @cached_property
     def scores(self) -> pa.Table:
         """One row per finished task: closed-loop score and metric scores."""
-        return _read(self.path / "scores.parquet")
+        found, done = _read(self.path / "scores.parquet"), pc.equal(self.tasks["status"], OK)
+        if not found.select(Task._fields).equals(self.tasks.filter(done).select(Task._fields)):
+            raise _damaged(self.path / "scores.parquet", "its rows are not the finished tasks")
+        return found
 
     @cached_property
     def metrics(self) -> pa.Table:
@@ -172,7 +199,7 @@ def stored_place(
     run: Path, rollout: str | None, rollout_row: int, rollout_rows: int
 ) -> Place | None:
     """Where a rollout is, by the columns of `tasks.parquet`."""
-    return Place(run / FOLDER / rollout, rollout_row, rollout_rows) if rollout else None
+    return Place(part_file(run / FOLDER, rollout), rollout_row, rollout_rows) if rollout else None
 
 
 def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
@@ -180,7 +207,8 @@ def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
 
     A task without a result has none.
     """
-    scores, metrics = (_by_task(path / f"{name}.parquet") for name in ("scores", "metrics"))
+    files = [path / f"{name}.parquet" for name in ("scores", "metrics")]
+    scores, metrics = map(_by_task, files)
     for key, (row,) in _by_task(path / "tasks.parquet"):
         if row["status"] == MISSING:
             continue
@@ -189,27 +217,50 @@ def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
             Task(*key),
             **{name: row[name] for name in TEXTS},
             seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
-            scores=next(scores)[1][0] if done else {},
-            metrics=next(metrics)[1] if done else [],
+            scores=_next_of(key, scores, files[0])[0] if done else {},
+            metrics=_next_of(key, metrics, files[1]) if done else [],
         )
         yield result, stored_place(path, *(row[name] for name in PLACE))
 
 
 def _by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
     key = itemgetter(*Task._fields)
-    batches = pq.ParquetFile(path).iter_batches(batch_size=4096)
-    rows = (row for batch in batches for row in batch.to_pylist())
+    rows = (row for batch in _batches(path) for row in batch.to_pylist())
     for found, group in groupby(rows, key):
         yield found, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]
 
 
-def _read(path: Path) -> pa.Table:
+def _next_of(key: tuple[Any, ...], rows: Iterator[Any], path: Path) -> list[dict[str, Any]]:
+    found, values = next(rows, (None, []))
+    if found != key:
+        raise _damaged(path, f"the rows of {describe(Task(*key))} are missing")
+    return list(values)
+
+
+def _batches(path: Path) -> Iterator[pa.RecordBatch]:
+    """A table of a run, part by part, with columns of the right types and plausible numbers."""
     try:
-        return pq.ParquetFile(path).read(use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            f"{str(path)!r} cannot be read: {error}", hint="make the run again"
-        ) from error
+        file = pq.ParquetFile(path)
+        found = {column.name: column.type for column in file.schema_arrow}
+        for column in TABLES[path.stem]:
+            if found.get(column.name) != column.type:
+                raise _damaged(path, f"column {column.name!r} is missing or not {column.type}")
+        for batch in file.iter_batches(batch_size=4096):
+            batch.validate(full=True)  # that texts are UTF-8
+            for name in set(_RANGES) & set(batch.schema.names):
+                values = batch[name].drop_null().to_numpy()
+                require(RUN, _RANGES[name], values, f"{path}: column {name!r} as")
+            yield batch
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise _damaged(path, str(error)) from error
+
+
+def _damaged(path: Path, what: str) -> DataError:
+    return DataError(f"{str(path)!r} cannot be read: {what}", hint="make the run again")
+
+
+def _read(path: Path) -> pa.Table:
+    return pa.Table.from_batches(_batches(path), TABLES[path.stem])
 
 
 def open_run(path: str | Path) -> Run:
@@ -241,7 +292,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
         version, _ = manifest["format"], manifest["state"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(
             f"{str(folder)!r} is not a run folder: manifest.json is missing or broken",
             hint="name a folder that `shiftsim run` wrote",
@@ -251,6 +302,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
             hint="make the run again with this version of shiftsim",
         )
+    finished = {"counts.ok": int, "counts.expected": int} if manifest["state"] == "finished" else {}
+    for key, kind in {**_MANIFEST, **finished}.items():
+        value: Any = manifest
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if not isinstance(value, kind):
+            raise _damaged(path, f"{key!r} is missing or no {kind.__name__}")
     return manifest
 
 

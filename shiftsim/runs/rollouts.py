@@ -10,6 +10,7 @@ whose. The first columns name the task, for readers that know nothing of places.
 """
 
 import math
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -23,7 +24,9 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
+from shiftsim.files import draft
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
 _COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
@@ -54,6 +57,7 @@ TRACKS = _without_nulls(
     }
 )
 FOLDER = "rollouts"
+_PART = re.compile(r"part-\d+\.parquet")
 _MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
 _MAX_GROUP = 16, 16 << 20
 # states hardly compress and are never searched: what costs more time brings next to nothing
@@ -134,9 +138,13 @@ def _offsets(count: int, size: int) -> pa.Array:
     return pa.array(np.arange(count + 1, dtype=np.int32) * size)
 
 
-def _from_lists(column: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
+def _from_lists(column: pa.Array, shape: tuple[int, ...], where: str) -> np.ndarray:
     flat = column.flatten().to_numpy(zero_copy_only=False)
-    return np.array(flat.reshape(len(column), *shape))
+    try:
+        return np.array(flat.reshape(len(column), *shape))
+    except ValueError as error:
+        what = f"{where}: {len(flat)} numbers in {len(column)} rows of shape {shape}"
+        raise DataError(what, hint="make the run again") from error
 
 
 def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
@@ -154,18 +162,21 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
             f"scenario {scenario.token!r} in the store is not the one that was driven",
             hint="use the store that the manifest names",
         )
+    ego = _stack(rows, EGO_COLUMNS)
+    where = f"the rollout of scenario {scenario.token!r}"
+    require(RUN, "state", ego, f"{where}: an ego")
     tracks = scenario.tracks.rows(samples)
     if "track_valid" in rows.schema.names:
         shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
         stored: dict[str, Any] = {
-            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape))
+            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape), where)
             for name, shape in shapes.items()
         }
         tracks = replace(tracks, **stored)
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
-        ego=_stack(rows, EGO_COLUMNS),
+        ego=ego,
         tracks=tracks,
         traffic_lights=scenario.traffic_lights.rows(samples),
         expert_time_us=scenario.iteration_times,
@@ -173,7 +184,7 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
         route=scenario.route,
         commands=_stack(rows, _COMMAND_COLUMNS),
         noise=_stack(rows, _NOISE_COLUMNS),
-        plans=_from_lists(rows["plan_poses"], (-1, 3)),
+        plans=_from_lists(rows["plan_poses"], (-1, 3), where),
         planning_seconds=np.array(rows["planning_seconds"].to_numpy()),
         degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
     )
@@ -195,7 +206,7 @@ def num_rows(file: Path) -> int:
 def _opened(file: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(file)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise _unreadable(file, error) from error
 
 
@@ -221,6 +232,11 @@ class RolloutReader:
         """
         if self._file is None or self._path != place.file:
             self._file, self._path, self._group = _opened(place.file), place.file, -1
+            columns = {column.name: column.type for column in self._file.schema_arrow}
+            for column in [*STATES, *(c for c in TRACKS if c.name in columns)]:
+                if columns.get(column.name) != column.type:
+                    what = f"column {column.name!r} is missing or not {column.type}"
+                    raise _unreadable(place.file, TypeError(what))
             found = self._file.metadata
             lengths = [found.row_group(i).num_rows for i in range(found.num_row_groups)]
             self._starts = np.cumsum([0, *lengths])
@@ -247,6 +263,7 @@ class PartWriter:
         self.folder = folder
         self._number = next_number(folder)
         self._writer: pq.ParquetWriter | None = None
+        self._partial = folder  # what it writes to
         self._pending: list[tuple[Task, pa.RecordBatch]] = []
         self._count = self._rows = self._bytes = 0  # in the file under way
         self._pending_bytes = 0
@@ -276,14 +293,11 @@ class PartWriter:
     def _path(self) -> Path:
         return self.folder / part_name(self._number)
 
-    @property
-    def _partial(self) -> Path:
-        return self._path.with_name(f".{self._path.name}.tmp")
-
     def _write_group(self) -> None:
         rows = pa.Table.from_batches([batch for _, batch in self._pending]).combine_chunks()
         schema = pa.schema([*_KEY, *rows.schema])
         if self._writer is None:
+            self._partial = draft(self._path)
             self._writer = pq.ParquetWriter(self._partial, schema, **_WRITE_OPTIONS)
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))
@@ -308,7 +322,8 @@ class PartWriter:
             with suppress(OSError):
                 self._writer.close()
             self._writer = None
-            self._partial.unlink(missing_ok=True)
+            with suppress(OSError):  # a draft is in nobody's way
+                self._partial.unlink(missing_ok=True)
 
 
 def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
@@ -337,6 +352,19 @@ def without_key(rows: pa.RecordBatch) -> pa.RecordBatch:
 def part_name(number: int) -> str:
     """Name of a file of rollouts."""
     return f"part-{number:05d}.parquet"
+
+
+def part_file(folder: Path, name: str) -> Path:
+    """The file of rollouts in a folder that a table or a journal names.
+
+    Raises:
+        DataError: It cannot be the name of one.
+    """
+    if not _PART.fullmatch(name):
+        raise DataError(
+            f"{str(folder)!r}: {name!r} is no file of rollouts", hint="make the run again"
+        )
+    return folder / name
 
 
 def next_number(folder: Path) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
-from shiftsim.files import read_toml, store_path
+from shiftsim.files import below, read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
 from shiftsim.runs.results import Run
 
@@ -57,6 +57,11 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         wanted = run.manifest.get("bundle", {}).get("hash")
     else:
         place = store or run.manifest["store"]
+        if "://" in place and store is None:  # which may be anybody's
+            raise DataError(
+                f"the store of run {run.path.name!r} is behind the URL {place!r}",
+                hint=f"if you trust it: --store {place}",
+            )
         path = store_path(place)
         if "://" not in place and not path.exists():
             raise DataError(
@@ -76,9 +81,9 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
     """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    target = folder / BUNDLE
+    target = below(folder, BUNDLE)
     if not target.exists():
-        partial = folder / f".{BUNDLE}.tmp"
+        partial = below(folder, f".{BUNDLE}.tmp")
         shutil.rmtree(partial, ignore_errors=True)
         _copy(store, partial, set(tokens))
         partial.rename(target)
@@ -165,7 +170,7 @@ def read_split(path: Path) -> Split:
         listed = table.get("tokens")
     else:
         try:
-            listed = path.read_text().split()
+            listed = path.read_text("utf-8").split()
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(
                 f"cannot read split {str(path)!r}: {error}", hint="check the path"

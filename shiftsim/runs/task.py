@@ -14,14 +14,15 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 import numpy as np
+import pyarrow as pa
 
 from shiftsim.data.store.reading import open_store
-from shiftsim.errors import ShiftsimError
+from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.results import FAILED, OK, TaskResult
+from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, simulate, simulate_together
@@ -131,7 +132,8 @@ class TaskRunner:
         began = perf_counter()
         try:
             logs = simulate_together(list(rollouts.values()))
-        except Exception:  # the shared pass itself failed: too little memory for all of them?
+        except (Exception, SystemExit):
+            # the shared pass itself failed: too little memory for all of them?
             return [self._alone(task) for task in batch.tasks]
         share = (perf_counter() - began) / max(1, len(logs))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
@@ -191,14 +193,18 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
     """What a piece of work returns or, whatever goes wrong, the failed result of its task."""
     try:
         return work()
-    except Exception as error:  # the one place: a task that fails is a row, not the end of a run
-        kind = "" if isinstance(error, ShiftsimError) else f"{type(error).__name__}: "
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit as well
+        # the one place: a task that fails is a row, not the end of a run
+        is_ours = isinstance(error, ShiftsimError)
+        kind = "" if is_ours else f"{type(error).__name__}: "
         return TaskResult(
             task,
             FAILED,
-            error=f"{kind}{error}",
-            hint=getattr(error, "hint", ""),
-            traceback=traceback.format_exc(),
+            error=kind + readable(error),
+            hint=readable(getattr(error, "hint", "")) if is_ours else "",
+            traceback=readable(traceback.format_exc()),
         )
 
 
@@ -229,8 +235,22 @@ def score_rollout(
         **profile,
     }
     start_us = int(log.time_us[0])
-    rows = [_metric_row(row, start_us) for row in (*result.rows, *result.extra)]
-    return scores, [{**row, **profile} for row in rows]
+    rows = [_metric_row(row, start_us) for row in result.rows]
+    own = _storable([_metric_row(row, start_us) for row in result.extra])
+    return scores, [{**row, **profile} for row in (*rows, *own)]
+
+
+def _storable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of custom metrics as the table will hold them."""
+    table = TABLES["metrics"]
+    try:
+        schema = pa.schema([table.field(name) for name in rows[0]] if rows else [])
+        return list(pa.Table.from_pylist(rows, schema).to_pylist())
+    except (pa.ArrowException, UnicodeError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"a custom metric returned what metrics.parquet cannot hold: {error}",
+            hint="return a number, or a MetricRow of texts and numbers",
+        ) from error
 
 
 def _metric_row(row: MetricRow, start_us: int) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from time import monotonic
 from typing import Any, Generic, Literal, TypeVar
 
 from shiftsim.errors import ConfigError
-from shiftsim.files import PACKAGE
+from shiftsim.files import fresh_python
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -266,10 +266,8 @@ class Pool:
 def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
     """Start an interpreter that serves a socket; interrupts from the terminal do not reach it."""
     command = "import sys, shiftsim.runs.workers as w; w.serve(*map(int, sys.argv[1:]))"
-    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
-    paths = os.pathsep.join(filter(None, search))
-    words = [sys.executable, "-c", command, str(os.getpid()), str(theirs.fileno())]
-    env = {**os.environ, **_ONE_THREAD, "PYTHONPATH": paths}
+    words, env = fresh_python(command, str(os.getpid()), str(theirs.fileno()))
+    env |= _ONE_THREAD
     if sys.platform == "win32":
         group = subprocess.CREATE_NEW_PROCESS_GROUP
         process = subprocess.Popen(words, stdin=subprocess.PIPE, creationflags=group, env=env)

@@ -6,7 +6,10 @@ iterations: the state reached after the last planner call is never stored.
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
 
@@ -45,3 +48,24 @@ class SimulationLog:
     plans: FloatArray
     planning_seconds: FloatArray
     degraded: BoolArray
+
+
+def as_recorded(scenario: Scenario) -> SimulationLog:
+    """The recording of a scenario as if it had been driven, without commands and plans."""
+    rows = scenario.iteration_rows[:-1]
+    count = len(rows)
+    return SimulationLog(
+        token=scenario.token,
+        time_us=scenario.time_us[rows],
+        ego=scenario.ego[rows],
+        tracks=scenario.tracks.rows(rows),
+        traffic_lights=scenario.traffic_lights.rows(rows),
+        expert_time_us=scenario.iteration_times,
+        expert_ego=scenario.expert,
+        route=scenario.route,
+        commands=np.full((count, 2), np.nan),
+        noise=np.zeros((count, 2)),
+        plans=np.full((count, 11, 3), np.nan),
+        planning_seconds=np.zeros(count),
+        degraded=np.zeros(count, np.bool_),
+    )

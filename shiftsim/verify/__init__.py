@@ -12,28 +12,19 @@ from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
 MODES = ("NR", "R", "PT")
-# Kind of folder: patterns that must all match something in it (`a|b`: either), and what compares it
-KINDS = {
-    "nuplan": (("scenes.json", "expected/*.parquet"), "nuplan:verify_nuplan"),
-    "nuplan_format": (("devkit_readback.json",), "nuplan.format:verify_nuplan_format"),
-    "metric_worlds": (("metric_world_*.json",), "metric_worlds:verify_metric_worlds"),
-    "pdm": (
-        ("kernels/*.npz|kernels/*.json|routes.json|idm_calls.json|loop/steps.parquet",),
-        "pdm:verify_pdm",
-    ),
-    "nets": (
-        ("state_dict.json|route_correction*|plantf|pluto|diffusion_planner|carl",),
-        "nets:verify_nets",
-    ),
+KINDS = {  # module of `verify_<kind>`, patterns that must all match something (`a|b`: either)
+    "nuplan": ("nuplan", "scenes.json", "expected/*.parquet"),
+    "nuplan_format": ("nuplan.format", "devkit_readback.json"),
+    "metric_worlds": ("metric_worlds", "metric_world_*.json"),
+    "pdm": ("pdm", "kernels/*.npz|kernels/*.json|routes.json|idm_calls.json|loop/steps.parquet"),
+    "nets": ("nets", "state_dict.json|route_correction*|plantf|pluto|diffusion_planner|carl"),
     "dynamics": (
-        (
-            "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",
-        ),
-        "dynamics:verify_dynamics",
+        "dynamics",
+        "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",
     ),
-    "dsc3d_sample": (("expected_rows.parquet", "data"), "dsc3d:verify_dsc3d_sample"),
-    "dsc3d_synthetic": (("**/expected_ego_20hz.parquet",), "dsc3d:verify_dsc3d_synthetic"),
-    "opendrive": (("*.refline.parquet",), "opendrive:verify_opendrive"),
+    "dsc3d_sample": ("dsc3d", "expected_rows.parquet", "data"),
+    "dsc3d_synthetic": ("dsc3d", "**/expected_ego_20hz.parquet"),
+    "opendrive": ("opendrive", "*.refline.parquet"),
 }
 
 
@@ -58,12 +49,10 @@ def verify(
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
     options = {"mode": mode, "scenes": scenes, "maps": maps}
-    for patterns, function in KINDS.values():
+    for kind, (module, *patterns) in KINDS.items():
         if all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns):
-            module, _, name = function.partition(":")
-            part = getattr(import_module(f"shiftsim.verify.{module}"), name)
-            report = Report()
-            takes = signature(part).parameters
+            part = getattr(import_module(f"shiftsim.verify.{module}"), f"verify_{kind}")
+            report, takes = Report(), signature(part).parameters
             part(folder, report, **{name: options[name] for name in options if name in takes})
             return report
     raise DataError(

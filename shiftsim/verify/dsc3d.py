@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pyproj
 import shapely
 
@@ -24,7 +22,7 @@ from shiftsim.data.opendrive.lanes import LaneKey, section_borders
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
-from shiftsim.verify.files import Groups, Source, read_fields, verify_files
+from shiftsim.verify.files import Groups, Source, read_fields, read_table, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import center_poses
@@ -36,6 +34,10 @@ _SIZE = 1e-6  # m, stored as 32 bit floats
 _SPEED = 1e-5  # m/s
 _SINGLE = 5e-7  # rad, two units in the last place of single-precision headings
 _STEP_S = 0.05
+# of columns and fields; `_EXACT` where none is named
+_COLUMNS = {"utm_x": _UTM, "utm_y": _UTM, "": _EXACT}
+_SUMMARY = {"dt_s": 1e-12, "max_yaw_minus_velocity_heading_rad": _SINGLE, "": _EXACT}
+_TRACK = {"speed_min": _SPEED, "speed_max": _SPEED, "path_length_xy": _SIZE, "": _EXACT}
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
 _SWITCH, _JUMP = 1.0, 10.0  # costs of a lane sequence: to a linked lane, to any other
 _DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
@@ -122,29 +124,30 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     keys = [list(local.keys_at(x, y).values()) for x, y in recording.bottom[:, :2].tolist()]
     sample = Sample(site, recording, keys)
 
-    def table(compare: Callable[[Source, int, Sample], None], path: Path) -> None:
-        groups = Groups(path, report, ("track_id",))
-        for number, track in enumerate(recording.track_ids.tolist()):
-            compare(groups[(str(track),)], number, sample)
+    def table(columns: Callable[[int, Sample], dict[str, Any]], path: Path) -> None:
+        groups, names = Groups(path, report, ("track_id",)), recording.track_ids.astype(str)
+        report.compare("tracks", path.stem, sorted(names), sorted(name for (name,) in groups))
+        for number, name in enumerate(names.tolist()):
+            groups.match((name,), columns(number, sample), _COLUMNS, angles={"yaw"})
         groups.finish()
 
     parts: dict[str, Callable[[Path], object]] = {
         "data": lambda path: report.note(_DERIVED),
-        "expected_rows.parquet": partial(table, _verify_rows),
-        "expected_20hz.parquet": partial(table, _verify_samples),
+        "expected_rows.parquet": partial(table, _rows),
+        "expected_20hz.parquet": partial(table, _samples),
         "expected.json": lambda path: _verify_summary(read_fields(path, report), sample),
     }
     verify_files(folder, report, parts)
 
 
-def _verify_rows(table: Source, number: int, sample: Sample) -> None:
-    """Compare the rows of a track as recorded."""
+def _rows(number: int, sample: Sample) -> dict[str, Any]:
+    """The rows of a track as recorded."""
     site, recording, keys = sample
     rows = np.flatnonzero(recording.track == number)
     utm = recording.bottom[rows, :2] + site.offset[:2]
     to_degrees = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True)
     lanes = [keys[row][0] if len(keys[row]) == 1 else LaneKey("", 0, 0) for row in rows.tolist()]
-    columns = {
+    return {
         "frame_id": recording.frame[rows] * site.frame_distance,
         "road": [key.road for key in lanes],
         "lane": [key.lane for key in lanes],
@@ -153,11 +156,10 @@ def _verify_rows(table: Source, number: int, sample: Sample) -> None:
         **_named("utm_x utm_y", utm),
         **_named("lon lat", np.column_stack(to_degrees.transform(*utm.T))),
     }
-    table.match(f"track {number}", columns, {"utm_x": _UTM, "utm_y": _UTM, "": _EXACT})
 
 
-def _verify_samples(table: Source, number: int, sample: Sample) -> None:
-    """Compare a track resampled at 20 Hz."""
+def _samples(number: int, sample: Sample) -> dict[str, Any]:
+    """A track resampled at 20 Hz."""
     recording = sample.recording
     runs = find_runs(recording, ConversionConfig().max_hole_s)
     (run,) = np.flatnonzero(runs.track == number)  # of one piece
@@ -167,16 +169,14 @@ def _verify_samples(table: Source, number: int, sample: Sample) -> None:
     steps = np.arange(ends[0], ends[1] + 1)
     times = steps * _STEP_S
     samples = sample_runs(recording, runs, np.full(len(steps), run, np.int64), times)
-    bottom = [np.interp(times, clock, recording.bottom[rows, axis]) for axis in (0, 1)]
-    columns = {
+    return {
         "step": steps.astype(np.int64),
         "t": times,
-        **_named("x y", np.transpose(bottom)),
+        "x": np.interp(times, clock, recording.bottom[rows, 0]),
+        "y": np.interp(times, clock, recording.bottom[rows, 1]),
+        "yaw": samples.poses[:, 2],
         **_named("vx vy", samples.velocities),
     }
-    where, yaw = f"track {number}", samples.poses[:, 2]
-    table.match(where, columns, _EXACT)
-    table.report.compare("20 Hz yaw", where, yaw, table["yaw"], atol=_EXACT, angle=True)
 
 
 def _named(names: str, columns: np.ndarray) -> dict[str, np.ndarray]:
@@ -185,60 +185,49 @@ def _named(names: str, columns: np.ndarray) -> dict[str, np.ndarray]:
 
 def _verify_summary(expected: Source, sample: Sample) -> None:
     site, recording, keys = sample
-    raw, yaw = _raw_columns(site, recording.name), recording.angles[:, 0]
+    report, folder = expected.report, site.folder / "annotations" / recording.name
+    raw = read_table(folder / "annotations.parquet", report)
     order = np.lexsort((raw["frame_id"], raw["track_id"]))
     velocity = np.column_stack([raw[f"velocity_{axis}"] for axis in "xyz"])[order]
-    stamps, moving = raw["time"], np.arctan2(velocity[:, 1], velocity[:, 0])
-    lag = (stamps - stamps[0]) * 1e-6 - recording.clock
+    stamps, yaw = read_table(folder / "frames.parquet", report)["time"], recording.angles[:, 0]
+    stamps = stamps.astype("datetime64[us]")
+    lag = (stamps - stamps[0]).astype(np.int64) * 1e-6 - recording.clock
+    moving = np.arctan2(velocity[:, 1], velocity[:, 0])
     ours = {
         "rows": len(recording.track),
         "frames": len(recording.clock),
         "dt_s": recording.period,
         "rate_hz": 1.0 / recording.period,
         "duration_s": recording.duration,
-        "first_time": _stamp(stamps[0]),
-        "last_time": _stamp(stamps[-1]),
+        "first_time": str(stamps[0]).replace("T", " ") + "+00:00",
+        "last_time": str(stamps[-1]).replace("T", " ") + "+00:00",
         "max_abs_time_minus_frameid_over_rate_s": np.abs(lag).max(),
         "max_yaw_minus_velocity_heading_rad": np.abs(wrap_angles(yaw - moving)).max(),
         "max_yaw_minus_rotation_z_rad": np.abs(yaw - raw["rotation_z"][order]).max(),
         "boxes_in_exactly_one_driving_lane": sum(len(key) == 1 for key in keys),
         "steps_20hz": int(np.floor(recording.duration / _STEP_S + _EXACT)) + 1,
     }
-    atol = {"dt_s": 1e-12, "max_yaw_minus_velocity_heading_rad": _SINGLE, "": _EXACT}
-    expected.match("recording", ours, atol, quantity="summary")
+    expected.match("recording", ours, _SUMMARY, quantity="summary")
     speed = np.linalg.norm(velocity, axis=1)
     tracks, names = expected.each("tracks")[0], recording.track_ids.astype(str).tolist()
-    expected.report.compare("tracks", expected.name, names, sorted(tracks, key=int))
+    report.compare("tracks", expected.name, names, sorted(tracks, key=int))
     for number, name in enumerate(names):
         rows = np.flatnonzero(recording.track == number)
         path = np.diff(recording.bottom[rows, :2], axis=0)
-        lanes = sorted({(key.road, key.lane) for row in rows for key in keys[row]})
-        (track,), size = tracks.each(name), recording.sizes[number]
         ours = {
             "category": recording.categories[number],
             "rows": len(rows),
-            **_named("length width height", size),
+            **_named("length width height", recording.sizes[number]),
             "speed_min": speed[rows].min(),
             "speed_max": speed[rows].max(),
             "path_length_xy": np.linalg.norm(path, axis=1).sum(),
+            "road_lane": [
+                [*lane] for lane in {(k.road, k.lane) for row in rows for k in keys[row]}
+            ],
         }
-        atol = {"speed_min": _SPEED, "speed_max": _SPEED, "path_length_xy": _SIZE, "": _EXACT}
-        track.match(f"track {name}", ours, atol, quantity="track")
-        theirs = sorted(map(tuple, track["road_lane"]))
-        expected.report.compare("track road_lane", f"track {name}", repr(lanes), repr(theirs))
+        track = tracks.each(name)[0]
+        track.match(f"track {name}", ours, _TRACK, quantity="track", unordered={"road_lane"})
     expected.finish()
-
-
-def _raw_columns(site: Site, name: str) -> dict[str, Any]:
-    folder = site.folder / "annotations" / name
-    table = pq.read_table(folder / "annotations.parquet").drop_columns(["category"])
-    time = pq.read_table(folder / "frames.parquet")["time"].cast(pa.timestamp("us", "UTC"))
-    raw = {key: table[key].to_numpy() for key in table.column_names}
-    return {**raw, "time": time.cast(pa.int64()).to_numpy()}
-
-
-def _stamp(time_us: int) -> str:
-    return str(np.datetime64(int(time_us), "us")).replace("T", " ") + "+00:00"
 
 
 def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> None:
@@ -253,50 +242,52 @@ def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> N
         return
     parts = {
         "data": lambda path: report.note(_DERIVED),
-        "expected.json": lambda path: _verify_scripted(path, report, maps),
+        "expected.json": lambda path: _verify_scripted(read_fields(path, report), folder, maps),
         "expected_ego_20hz.parquet": lambda path: None,  # with `expected.json`
     }
     verify_files(folder, report, parts)
 
 
-def _verify_scripted(path: Path, report: Report, maps: Path | None) -> None:
-    folder, name = path.parent, path.parent.name
-    site, expected = open_site(folder / "data"), read_fields(path, report)
-    recording, config = read_recording(site, site.recordings[0]), ConversionConfig()
+def _verify_scripted(expected: Source, folder: Path, maps: Path | None) -> None:
+    report, name, config = expected.report, folder.name, ConversionConfig()
+    site = open_site(folder / "data")
+    recording = read_recording(site, site.recordings[0])
     rate, rows = 1.0 / recording.period, len(recording.track)
-    ours = {"rate_hz": rate, "duration_s": recording.duration, "rows": rows}
-    expected.match(name, ours, _EXACT, quantity="recording")
+    facts = {"rate_hz": rate, "duration_s": recording.duration, "rows": rows}
+    expected.match(name, facts, _EXACT, quantity="recording")
     tracks, ids = expected.each("tracks")[0], recording.track_ids.tolist()
     report.compare("track ids", name, ids, sorted(map(int, tracks)))
     for number, track in enumerate(ids):
-        facts = {"category": recording.categories[number], "dim": recording.sizes[number]}
+        own = {"category": recording.categories[number], "dim": recording.sizes[number]}
         where = f"{name} track {track}"
-        tracks.each(str(track))[0].match(where, facts, {"dim": _SIZE}, quantity="track")
+        tracks.each(str(track))[0].match(where, own, {"dim": _SIZE}, quantity="track")
     windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
     wanted, lanes = expected.each("windows"), dict[tuple[str, str], Any]()
     report.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):
-        where = f"{name} window {window.start_s:g} s"
-        theirs.match(where, {"start_s": window.start_s}, _EXACT, quantity="window")
         judged = zip(window.tracks.tolist(), window.verdicts, window.partners, strict=True)
         verdicts = {
             ids[track]: verdict if partner < 0 else f"{verdict} with {ids[partner]}"
             for track, verdict, partner in judged
         }
+        egos = [track for track, verdict in verdicts.items() if verdict == EGO]
+        where, own = (
+            f"{name} window {window.start_s:g} s",
+            {"start_s": window.start_s, "egos": egos},
+        )
+        theirs.match(where, own, _EXACT, quantity="window", unordered={"egos"})
         given = {int(track): verdict for track, verdict in theirs["verdict"].items()}
         report.compare("tracks seen", where, sorted(verdicts), sorted(given))
         for track in sorted(set(verdicts) & set(given)):
             report.compare("verdict", f"{where} track {track}", verdicts[track], given[track])
-        egos = [track for track, verdict in sorted(verdicts.items()) if verdict == EGO]
-        report.compare("egos", where, egos, sorted(theirs["egos"]))
         begin = f"{theirs['start_s']:.1f}"
         lanes |= {(begin, track): way for track, way in theirs["lanes_from_t0"].items()}
     expected.used.add("note")
     places = [maps / expected["map"]] if maps is not None else []
     places += [folder / "data/map/map.xodr"]
     places += [parent / "maps" / expected["map"] for parent in folder.resolve().parents[:4]]
-    if place := next((place for place in places if place.is_file()), None):
-        _verify_scenarios(folder, site, recording, LocalMap(place), lanes, report)
+    if found := next(filter(Path.is_file, places), None):
+        _verify_scenarios(folder, site, recording, LocalMap(found), lanes, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
     expected.finish()
@@ -313,25 +304,25 @@ def _verify_scenarios(
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
     poses = Groups(folder / "expected_ego_20hz.parquet", report, ("window_start_s", "track_id"))
     made = convert_recording(recording, local.placed(site), site.offset[:2], ConversionConfig())
-    egos = {ego.name: ego for ego in made.egos}
+    egos, seen = {ego.name: ego for ego in made.egos}, set()
     for window in made.windows:
         begin = float(str(window.metadata["window_start_s"]))
         key = (f"{begin:.1f}", str(window.metadata["track_id"]))
+        seen.add(key)
         where, ego = f"{folder.name} window {key[0]} track {key[1]}", egos[window.ego]
         rows = slice(window.first_row - ego.first_row, window.last_row - ego.first_row)
         centers = center_poses(ego.states[rows, :3])
         centers[:, :2] -= site.offset[:2]
         if poses.match(key, {"frame": np.arange(len(centers))}, quantity="20 Hz"):
-            table = poses[key]
-            xy = np.column_stack([table["x_local"], table["y_local"]])
+            yaw = {"yaw": centers[:, 2]}
+            poses.match(key, yaw, _ANGLE, quantity="20 Hz", angles={"yaw"})
+            xy = np.column_stack([poses[key]["x_local"], poses[key]["y_local"]])
             error = np.linalg.norm(centers[:, :2] - xy, axis=1)
             report.compare("20 Hz position", where, error, 0.0 * error, atol=_POSITION)
-            yaw = table["yaw"]
-            report.compare("20 Hz yaw", where, centers[:, 2], yaw, atol=_ANGLE, angle=True)
         first = int(window.iteration_rows[0]) - window.first_row
-        given = repr([tuple(lane) for lane in lanes.pop(key, ())])
+        given = repr([tuple(lane) for lane in lanes.get(key, ())])
         ways = [repr([tuple(lane) for lane in way]) for way in local.sequences(centers[first:, :2])]
         report.compare("lanes", where, given if given in ways else ways[0], given)
-    for start, track in lanes:
+    for start, track in sorted((set(poses) | set(lanes)) - seen):
         report.fail("lanes", f"{folder.name} window {start} track {track}", "no such scenario")
     poses.finish()

@@ -6,7 +6,7 @@ covered. `match` compares values of ours with those of the same names.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -86,11 +86,6 @@ class Source:
             groups.setdefault(tuple(map(str, values)), []).append(row)
         return {values: self.at(np.array(rows)) for values, rows in groups.items()}
 
-    def by(self, key: str, value: str) -> "Source":
-        """One column as values that another one names, such as scores by metric."""
-        pairs = zip(self[key].tolist(), self[value].tolist(), strict=True)
-        return Source(self.name, key, dict(pairs), self.report)
-
     def each(self, name: str) -> "list[Source]":
         """The objects in a list of a `.json`, as parts of the file; or the one that is not listed.
 
@@ -106,25 +101,55 @@ class Source:
     def match(
         self,
         where: str,
-        ours: Mapping[str, object],
+        ours: Mapping[str, Any],
         atol: Tolerances = EXACT,
         *,
         quantity: str | None = None,
+        angles: Collection[str] = (),
+        unordered: Collection[str] = (),
     ) -> bool:
         """Compare values of ours with those of the same names; a missing one is a mismatch.
 
-        `quantity` begins the names of the quantities, instead of the name of the file. Returns
-        whether all agree.
+        `quantity` begins the names of the quantities, instead of the name of the file. `angles` are
+        equal up to whole turns, `unordered` lists in any order. Returns whether all agree.
         """
         prefix, agree = self.name if quantity is None else quantity, True
         for name, value in ours.items():
             bound = atol if isinstance(atol, float) else atol.get(name, atol.get("", EXACT))
             label = f"{prefix} {name}".strip()
-            if name in self:
-                agree &= self.report.compare(label, where, value, self[name], atol=bound)
-            else:
+            if name not in self:
                 agree = self.report.fail(label, where, f"no {self.what} {name!r}")
+                continue
+            sides = value, self[name]
+            if name in unordered and isinstance(value, list):
+                sides = sorted(map(repr, value)), sorted(map(repr, sides[1]))
+            angle = name in angles
+            agree &= self.report.compare(label, where, *sides, atol=bound, angle=angle)
         return agree
+
+    def match_tree(
+        self,
+        where: str,
+        ours: Mapping[str, Any],
+        atol: Tolerances = EXACT,
+        *,
+        quantity: str | None = None,
+        **options: Collection[str],
+    ) -> None:
+        """`match`, also within the objects and the lists of objects of a `.json`."""
+        prefix, plain = self.name if quantity is None else quantity, dict[str, Any]()
+        for name, value in ours.items():
+            items = value if isinstance(value, list) else [value]
+            if name not in self or not items or not isinstance(items[0], dict):
+                plain[name] = value
+                continue
+            label, parts = f"{prefix} {name}".strip(), self.each(name)
+            if items is value:
+                self.report.compare(f"number of {label}", where, len(items), len(parts))
+            for number, (item, part) in enumerate(zip(items, parts, strict=False)):
+                at = f"{where} {name} {number}" if items is value else where
+                part.match_tree(at, item, atol, quantity=label, **options)
+        self.match(where, plain, atol, quantity=quantity, **options)
 
     def match_rows(
         self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
@@ -201,6 +226,12 @@ class Groups(dict[tuple[str, ...], Source]):
     def match(self, key: tuple[str, ...], *args: Any, **options: Any) -> bool:
         """`Source.match` for the rows of a key."""
         return self[key].match(" ".join(key), *args, **options)
+
+    def match_keys(self, key: tuple[str, ...], ours: list[tuple[str, ...]]) -> None:
+        """Compare which keys begin with `key`, by the rest of them."""
+        theirs = [name[len(key) :] for name in self if name[: len(key)] == key]
+        label, where = f"{self.table.name} present", " ".join(key)
+        self.table.report.compare(label, where, sorted(ours), sorted(theirs))
 
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""

@@ -12,10 +12,10 @@ from shiftsim.verify.files import Source, read_fields
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, make_scenario, read_map, read_objects
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import VY, AgentKind, LightStatus, Tracks, TrafficLights
+from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights
 
 TOLERANCE = 1e-6  # m, rad, m/s
-VEHICLE_COLUMNS = ("token", "x", "y", "heading", "vx", "vy", "path_speed", "route_edge_ids")
+NUMBERS = ("x", "y", "heading", "vx", "vy", "path_speed")  # of a vehicle
 
 
 def verify_idm_world(path: Path, report: Report) -> None:
@@ -27,43 +27,28 @@ def verify_idm_world(path: Path, report: Report) -> None:
         tracks = scenario.tracks.rows(np.arange(scenario.num_iterations))  # a copy, to be driven
         traffic = IdmTraffic()
         traffic.start(scenario, tracks, 0)
-        order = order_observed(tracks.kinds, tracks.valid[0])
-        ours = {
-            "vehicle_columns": list(VEHICLE_COLUMNS),
-            "order_frame0": [tracks.tokens[i] for i in order.tolist()],
-        }
+        order = order_observed(tracks.kinds, tracks.valid[0]).tolist()
+        columns = ["token", *NUMBERS, "route_edge_ids"]
+        ours = {"vehicle_columns": columns, "order_frame0": [tracks.tokens[i] for i in order]}
         expected.match(name, ours, quantity="idm_world")
-        frames = expected["vehicles"]
+        frames, is_vehicle = expected["vehicles"], tracks.kinds == AgentKind.VEHICLE
         report.compare("idm_world frames", name, scenario.num_iterations, len(frames))
         for iteration, rows in enumerate(frames[: scenario.num_iterations]):
             if iteration:
                 traffic.step(iteration - 1, scenario.ego[iteration - 1], tracks, iteration)
-            columns = dict(zip(VEHICLE_COLUMNS, zip(*rows, strict=True), strict=True))
-            theirs = Source("idm_world", "column", columns, report)
-            _compare_vehicles(f"{name} {iteration}", traffic, scenario, tracks, iteration, theirs)
+            where, index = f"{name} {iteration}", np.array(list(traffic.routes), np.int64)
+            vehicles = np.flatnonzero(tracks.valid[iteration] & is_vehicle)
+            report.compare("idm_world tracks", where, vehicles, index)
+            values = np.array(rows, np.object_).reshape(-1, len(columns)).T
+            theirs = Source("idm_world", "column", dict(zip(columns, values, strict=True)), report)
+            theirs.match(where, {"token": [tracks.tokens[i] for i in index.tolist()]})
+            numbers = [tracks.poses[iteration, index], tracks.velocities[iteration, index]]
+            columns_of = np.column_stack([*numbers, traffic.path_speeds]).T
+            theirs.match(where, dict(zip(NUMBERS, columns_of, strict=True)), TOLERANCE)
+            ids = scenario.map.edges.ids
+            routes = [[ids[edge] for edge in route] for route in traffic.routes.values()]
+            theirs.match_rows({"route_edge_ids": routes}, where=f"{where} vehicle")
         world.finish()
-
-
-def _compare_vehicles(
-    where: str,
-    traffic: IdmTraffic,
-    scenario: Scenario,
-    tracks: Tracks,
-    iteration: int,
-    theirs: Source,
-) -> None:
-    routes = traffic.routes
-    index = np.array(list(routes), np.int64)
-    vehicles = np.flatnonzero(tracks.valid[iteration] & (tracks.kinds == AgentKind.VEHICLE))
-    theirs.report.compare("idm_world tracks", where, vehicles, index)
-    ids = scenario.map.edges.ids
-    numbers = [tracks.poses[iteration, index], tracks.velocities[iteration, index]]
-    columns = np.column_stack([*numbers, traffic.path_speeds]).T
-    ours = dict(zip(VEHICLE_COLUMNS[1:7], columns, strict=True))
-    theirs.match(where, {"token": [tracks.tokens[i] for i in index.tolist()]})
-    theirs.match(where, ours, TOLERANCE)
-    lists = {"route_edge_ids": [[ids[edge] for edge in route] for route in routes.values()]}
-    theirs.match_rows(lists, where=f"{where} vehicle")
 
 
 def _make_scenario(world: Source) -> Scenario:
@@ -78,5 +63,7 @@ def _make_scenario(world: Source) -> Scenario:
     tracks = read_objects(sorted(things, key=lambda o: AgentKind[o["type"]]), len(time_us))
     out = make_scenario(str(world.values["world"]), road, time_us, ego, tracks)
     ids = tuple(sorted({name for row in world["lights"] for name in row}))
+    if lost := set(ids) - set(road.edges.ids):
+        raise DataError(f"lights are on lanes that the map does not have: {sorted(lost)}")
     status = [[LightStatus[row.get(name, "ABSENT")] for name in ids] for row in world["lights"]]
     return replace(out, traffic_lights=TrafficLights(ids, np.array(status, np.int8)))

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.errors import DataError
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import TOLERANCE, Source, read_fields, verify_files
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import ego_states, read_map, read_objects, recorded_log
+from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
 from shiftsim.world.map import VectorMap
 
 SCORE_TOLERANCES = dict.fromkeys(  # the other scores are 0 or 1
@@ -42,33 +43,30 @@ def _read(world: Source) -> tuple[SimulationLog, VectorMap]:
         ego_states(dict(zip(world["state_columns"], np.transpose(world[name]), strict=True)))
         for name in ("ego", "expert")
     )
-    tracks = read_objects(world.each("objects"), len(ego))
+    things = world.each("objects")
+    if len(time_us) != len(expert) or any(len(o["frames"]) != len(time_us) for o in things):
+        raise DataError(f"{len(time_us)} time stamps, other numbers of expert states or of frames")
     token = f"world {world.values.get('world')}"
-    return recorded_log(token, time_us[: len(ego)], ego, tracks, time_us, expert), road
+    tracks = read_objects(things, len(time_us))
+    return recorded_log(make_scenario(token, road, time_us, expert, tracks), ego), road
 
 
 def _verify_world(report: Report, path: Path) -> None:
     world, where = read_fields(path, report, "metric_world"), path.stem
     world.note("label", "world", "kind")
     log, road = _read(world)
-    count = len(log.expert_time_us)
-    report.compare("number of states", where, len(log.ego), count - 1)
-    for thing in world.each("objects"):
-        report.compare("number of frames", where, len(thing["frames"]), count)
     # a connector lies in a roadblock connector, a lane in a roadblock
-    kinds = [road.block_of[edge] >= road.num_roadblocks for edge in range(len(road.edges))]
-    is_connector = [road.is_connector(edge) for edge in range(len(road.edges))]
+    kinds = road.block_of >= road.num_roadblocks
+    is_connector = np.arange(len(road.edges)) >= road.num_lanes
     report.compare("kind of edges and their roadblocks", where, kinds, is_connector)
-    measured = measure(log, road)
-    expected = world.each("expected")[0]
-    results = {"default": judge(measured, NUPLAN), "deepplan": judge(measured, DEEPPLAN)}
-    for name, result in results.items():
-        scores = expected.each(f"scores_{name}")[0]
-        at = f"{where} {name}"
-        scores.match(at, known_scores(result), SCORE_TOLERANCES, quantity="score")
-    order = {"comfort_flag_order": list(BOUNDED_SIGNALS.values())}
-    expected.match(where, order, quantity="")
-    _compare_series(where, expected.each("series")[0], measured, results["default"], road)
+    expected, measured = world.each("expected")[0], measure(log, road)
+    for name, profile in (("deepplan", DEEPPLAN), ("default", NUPLAN)):
+        scores, result = expected.each(f"scores_{name}")[0], judge(measured, profile)
+        scores.match(f"{where} {name}", known_scores(result), SCORE_TOLERANCES, quantity="score")
+    order = list(BOUNDED_SIGNALS.values())
+    expected.match(where, {"comfort_flag_order": order}, quantity="")
+    series = expected.each("series")[0]
+    series.match_tree(where, _series(measured, result, road), TOLERANCE, quantity="")
     world.finish()
 
 
@@ -78,13 +76,9 @@ def known_scores(result: MetricResult) -> dict[str, float]:
     return {name: score for name, score in scores.items() if score is not None}
 
 
-def _compare_series(
-    where: str, series: Source, measured: Measurements, result: MetricResult, road: VectorMap
-) -> None:
-    samples = range(len(measured.time_us))
-    statistics = {s.name: s.value for s in result.statistics}
-    ttc = measured.ttc.values
-    ours = {
+def _series(measured: Measurements, result: MetricResult, road: VectorMap) -> dict[str, Any]:
+    samples, ttc = range(len(measured.time_us)), measured.ttc.values
+    return {
         "driven_route": [measured.route.ids(road, i) for i in samples],
         "corner_routes": [
             [measured.corners.ids(road, i, corner) for corner in range(4)] for i in samples
@@ -92,27 +86,21 @@ def _compare_series(
         "common_or_connected": measured.is_common.astype(np.int64),
         "corners_in_drivable_area": (~measured.drivable.outside.any(axis=1)).astype(np.int64),
         "at_fault_times": np.array(measured.at_fault_times, np.int64),
+        "at_fault_counts": at_fault_counts(measured.collisions),
         "time_to_collision": np.where(np.isinf(ttc), np.nan, ttc),
         "overspeed": measured.overspeed,
         "progress_1s_along_lane": result.series["driving_direction_compliance"].values,
         "ego_progress": measured.progress.ego,
+        "progress_statistics": {s.name: s.value for s in result.statistics if s.name in _PROGRESS},
         "comfort_flags": within_bounds(measured.comfort, NUPLAN),
         "comfort_flags_deepplan": within_bounds(measured.comfort, DEEPPLAN),
+        "collisions": [
+            {
+                "time_us": contact.time_us,
+                "token": contact.token,
+                "type": f"{contact.collision_type.upper()}_COLLISION",
+                "ego_delta_v": contact.delta_v,
+            }
+            for contact in measured.collisions
+        ],
     }
-    series.match(where, ours, TOLERANCE, quantity="")
-    counts = at_fault_counts(measured.collisions)
-    series.each("at_fault_counts")[0].match(where, counts, quantity="at_fault_counts")
-    progress = {name: statistics[name] for name in _PROGRESS if name in statistics}
-    given = series.each("progress_statistics")[0]
-    given.match(where, progress, TOLERANCE, quantity="progress_statistics")
-    contacts = series.each("collisions")
-    report, found = series.report, measured.collisions
-    report.compare("number of collisions", where, len(found), len(contacts))
-    for contact, theirs in zip(found, contacts, strict=False):
-        ours = {
-            "time_us": contact.time_us,
-            "token": contact.token,
-            "type": f"{contact.collision_type.upper()}_COLLISION",
-            "ego_delta_v": contact.delta_v,
-        }
-        theirs.match(where, ours, TOLERANCE, quantity="collision")

@@ -63,7 +63,7 @@ class Report:
         strings, booleans and integers are compared exactly.
         """
         tally = self._count(quantity)
-        tally.tolerance = max(tally.tolerance, float(np.max(atol)))
+        tally.tolerance = max(tally.tolerance, float(np.max(atol, initial=0.0)))
         ours, theirs = _array(actual), _array(expected)
         if ours.shape != theirs.shape:
             return self._differ(quantity, where, f"shape {ours.shape}, not {theirs.shape}")

@@ -7,7 +7,6 @@ later finds them in the disk cache.
 
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +16,7 @@ from subprocess import DEVNULL
 
 import numpy as np
 
+from shiftsim.files import fresh_python
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -33,7 +33,8 @@ def warm_up(*shares: str) -> Iterator[None]:
     """
     command = "import sys; from shiftsim.verify.warmup import SHARES; SHARES[sys.argv[1]]()"
     start = partial(subprocess.Popen, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
-    processes = [start([sys.executable, "-c", command, share]) for share in shares or SHARES]
+    starts = [fresh_python(command, share) for share in shares or SHARES]
+    processes = [start(words, env=environment) for words, environment in starts]
     try:
         yield
         for process in processes:

@@ -1,6 +1,7 @@
 """What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.verify.files import Source
 from shiftsim.world import state
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
@@ -23,10 +24,6 @@ EGO_COLUMNS = (
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
 BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
-_IS_CONNECTOR = {  # by kind of an edge or block
-    **{"lane": False, "roadblock": False},
-    **{"connector": True, "roadblock_connector": True},
-}
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
@@ -106,7 +103,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         edges=[
             EdgeSpec(
                 id=edge["id"],
-                is_connector=_IS_CONNECTOR[edge["kind"]],
+                is_connector=_is_connector(edge["kind"], "lane", "connector"),
                 polygon=shapely.Polygon(edge["polygon"]),
                 baseline=np.array(edge["baseline"], np.float64),
                 block_id=edge["roadblock"] if blocks else "",
@@ -119,7 +116,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         blocks=[
             BlockSpec(
                 id=name,
-                is_connector=_IS_CONNECTOR[block["kind"]],
+                is_connector=_is_connector(block["kind"], "roadblock", "roadblock_connector"),
                 polygon=shapely.Polygon(block["polygon"]),
             )
             for name, block in blocks.items()
@@ -133,6 +130,12 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     if lost:
         raise DataError(f"ids that name nothing: {', '.join(lost)}")
     return road
+
+
+def _is_connector(kind: str, plain: str, connector: str) -> bool:
+    if kind not in (plain, connector):
+        raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
+    return kind == connector
 
 
 def _areas(rings: Mapping[Any, Any]) -> list[AreaSpec]:
@@ -161,30 +164,9 @@ def make_scenario(
     )
 
 
-def recorded_log(
-    token: str,
-    time_us: IntArray,
-    ego: FloatArray,
-    tracks: Tracks,
-    expert_time_us: IntArray,
-    expert_ego: FloatArray,
-) -> SimulationLog:
-    """A rollout of which no more is known; arguments as the attributes of `SimulationLog`."""
-    count = len(ego)
-    if not 0 < count <= len(expert_time_us) == len(expert_ego):
-        raise DataError(f"{count} ego, {len(expert_ego)} expert states of {len(expert_time_us)}")
-    return SimulationLog(
-        token=token,
-        time_us=time_us,
-        ego=ego,
-        tracks=tracks,
-        traffic_lights=TrafficLights.empty(count),
-        expert_time_us=expert_time_us,
-        expert_ego=expert_ego,
-        route=(),
-        commands=np.full((count, 2), np.nan),
-        noise=np.zeros((count, 2)),
-        plans=np.full((count, 11, 3), np.nan),
-        planning_seconds=np.zeros(count),
-        degraded=np.zeros(count, np.bool_),
-    )
+def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:
+    """A rollout of which only the ego states (K, 11) are known; the scenario has the expert's."""
+    log = as_recorded(scenario)
+    if len(ego) != len(log.ego):
+        raise DataError(f"{len(ego)} ego states, {len(log.ego) + 1} of the expert")
+    return replace(log, ego=ego)

@@ -8,6 +8,7 @@ from typing import Any
 import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError, nearest
+from shiftsim.files import below, write_text
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -192,17 +193,16 @@ def write_site(
     The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
     subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
     """
-    pages = folder / "replay"
+    pages = below(folder, "replay")
     pages.mkdir(parents=True, exist_ok=True)
     found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
     found = found[:limit] if limit else found
     rows: list[dict[str, Any]] = []
     for done, (gallery, token) in enumerate(found):
-        page = gallery.page(token, back="../index.html")
-        (pages / page_name(token)).write_text(page, encoding="utf-8")
+        gallery.page(token, back="../index.html").save(pages / page_name(token))
         rows += gallery.rows(token)
         on_progress(done + 1, len(found))
-    (folder / "index.html").write_text(list_page(title, rows, above=above), encoding="utf-8")
+    write_text(folder / "index.html", list_page(title, rows, above=above))
     return len(found)
 
 

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from shiftsim.files import write_text
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import pack
 from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
@@ -28,7 +29,7 @@ class Page(str):
     def save(self, path: str | Path) -> Path:
         """Write the page to a file."""
         file = Path(path)
-        file.write_text(self, encoding="utf-8")
+        write_text(file, self)
         return file
 
     def _repr_html_(self) -> str:

@@ -150,3 +150,19 @@ def test_an_unknown_column_is_named_as_not_covered(copy: Path, scenes: Scenes) -
     content = pq.read_table(path)
     pq.write_table(content.append_column("novelty", pa.array([1] * content.num_rows)), path)
     assert "route: column 'novelty'" in verify(copy, scenes).not_covered
+
+
+@pytest.mark.parametrize("iteration", [-1, 10_000])
+def test_objects_outside_the_run_are_named(copy: Path, scenes: Scenes, iteration: int) -> None:
+    change(copy, "objects", "iteration", lambda value: iteration)
+    assert "which the ego does not have" in " ".join(verify(copy, scenes).mismatches)
+
+
+def test_a_statistic_that_only_the_reference_has_is_a_mismatch(copy: Path, scenes: Scenes) -> None:
+    path = copy / "expected" / "statistics.parquet"
+    content = pq.read_table(path)
+    more = content.slice(0, 1).set_column(
+        content.column_names.index("statistic"), "statistic", pa.array(["novelty"])
+    )
+    pq.write_table(pa.concat_tables([content, more.cast(content.schema)]), path)
+    assert "statistics present" in " ".join(verify(copy, scenes).mismatches)

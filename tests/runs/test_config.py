@@ -84,3 +84,9 @@ def test_stores_are_found_by_name_or_path(tmp_path, monkeypatch):
     (tmp_path / "mini").mkdir()
     (tmp_path / "mini" / "store.json").write_text("{}")
     assert store_path("mini") == Path("mini")
+
+
+@pytest.mark.parametrize("setting", [{"workers": 10**9}, {"batch_size": 10**9}, {"timeout": 1e300}])
+def test_more_than_any_machine_has_is_refused(setting):
+    with pytest.raises(ConfigError, match="it must be within"):
+        make_config({"planners": ["idm"], **setting})

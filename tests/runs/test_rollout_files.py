@@ -26,7 +26,15 @@ from shiftsim.runs.rollouts import (
     without_key,
 )
 
-MANIFEST = {"format": 4, "state": "finished"}
+MANIFEST = {
+    "format": 4,
+    "state": "finished",
+    **{"split": "s", "store": "s", "config": {"planners": []}, "counts": {}},
+    "determining": {
+        **{"store": "", "planners": {}, "traffic": "", "controller": ""},
+        "thresholds": {"name": ""},
+    },
+}
 
 
 def made_up(length, *, value=0.0, tracks=None):

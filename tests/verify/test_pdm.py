@@ -162,6 +162,15 @@ def test_a_changed_search_is_noticed(folder, scenes):
     assert check_kernels(folder, scenes).mismatches
 
 
+def test_a_search_among_more_lanes_than_there_are_is_noticed(folder, scenes):
+    path = folder / "kernels" / "graph_search.json"
+    cases = json.loads(path.read_text())
+    case = next(case for case in cases if case["kind"] == "lane_dijkstra")
+    case["length"].append(1.0)
+    path.write_text(json.dumps(cases))
+    assert len(check_kernels(folder, scenes).mismatches) == 1
+
+
 def test_an_unknown_array_and_field_are_named(folder, scenes):
     path = folder / "kernels" / "idm.npz"
     with np.load(path) as archive:

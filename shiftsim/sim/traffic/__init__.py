@@ -6,8 +6,6 @@ rewrites rows as the rollout proceeds. A model is any object with the two method
 `mixed.Mixed` makes one of several, each for some of the tracks (docs/own_traffic.md).
 """
 
-import sys
-from pathlib import Path
 from typing import Protocol
 
 from shiftsim.arrays import FloatArray, IntArray
@@ -76,8 +74,6 @@ def make_traffic(name: str) -> Traffic:
         ConfigError: The name is unknown, or what it names is not a traffic model.
     """
     target = _MODELS.get(full := traffic_name(name), full)
-    if full not in _MODELS and (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # a model beside the user's files, as for planners
     hint = "give package.module:Model of a class on the Python path"
     model: Traffic = load_attribute("traffic", target, hint)()
     for method in ("start", "step"):

@@ -6,7 +6,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from shiftsim.verify.files import Source, read_arrays, read_fields, read_json, verify_files
+from shiftsim.verify.files import Source, read_arrays, read_fields, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
@@ -41,16 +41,13 @@ def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None
         report.skip(f"{part}: torch is not installed")
     else:
         files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
-        bound = {
-            pattern: partial(_verify_file, compare, report, scenes)
-            for pattern, compare in files.items()
-        }
-        verify_files(folder, report, bound)
+        verify_files(folder, report, {p: partial(_verify, files[p], report, scenes) for p in files})
 
 
-def _verify_file(
+def _verify(
     compare: Callable[[Source, Scenes], None], report: Report, scenes: Scenes, path: Path
 ) -> None:
+    """Compare one file, if its scene is at hand."""
     file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
     scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
     if scene is not None and scene not in scenes:
@@ -65,8 +62,4 @@ def _part_of(folder: Path) -> str | None:
     if any(folder.glob("route_correction_*.json")):
         return "route_correction"
     manifest = folder / "state_dict.json"
-    if not manifest.is_file():
-        return None
-    content = read_json(manifest)
-    named = content.get("planner") if isinstance(content, dict) else None
-    return named if named in PARTS else folder.resolve().name
+    return str(read_fields(manifest, Report())["planner"]) if manifest.is_file() else None

@@ -10,11 +10,11 @@ from shiftsim.planners.learned.carl.view import CHANNELS, in_picture, picture_fr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
+from shiftsim.verify.nets import networks
 from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, match_meta, verify_manifest
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind, Command
+from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
 
 NAME = Carl.name
 # network outputs; what it reads: m/s, m/s^2, rad, …, stored as 32 bit floats
@@ -39,16 +39,15 @@ _RECORDED = ("measurements", "action", "alpha", "beta", "value")
 
 
 def _manifest(network: Any) -> dict[str, Any]:
-    return {"checkpoint": None, "hyper": network.RELEASED, "drive_overrides": _DRIVE}
+    prose = dict.fromkeys(("file", "container", "prefix", "loading", "config"), networks.PROSE)
+    return {"checkpoint": prose, "hyper": network.RELEASED, "drive_overrides": _DRIVE}
 
 
 def _verify_forward(file: Source, scenes: Scenes) -> None:
     """The network on stored inputs, with each variant of the weights."""
-    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
-    match_meta(file, NAME, {"case": file.name.removeprefix("forward_"), "variants": variants})
     names = ("bev_semantics", "measurements", "value_measurements")
     inputs = [file[f"in.{name}"][None] for name in names]
-    for variant in variants:
+    for variant in networks.match_case(file, NAME):
         parts, heads = _outputs(variant, *inputs)
         for start, ours in (("out.", parts), (f"out.{variant}.", heads)):
             file.below(start).match(f"{file.name} {variant}", ours, BOUNDS, quantity=NAME)
@@ -61,33 +60,30 @@ def _outputs(
     import torch
     from torch.distributions import Beta
 
-    network = make_network(NAME, variant)
+    network = networks.make_network(NAME, variant)
     see, feel, tell = (torch.from_numpy(array) for array in (pictures, measured, critic))
     with torch.inference_mode():
         encoder = network.features_extractor
         features = encoder(see, feel)
         policy, value = network.policy(features), network.value(features, tell)
         beta: Any = Beta(policy.alpha, policy.beta)
-        log_prob, entropy = beta.log_prob(beta.mean), beta.entropy()
-        sums = {"log_prob": log_prob.sum(dim=1), "entropy": entropy.sum(dim=1)}
+        sums = {"log_prob": beta.log_prob(beta.mean), "entropy": beta.entropy()}
         seen = {"cnn_flat": encoder.see(see), "state_latent": encoder.feel(feel)}
-    heads = {"action": policy.action, **policy._asdict(), "value": value, **sums}
+    summed = {name: numbers.sum(dim=1) for name, numbers in sums.items()}
+    heads = {"action": policy.action, **policy._asdict(), "value": value, **summed}
     return {**seen, "features": features}, heads
 
 
 def _verify_decoding(file: Source, scenes: Scenes) -> None:
-    match_meta(file, NAME, {"columns": list(FILE_COLUMNS), "dt": 0.1})
+    networks.match_meta(file, NAME, {"columns": list(FILE_COLUMNS), "dt": 0.1})
     states = file.take("in.state", -1, NUM_STATE)
     after, commands = np.empty(states.shape), np.empty((len(states), 2))
     for row, (ego, action) in enumerate(zip(states, file["in.action"], strict=True)):
-        commands[row] = _numbers(command_of(action, ego))
+        command = command_of(action, ego)
+        commands[row] = command.acceleration, command.steering_rate
         step_bicycle(ego, *commands[row], WHEEL_BASE, 0.1, after[row])
     ours = {"command": commands, "next_state": after}
     file.below("out.").match_rows(ours, DECODED, where=file.name)
-
-
-def _numbers(command: Command) -> tuple[float, float]:
-    return command.acceleration, command.steering_rate
 
 
 def _compare(loop: Loop) -> None:
@@ -98,57 +94,51 @@ def _compare(loop: Loop) -> None:
     for label, drawn, channel in zip(CHANNELS, pictures, theirs, strict=True):
         loop.compare(f"picture {label}", drawn, channel)
     if any(name.startswith("cache/") for name in loop.stored):
-        _compare_drawn(loop)
+        loop.match(_drawn(loop.planner, loop.scenario.map, loop.seen), part="cache/")
     _, heads = _outputs(loop.variant, pictures[None], measured[None], _VALUE_MEASUREMENTS)
     ours = {name: value[0] for name, value in heads.items()}
     ours |= {"measurements": measured, "action": loop.output}
-    loop.match_row({name: ours[name] for name in _RECORDED}, BOUNDS)
+    ours = {name: ours[name] for name in _RECORDED}
+    loop.row.match(loop.where, ours, BOUNDS, quantity=NAME)
     # the next step goes on from their action: standing still, each step multiplies a difference
-    theirs = loop.planner.decode(loop.recorded("action"), loop.seen)
+    theirs = loop.planner.decode(loop.row["action"], loop.seen)
     for whose, command, atol in (("our", loop.plan, COMMAND), ("their", theirs, DECODED)):
-        name = f"command of {whose} action"
-        loop.compare(name, _numbers(command), loop.recorded("command"), atol)
+        numbers = (command.acceleration, command.steering_rate)
+        loop.compare(f"command of {whose} action", numbers, loop.row["command"], atol)
 
 
-def _compare_drawn(loop: Loop) -> None:
-    """Compare which objects were drawn, and in which order."""
-    lights = [f"{name}:{status.name}" for name, status in loop.seen.traffic_lights.items()]
-    areas, tracks = _drawn_areas(loop.planner, loop.scenario.map), _drawn_tracks(loop.seen)
-    lists = {**areas, **tracks, "traffic_lights": lights}
-    loop.match(lists, part="cache/")
-
-
-def _drawn_areas(planner: Carl, road: VectorMap) -> dict[str, list[str]]:
+def _drawn(planner: Carl, road: VectorMap, seen: Observation) -> dict[str, list[str]]:
+    """Ids of what was drawn, in this order."""
     found, blocks = planner.found.tolist(), len(road.blocks)
     first = [area for area in found if area < road.num_roadblocks]
     second = [area for area in found if road.num_roadblocks <= area < blocks]
-    edges = [[e for b in part for e in road.block_edges.at(b).tolist()] for part in (first, second)]
-    crossed = dict.fromkeys(road.intersection_of[edges[1]].tolist())
+    lanes, connectors = (
+        [edge for block in part for edge in road.block_edges.at(block).tolist()]
+        for part in (first, second)
+    )
+    crossed = dict.fromkeys(road.intersection_of[connectors].tolist())
+    tracks, frame = seen.tracks, picture_frame(seen.ego.center)
+    boxes: dict[str, list[str]] = {"vehicles": [], "pedestrians": [], "static": []}
+    for index in np.flatnonzero(tracks.valid[0]).tolist():
+        if in_picture(frame, *tracks.poses[0, index, :2].tolist()):
+            kind = tracks.kinds[index]
+            walks = "pedestrians" if kind == AgentKind.PEDESTRIAN else "vehicles"
+            boxes["static" if kind > LAST_AGENT_KIND else walks].append(tracks.tokens[index])
     return {
         "roadblocks": [road.blocks.ids[area] for area in first],
         "roadblock_connectors": [road.blocks.ids[area] for area in second],
-        "lanes": [road.edges.ids[edge] for edge in edges[0]],
-        "lane_connectors": [road.edges.ids[edge] for edge in edges[1]],
+        "lanes": [road.edges.ids[edge] for edge in lanes],
+        "lane_connectors": [road.edges.ids[edge] for edge in connectors],
         "intersections": [road.intersections.ids[i] for i in crossed if i >= 0],
         "car_parks": [road.car_parks.ids[area - blocks] for area in found if area >= blocks],
         "route": [road.blocks.ids[block] for block in planner.route],
+        "traffic_lights": [f"{id_}:{light.name}" for id_, light in seen.traffic_lights.items()],
+        **boxes,
     }
 
 
-def _drawn_tracks(seen: Observation) -> dict[str, list[str]]:
-    tracks, frame = seen.tracks, picture_frame(seen.ego.center)
-    out: dict[str, list[str]] = {"vehicles": [], "pedestrians": [], "static": []}
-    for index in np.flatnonzero(tracks.valid[0]).tolist():
-        x, y = tracks.poses[0, index, :2].tolist()
-        if in_picture(frame, x, y):
-            kind = tracks.kinds[index]
-            walks = "pedestrians" if kind == AgentKind.PEDESTRIAN else "vehicles"
-            out["static" if kind > LAST_AGENT_KIND else walks].append(tracks.tokens[index])
-    return out
-
-
 FILES = {
-    "state_dict.json": partial(verify_manifest, NAME, COUNTS, _manifest),
+    "state_dict.json": partial(networks.verify_manifest, NAME, COUNTS, _manifest),
     "forward_*.npz": _verify_forward,
     "action_decode.npz": _verify_decoding,
     "closed_loop_*.npz": partial(verify_loop, Carl, _compare, ("command", *_RECORDED)),

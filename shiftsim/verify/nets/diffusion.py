@@ -13,27 +13,16 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.planners.learned.deterministic import keyed_normals
-from shiftsim.planners.learned.diffusion.features import (
-    LANES,
-    ROUTE_LANES,
-    Features,
-    agent_features,
-    lane_features,
-    lanes_on_route,
-)
-from shiftsim.planners.learned.diffusion.kernels import (
-    SAMPLES,
-    LaneLines,
-    line_bounds,
-    nearest_lanes,
-    resample_lanes,
-)
+from shiftsim.planners.learned.diffusion import features as builder
+from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
-from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
+from shiftsim.verify.nets import networks
 from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import FEATURE, PROSE, make_network, match_meta, verify_manifest
+from shiftsim.verify.nets.networks import FEATURE, make_network, match_meta
 from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.worlds import make_tracks
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -76,27 +65,18 @@ def start_noise(key: str) -> np.ndarray:
 class KeyedPlanner(DiffusionPlanner):
     """The planner with the start noise of the reference files."""
 
-    def reset(self, scene: SceneInfo) -> None:
-        """Prepare for a scenario."""
-        super().reset(scene)
-        self._token = scene.token
-
-    def features(self, observation: Observation) -> Features:
+    def features(self, observation: Observation) -> builder.Features:
         """What the network reads."""
-        noise = start_noise(f"{self._token}:{observation.iteration}")
+        _, token = self._key
+        noise = start_noise(f"{token}:{observation.iteration}")
         return replace(super().features(observation), noise=noise)
 
 
 def _manifest(network: Any) -> dict[str, Any]:
-    last, starts = (
-        "decoder.decoder.dit.final_layer.proj.4",
-        {
-            "prefix": re.compile(re.escape(network.PREFIXES[0])),
-            "used_key": re.compile(r"ema_state_dict\b"),
-        },
-    )
+    last, prefix = "decoder.decoder.dit.final_layer.proj.4", re.escape(network.PREFIXES[0])
+    starts = {"prefix": re.compile(prefix), "used_key": re.compile(r"ema_state_dict\b")}
     return {
-        "checkpoint": {"file": PROSE, "container": PROSE, **starts},
+        "checkpoint": {"file": networks.PROSE, "container": networks.PROSE, **starts},
         "drive_overrides": {f"{last}.weight": _DRIVE[0].format(last), f"{last}.bias": _DRIVE[1]},
         "noise": _NOISE,
     }
@@ -124,6 +104,7 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
         "sigma": made.sigma,
         "final_denoise_t": sampler.LAST_TIME,
     }
+    file.match(file.name, ours, SCHEDULE, quantity=NAME)
     steps = {
         "step": numbers,
         "order": np.minimum(numbers, 2),
@@ -133,12 +114,10 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
         "c_x0": made.c_x0,
         "r0": np.array([np.nan, *made.r0.tolist()]),
     }
-    file.match(file.name, ours, SCHEDULE, quantity=NAME)
-    listed = file["steps"]
-    theirs = {name: [step[name] for step in listed] for name in listed[0]}
-    table = Source("sampler steps", "field", theirs, file.report)
-    table.match(file.name, steps, SCHEDULE, quantity=f"{NAME} sampler")
-    table.finish()
+    listed = file.each("steps")
+    for name, values in steps.items():
+        theirs = [step[name] for step in listed]
+        file.report.compare(f"{NAME} sampler {name}", file.name, values, theirs, atol=SCHEDULE)
 
 
 def _verify_forward(file: Source, scenes: Scenes) -> None:
@@ -146,8 +125,6 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
     import torch
 
     case, given = file.name.removeprefix("forward_"), file.below("in.")
-    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
-    match_meta(file, NAME, {"case": case, "variants": variants})
     limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
@@ -162,7 +139,7 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
             "route_encoding": network.dit[0].route_encoder(scene["route_lanes"]),
         }
         file.below("out.").match(file.name, encoded, NETWORK, quantity=NAME)
-        for variant in variants:
+        for variant in networks.match_case(file, NAME):
             _verify_sampling(file, variant, scene, inputs)
 
 
@@ -172,9 +149,8 @@ def _verify_sampling(
     """All calls of the sampler with one variant of the weights."""
     import torch
 
+    from shiftsim.planners.learned.diffusion.network import sampler
     from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
-    from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE as TIMES
-    from shiftsim.planners.learned.diffusion.network.sampler import sample
 
     network, stored = make_network(NAME, variant), file.below(f"out.{variant}.")
     current, absent = network.present(scene)
@@ -187,28 +163,25 @@ def _verify_sampling(
         return made[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:
-        return network.denormalise(sample(function, current, noise)[:, :, 1:])
+        return network.denormalise(sampler.sample(function, current, noise)[:, :, 1:])
 
-    bound = SAMPLED[variant]
-    ours = {
-        "prediction": (sampled(call), bound),
-        "step_t": (TIMES.call_times, SCHEDULE),
-        "dit_first": (made[0], NETWORK),
-        # of the other calls the ego's input and the last output are stored
-        "step_ego_x": (torch.stack(seen), bound / SCALE),
-        "dit_last": (made[-1], bound / SCALE),
-    }
+    ours = {"prediction": sampled(call), "step_t": sampler.SCHEDULE.call_times}
+    # of the calls behind the first the ego's input and the last output are stored
+    ours |= {"dit_first": made[0], "step_ego_x": torch.stack(seen), "dit_last": made[-1]}
     if "guided_prediction" in stored:
         guided = with_guidance(call, network, inputs["neighbor_agents_past"], absent)
-        ours["guided_prediction"] = (sampled(guided), bound)
-    for name, (value, atol) in ours.items():
-        stored.match(f"{file.name} {variant}", {name: value}, atol, quantity=NAME)
+        ours["guided_prediction"] = sampled(guided)
+    metres = dict.fromkeys(("prediction", "guided_prediction"), SAMPLED[variant])
+    bounds = {**metres, "step_t": SCHEDULE, "dit_first": NETWORK, "": SAMPLED[variant] / SCALE}
+    stored.match(f"{file.name} {variant}", ours, bounds, quantity=NAME)
 
 
 def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
+    import torch
+
     bound = SAMPLED[loop.variant]
-    loop.compare("ego_prediction", loop.output[0], loop.recorded("ego_prediction"), bound)
+    loop.compare("ego_prediction", loop.output[0], loop.row["ego_prediction"], bound)
     loop.compare_plan(POSITION)
     if not list(loop.stored):
         return
@@ -222,25 +195,18 @@ def _compare(loop: Loop) -> None:
         **{f"feature/{name}": getattr(features, name) for name in names},
     }
     if "encoding" in loop.stored:
-        ours["encoding"] = _encoding(loop.planner.network, features)
+        with torch.inference_mode():
+            network, (inputs, _) = loop.planner.network, loop.planner.batch([features])
+            ours["encoding"] = network.encode(network.normalise(inputs))[0]
     loop.match(ours, {"prediction": bound, "encoding": NETWORK, "": FEATURE})
-
-
-def _encoding(network: Any, features: Features) -> Any:
-    """Tokens of the scene (107, 192)."""
-    import torch
-
-    with torch.inference_mode():
-        inputs = {name: torch.from_numpy(getattr(features, name)[None]) for name in INPUTS}
-        return network.encode(network.normalise(inputs))[0]
 
 
 def _verify_agents(file: Source, scenes: Scenes) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
     match_meta(file, NAME, {"frame_columns": _TRACK_COLUMNS})
-    if f"in.frame{SAMPLES:02d}" in file:
+    if f"in.frame{kernels.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
-    made = agent_features(_tracks(file), file.take("in.anchor", 3))
+    made = builder.agent_features(_tracks(file), file.take("in.anchor", 3))
     ours = dict(zip(("agents", "static", "selected"), made, strict=True))
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
@@ -249,25 +215,27 @@ def _tracks(file: Source) -> Tracks:
     """The frames as tracks, in the order of the last frame; static objects after them."""
     names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
     frames = [file.take(name, -1, len(_TRACK_COLUMNS)) for name in names]
-    kinds: dict[int, int] = {}
-    for name, frame in zip(names[::-1], frames[::-1], strict=True):
-        for track, kind in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True):
-            if kinds.setdefault(int(track), kind) != kind:
-                raise DataError("a track changes its type")
+    typed = [
+        pair
+        for name, frame in zip(names[::-1], frames[::-1], strict=True)
+        for pair in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True)
+    ]
+    kinds = dict(typed)
+    if len(set(typed)) != len(kinds):
+        raise DataError("a track changes its type")
     static = file.take("in.static", -1, 5)
     types = file.take("in.static_type", len(static)).tolist()
     column = {track: index for index, track in enumerate(kinds)}
-    shape = (len(frames), len(column) + len(static))
-    values, valid = np.full((*shape, 7), np.nan), np.zeros(shape, np.bool_)
-    for sample, frame in enumerate(frames):
-        where = [column[int(track)] for track in frame[:, 0]]
-        valid[sample, where] = True
-        values[sample, where] = frame[:, [6, 7, 3, 1, 2, 5, 4]]
-    valid[-1, len(column) :] = True
-    values[-1, len(column) :, [0, 1, 2, 6, 5]] = static.T
-    poses, velocities, sizes = np.split(values, (3, 5), axis=2)
-    codes = np.array([*kinds.values(), *(AgentKind[_STATIC[t]] for t in types)], np.int64)
-    return Tracks(valid, poses, velocities, sizes, codes, tuple(map(str, range(shape[1]))))
+    moving = np.concatenate(frames)
+    samples = [*np.repeat(np.arange(len(frames)), [len(f) for f in frames]), *[-1] * len(static)]
+    columns = [column[track] for track in moving[:, 0].tolist()]
+    columns += range(len(column), len(column) + len(static))
+    values = np.full((len(columns), 7), np.nan)
+    values[: len(moving)] = moving[:, [6, 7, 3, 1, 2, 5, 4]]
+    values[len(moving) :, [0, 1, 2, 6, 5]] = static
+    words = [*(AgentKind(kind).name for kind in kinds.values()), *(_STATIC[t] for t in types)]
+    shape = (len(frames), len(words))
+    return make_tracks(shape, (samples, columns), values, words, tuple(map(str, range(shape[1]))))
 
 
 def _verify_lanes(file: Source, scenes: Scenes) -> None:
@@ -278,20 +246,22 @@ def _verify_lanes(file: Source, scenes: Scenes) -> None:
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
     limits = np.where(file["in.has_limit"], file["in.limit"].astype(np.float64), np.nan)
     blocks = np.array([index[name] for name in owner], np.int64)
-    resampled = resample_lanes(lines, left, right)
-    lanes = LaneLines(resampled, line_bounds(lines), limits, blocks)
+    resampled = kernels.resample_lanes(lines, left, right)
+    lanes = kernels.LaneLines(resampled, kernels.line_bounds(lines), limits, blocks)
     # the lanes come in the order of the distance to their areas, which are not there
     point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
-    edges = nearest_lanes(np.arange(len(owner)), point, lines, anchor[0], anchor[1], LANES)
+    edges = kernels.nearest_lanes(
+        np.arange(len(owner)), point, lines, anchor[0], anchor[1], builder.LANES
+    )
     lights = file.take("in.light", len(owner), 4)
     once = np.ones(len(owner), np.int64)
     file.report.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
-    rows = lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, LANES)
+    rows = builder.lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, builder.LANES)
     route = [index.get(name, -1) for name in file["in.route"].tolist()]
-    on_route = lanes_on_route(lanes.blocks[edges], route)
+    on_route = builder.lanes_on_route(lanes.blocks[edges], route)
     ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), rows, strict=True))
     for name, array in list(ours.items()):
-        ours[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+        ours[f"route_{name}"] = np.zeros((builder.ROUTE_LANES, *array.shape[1:]), array.dtype)
         ours[f"route_{name}"][: len(on_route)] = array[on_route]
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
@@ -303,12 +273,11 @@ def _lines(file: Source, name: str) -> Polylines:
     return make_polylines(np.split(xy, np.cumsum(lengths)[:-1]))
 
 
+_SIZES = {"parameters": "", "parameters_encoder": "encoder"}
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(
-        verify_manifest, NAME, {"parameters": "", "parameters_encoder": "encoder"}, _manifest
-    ),
+    "state_dict.json": partial(networks.verify_manifest, NAME, _SIZES, _manifest),
     "forward_*.npz": _verify_forward,
     "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare, (*PLANS, "ego_prediction")),
     "overflow_agents_*.npz": _verify_agents,

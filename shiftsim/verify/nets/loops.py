@@ -33,7 +33,8 @@ KNOWN_ERRORS = (  # of official planners, which ours answer with a fallback
 class Loop:
     """One closed-loop file, and its iteration that is compared just now."""
 
-    number: int  # the iteration
+    number = 0  # of the iteration
+    row: Source  # of the arrays of the whole loop
     stored: Source  # what is stored of it alone
     seen: Observation  # what the planner saw
     features: Any  # what its network read
@@ -47,7 +48,6 @@ class Loop:
         # recorded ego states, columns of `state.STATE_COLUMNS`: all, and those up to iteration 0
         self.ego = file.take("ego/current", -1, state.NUM_STATE)
         self.past = file.take("ego/initial_history", HISTORY_SAMPLES, state.NUM_STATE)
-        self.number = 0
         planner.reset(scene_info(self.scenario, planner=planner))
 
     @property
@@ -64,19 +64,10 @@ class Loop:
         """Compare with the arrays of the same names that are stored of this iteration alone."""
         self.stored.below(part).match(self.where, ours, atol, quantity=self.name)
 
-    def match_row(self, ours: Mapping[str, object], atol: Tolerances) -> None:
-        """Compare with the rows for this iteration of arrays of the whole loop."""
-        rows = self.file.below("out/").at(self.number)
-        rows.match(self.where, ours, atol, quantity=self.name)
-
-    def recorded(self, name: str) -> Any:
-        """The row for this iteration of an array of the whole loop."""
-        return self.file[f"out/{name}"][self.number]
-
     def compare_plan(self, motion: float) -> None:
         """Compare the plan with the recorded one; `motion` is the tolerance behind the poses."""
-        theirs, ours = self.recorded("trajectory"), self.plan.states[:, :PLAN_COLUMNS]
-        self.compare("plan time [us]", self.plan.time_us, self.recorded("trajectory_time_us"))
+        theirs, ours = self.row["trajectory"], self.plan.states[:, :PLAN_COLUMNS]
+        self.compare("plan time [us]", self.plan.time_us, self.row["trajectory_time_us"])
         self.compare("plan [m]", ours[:, :2], theirs[:, :2], POSITION)
         self.compare("plan [rad]", ours[:, 2], theirs[:, 2], HEADING)
         self.compare("plan motion", ours[:, 3:], theirs[:, 3:], motion)
@@ -85,55 +76,26 @@ class Loop:
         """Go to an iteration: make everything again that the planner makes there."""
         ego = np.concatenate([self.past, self.ego[1 : number + 1]])[-HISTORY_SAMPLES:]
         self.number, self.stored = number, self.file.below(f"it{number:02d}/")
+        self.row = self.file.below("out/").at(number)
         self.seen = observe_log(self.scenario, number, ego=ego)
         self.features = self.planner.features(self.seen)
         (self.output,) = self.planner.infer([self.features])
         self.plan = self.planner.decode(self.output, self.seen)
 
-    def compare_scene(self, scenes: Scenes) -> None:
-        """Compare what the file says about its scene, and which files that was made from."""
-        scenario, rows, meta = self.scenario, past_rows(self.scenario, 0), self.file.below("meta/")
-        sources = scenes.sources(str(meta["scene"]))
-        content = [path.read_bytes() for path in sources]
-        sums = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
-        made = {  # of which a file has some
-            "db_md5": sums[0],
-            "map_md5": sums[1],
-            "source_files": [path.relative_to(scenes.folder).as_posix() for path in sources],
-            "source_crc32": [zlib.crc32(data) for data in content],
-        }
-        facts = {
-            "token": scenario.token,
-            "scenario_type": scenario.scenario_type,
-            "map_name": scenario.map.name,
-            "route_roadblock_ids": list(scenario.route),
-            "state_columns": list(FILE_COLUMNS),
-            **{name: value for name, value in made.items() if name in meta},
-        }
-        meta.match(self.file.name, facts, quantity=f"{self.name} scene")
-        logged = {
-            "initial_history": scenario.ego[rows],
-            "initial_history_time_us": scenario.time_us[rows],
-            "current_time_us": scenario.iteration_times[: len(self.ego)],
-        }
-        self.file.below("ego/").match(self.file.name, logged, STATE, quantity=self.name)
-        self.compare("logged ego", scenario.ego[rows[-1]], self.ego[0], STATE)
-
     def compare_driven(self) -> None:
-        """Compare the recorded ego states with what the recorded plans lead to."""
+        """Compare the next ego state with what the recorded plan leads to."""
         command, after = np.empty(2), np.empty(state.NUM_STATE)
-        times = self.file["ego/current_time_us"]
-        for number in range(len(self.ego) - 1):
-            self.number, step = number, (*times[number : number + 2].tolist(), self.ego[number])
-            if "out/command" in self.file:
-                command_and_step(*step, self.recorded("command"), 0.0, 0.0, after)
-            else:
-                plan, plan_us = self.recorded("trajectory"), self.recorded("trajectory_time_us")
-                states = np.zeros((len(plan), state.NUM_STATE))
-                states[:, :PLAN_COLUMNS] = plan
-                status = track_and_step(*step, plan_us, states, 0.0, 0.0, after, command)
-                raise_for_status(status, step[0], plan_us)
-            self.compare("driven ego", after, self.ego[number + 1], STATE)
+        times = self.file["ego/current_time_us"][self.number :][:2].tolist()
+        if "command" in self.row:
+            command[:] = self.row["command"]
+            command_and_step(*times, self.ego[self.number], command, 0.0, 0.0, after)
+        else:
+            plan, plan_us = self.row["trajectory"], self.row["trajectory_time_us"]
+            states = np.zeros((len(plan), state.NUM_STATE))
+            states[:, :PLAN_COLUMNS] = plan
+            step = (*times, self.ego[self.number], plan_us, states, 0.0, 0.0, after, command)
+            raise_for_status(track_and_step(*step), times[0], plan_us)
+        self.compare("driven ego", after, self.ego[self.number + 1], STATE)
 
 
 def verify_loop(
@@ -149,7 +111,7 @@ def verify_loop(
     arrays.
     """
     loop = Loop(file, _planner(make, f"deterministic:{file['meta/variant']}").fork(), scenes)
-    loop.compare_scene(scenes)
+    _compare_scene(loop, scenes)
     counts = [len(file[f"out/{name}"]) for name in recorded]
     loop.compare("plans", counts, counts[:1] * len(counts))
     where, _, error = str(file["meta/error"]).partition(": ")
@@ -162,7 +124,38 @@ def verify_loop(
         loop.compare("failure", bool(loop.planner.degraded), number == counts[0])
         if number < counts[0]:
             compare(loop)
-    loop.compare_driven()
+            if number + 1 < len(loop.ego):
+                loop.compare_driven()
+
+
+def _compare_scene(loop: Loop, scenes: Scenes) -> None:
+    """Compare what the file says about its scene, and which files that was made from."""
+    scenario, rows, meta = loop.scenario, past_rows(loop.scenario, 0), loop.file.below("meta/")
+    sources = scenes.sources(str(meta["scene"]))
+    content = [path.read_bytes() for path in sources]
+    sums = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
+    made = {  # of which a file has some
+        "db_md5": sums[0],
+        "map_md5": sums[1],
+        "source_files": [path.relative_to(scenes.folder).as_posix() for path in sources],
+        "source_crc32": [zlib.crc32(data) for data in content],
+    }
+    facts = {
+        "token": scenario.token,
+        "scenario_type": scenario.scenario_type,
+        "map_name": scenario.map.name,
+        "route_roadblock_ids": list(scenario.route),
+        "state_columns": list(FILE_COLUMNS),
+        **{name: value for name, value in made.items() if name in meta},
+    }
+    meta.match(loop.file.name, facts, quantity=f"{loop.name} scene")
+    logged = {
+        "initial_history": scenario.ego[rows],
+        "initial_history_time_us": scenario.time_us[rows],
+        "current_time_us": scenario.iteration_times[: len(loop.ego)],
+    }
+    loop.file.below("ego/").match(loop.file.name, logged, STATE, quantity=loop.name)
+    loop.compare("logged ego", scenario.ego[rows[-1]], loop.ego[0], STATE)
 
 
 @cache

@@ -36,45 +36,46 @@ def match_meta(file: Source, planner: str, ours: Mapping[str, object]) -> None:
     file.report.compare(f"{planner} meta", file.name, ours, json.loads(str(file["meta"])))
 
 
+def match_case(file: Source, planner: str) -> list[str]:
+    """`match_meta` of a forward pass: its name, and the variants of the weights that it has."""
+    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
+    case = file.name.removeprefix("forward_")
+    match_meta(file, planner, {"case": case, "variants": variants})
+    return variants
+
+
 def verify_manifest(
     planner: str,
-    counts: Mapping[str, str],
-    make_others: Callable[[Any], Mapping[str, Any]],
+    counts: Mapping[str, str],  # by field that counts weights: pattern of their names
+    make_others: Callable[[Any], Mapping[str, Any]],  # further fields from the network's module
     manifest: Source,
     scenes: Scenes,
 ) -> None:
     """Compare the manifest `state_dict.json` of a network: names, shapes, types, rules and weights.
 
-    Args:
-        planner: Name of the planner.
-        counts: By field that is the size of all weights, or of the trainable ones if it says so:
-            pattern of their names.
-        make_others: Makes further fields from the module of the network: our value, in which a
-            pattern stands for every text that it matches, or None for what need not be compared.
-        manifest: The file.
-        scenes: Not needed.
+    Fields that count, count the trainable weights if they say so. In the others a pattern stands
+    for every text that it matches.
     """
     report, module = manifest.report, network_module(planner)
     network = module.build_network(None)
     built = {name: value.detach().numpy() for name, value in network.state_dict().items()}
+    parameters = {name for name, _ in network.named_parameters()}
     rules = getattr(module, "RULES", None) or {}
     entries = manifest.each("keys" if "keys" in manifest else "entries")
     names = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
     report.compare(f"{planner} state names", manifest.name, sorted(built), sorted(names))
-    parameters = {name for name, _ in network.named_parameters()}
     for name, entry in zip(names, entries, strict=True):
-        if name not in built:
-            continue
-        ours = {
-            "shape": list(built[name].shape),
-            "dtype": str(built[name].dtype),
-            "kind": "parameter" if name in parameters else "buffer",
-            "ckpt_key": module.PREFIXES[0] + name,
-            "rule": rules.get(name) or rule_of(name, built[name].ndim),
-            "value": built[name].tolist(),
-        }
-        ours = {field: value for field, value in ours.items() if field in entry}
-        entry.match(name, ours, quantity=f"{planner} state")
+        if name in built:
+            ours = {
+                "shape": list(built[name].shape),
+                "dtype": str(built[name].dtype),
+                "kind": "parameter" if name in parameters else "buffer",
+                "ckpt_key": module.PREFIXES[0] + name,
+                "rule": rules.get(name) or rule_of(name, built[name].ndim),
+                "value": built[name].tolist(),
+            }
+            ours = {field: value for field, value in ours.items() if field in entry}
+            entry.match(name, ours, quantity=f"{planner} state")
     (check,) = manifest.each("selfcheck")
     if "first3_raw_z" in check:
         name, shape = check["name"], built[check["name"]].shape
@@ -86,19 +87,10 @@ def verify_manifest(
         for name in check:
             first = weights[name].ravel()[: len(check[name])].astype(float)
             report.compare(f"{planner} selfcheck", name, first, check[name])
-    ours = {
-        field: sum(
-            built[name].size
-            for name in (parameters if "trainable" in field else built)
-            if re.match(pattern, name)
-        )
-        for field, pattern in counts.items()
-    }
-    for name, value in make_others(module).items():
-        if value is None:
-            manifest.note("description", name)
-        else:
-            ours[name] = _filled(value, manifest[name])
+    ours = {name: _filled(value, manifest[name]) for name, value in make_others(module).items()}
+    for field, pattern in counts.items():
+        counted = parameters if "trainable" in field else built
+        ours[field] = sum(built[name].size for name in counted if re.match(pattern, name))
     manifest.match(manifest.name, ours, quantity=f"{planner} manifest")
     manifest.used.add("planner")
 

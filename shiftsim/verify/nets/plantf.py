@@ -22,7 +22,6 @@ from shiftsim.verify.scenes import Scenes
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 
-NAME = PlanTF.name
 MOTION = 1e-5  # m/s, m/s^2: derivatives of the recorded poses
 DERIVED_HEADING = 5e-4  # rad, arctangent of small vectors
 RAW = ("trajectory", "probability", "prediction", "ref_free_trajectory")
@@ -63,6 +62,7 @@ CODES = {  # integers, stored as floats
     "map.polygon_road_block_id",
 }
 HISTORIES = ("position", "heading", "velocity", "shape")  # of agents
+ZEROS = {"agent.target", "reference_line.future_projection"}
 _ROUNDING = 2.0**-22  # twice the relative error of a 32 bit float
 _FEW = 0.01  # part of the values
 
@@ -71,13 +71,10 @@ def compare_features(
     loop: Loop,
     agents: AgentFeatures,
     road: RoadFeatures,
-    route: tuple[int, ...],
-    others: Mapping[str, object],
+    route: tuple[int, ...],  # blocks of the corrected route
+    others: Mapping[str, object],  # further features by name
 ) -> None:
-    """Compare what is stored of one iteration that is made before the network.
-
-    `route` are blocks of the corrected route, `others` further features by name.
-    """
+    """Compare what is stored of one iteration that is made before the network."""
     scenario, ego = loop.scenario, loop.seen.history.ego[-1]
     ids = [*scenario.map.edges.ids, *scenario.map.crosswalks.ids]
     features = {
@@ -101,9 +98,9 @@ def compare_features(
     }
     loop.match(names)
     # samples that are absent hold the origin of the map, seen from the ego
-    cos, sin = np.cos(ego[2]), np.sin(ego[2])
+    cos, sin, there = np.cos(ego[2]), np.sin(ego[2]), agents.valid
     origin = np.array([-cos * ego[0] - sin * ego[1], sin * ego[0] - cos * ego[1]])
-    there, absent = agents.valid, {"position": origin, "heading": -ego[2]}
+    absent = {"position": origin, "heading": -ego[2]}
     for name in HISTORIES:
         ours, theirs = getattr(agents, name), loop.stored[f"feature/agent.{name}"]
         loop.compare(f"agent.{name}", ours[there], theirs[there], FEATURE)
@@ -112,12 +109,67 @@ def compare_features(
         loop.compare(f"agent.{name} where absent", rest, theirs[~there], atol)
 
 
-def network_inputs(planner: str, arrays: Source) -> Any:
+def network_outputs(planner: str, network: Any, inputs: Any) -> Arrays:
+    """What the official network says of a batch, by the names of the files, and makes of that."""
+    import torch
+
+    with torch.inference_mode():
+        out = network(inputs, predict=True) if planner == "plantf" else network(inputs)
+        made = {name: getattr(out, name).numpy() for name in RAW if hasattr(out, name)}
+        if planner == "pluto":
+            made["hidden"] = network.hidden_proj(out.ego).numpy()
+    poses, count = headings_of(made["trajectory"]), len(made["trajectory"])
+    best = made["probability"].reshape(count, -1).argmax(axis=1)
+    flat = poses.reshape(count, -1, *poses.shape[-2:])
+    made["output_trajectory"] = flat[np.arange(count), best]
+    if planner == "pluto":
+        present = np.concatenate([inputs.position[:, 1:, -1], inputs.heading[:, 1:, -1:]], -1)
+        motion = made["prediction"]
+        predicted = headings_of(motion) + present[:, :, None]
+        made["output_prediction"] = np.concatenate([predicted, motion[..., 4:]], -1)
+        made["output_ref_free_trajectory"] = headings_of(made["ref_free_trajectory"])
+        made["candidate_trajectories"] = poses
+    return made
+
+
+def compare_outputs(stored: Source, where: str, planner: str, variant: str, ours: Arrays) -> None:
+    """Compare outputs, raw and derived, by name; headings of poses agree up to whole turns."""
+    for name, value in ours.items():
+        atol = OUTPUT["base" if name in UNSCALED.get(planner, ()) else variant]
+        theirs, compare = stored[name], stored.report.compare
+        if name.startswith(("output_", "candidate_")):
+            headings, label = (value[..., 2], theirs[..., 2]), f"{planner} {name} heading"
+            compare(label, where, *headings, atol=DERIVED_HEADING, angle=True)
+            value, theirs = (np.delete(poses, 2, axis=-1) for poses in (value, theirs))
+        compare(f"{planner} {name} ({variant})", where, value, theirs, atol=atol)
+
+
+def compare_network(loop: Loop, batch: Any, *left_out: str) -> None:
+    """Compare outputs for one iteration, but those which are too large and not stored."""
+    made = network_outputs(loop.name, loop.planner.network, batch)
+    ours = {name: value[0] for name, value in made.items() if name not in left_out}
+    compare_outputs(loop.stored.below("net/"), loop.where, loop.name, loop.variant, ours)
+
+
+def verify_forward(planner: str, radius: float, file: Source, scenes: Scenes, **args: Any) -> None:
+    """Compare the network alone, on synthetic inputs as the official code batched them.
+
+    `radius` [m] is that of the features, `args` differ from the network's released ones.
+    """
+    variant = str(file["meta/variant"])
+    network, inputs = make_network(planner, variant, **args), _network_inputs(planner, file)
+    ours = network_outputs(planner, network, inputs)
+    compare_outputs(file.below("out/"), file.name, planner, variant, ours)
+    _compare_inputs(file, planner, radius)
+    file.note("the network does not read them", "in/origin", "in/angle")
+    file.note("the network does not read the yaw rate, the last value of in/current_state")
+
+
+def _network_inputs(planner: str, file: Source) -> Any:
     """A batch for the network, from arrays by the names of the official features."""
     import torch
 
-    kind = network_module(planner).Inputs
-    values = {}
+    kind, arrays, values = network_module(planner).Inputs, file.below("in/"), {}
     for field in set(INPUTS) & {item.name for item in fields(kind)}:
         if field == "object_pose":
             pose = (arrays["static_objects.position"], arrays["static_objects.heading"][..., None])
@@ -134,88 +186,7 @@ def network_inputs(planner: str, arrays: Source) -> Any:
     return kind(**values)
 
 
-def run_network(planner: str, network: Any, inputs: Any) -> dict[str, Any]:
-    """Raw outputs for a batch by their names in the files."""
-    import torch
-
-    with torch.inference_mode():
-        out = network(inputs, predict=True) if planner == "plantf" else network(inputs)
-        raw = {name: getattr(out, name).numpy() for name in RAW if hasattr(out, name)}
-        if planner == "pluto":
-            raw["hidden"] = network.hidden_proj(out.ego).numpy()
-    return raw
-
-
-def derived_outputs(raw: Mapping[str, Any], present: Any) -> dict[str, Any]:
-    """What the official network makes of its raw outputs for one scene.
-
-    `present` are the (A, 3) poses of the agents now.
-    """
-    poses, best = headings_of(raw["trajectory"]), int(raw["probability"].argmax())
-    derived = {"output_trajectory": poses.reshape(-1, *poses.shape[-2:])[best]}
-    if "ref_free_trajectory" in raw:  # PLUTO
-        motion = raw["prediction"]
-        predicted = headings_of(motion) + present[:, None]
-        derived["output_prediction"] = np.concatenate([predicted, motion[..., 4:]], -1)
-        derived["output_ref_free_trajectory"] = headings_of(raw["ref_free_trajectory"])
-        derived["candidate_trajectories"] = poses
-    return derived
-
-
-def compare_outputs(
-    stored: Source, where: str, planner: str, variant: str, ours: Mapping[str, Any]
-) -> None:
-    """Compare outputs, raw and derived, by name; headings of poses agree up to whole turns."""
-    for name, value in ours.items():
-        atol = OUTPUT["base" if name in UNSCALED.get(planner, ()) else variant]
-        theirs, compare = stored[name], stored.report.compare
-        if name.startswith(("output_", "candidate_")):
-            headings, label = (value[..., 2], theirs[..., 2]), f"{planner} {name} heading"
-            compare(label, where, *headings, atol=DERIVED_HEADING, angle=True)
-            value, theirs = (np.delete(poses, 2, axis=-1) for poses in (value, theirs))
-        compare(f"{planner} {name} ({variant})", where, value, theirs, atol=atol)
-
-
-def verify_forward(planner: str, radius: float, file: Source, scenes: Scenes, **args: Any) -> None:
-    """Compare the network alone, on synthetic inputs as the official code batched them.
-
-    `radius` [m] is that of the features, `args` differ from the network's released ones.
-    """
-    variant = str(file["meta/variant"])
-    inputs = network_inputs(planner, file.below("in/"))
-    ours = run_network(planner, make_network(planner, variant, **args), inputs)
-    position, heading = file["in/agent.position"], file["in/agent.heading"]
-    present = np.concatenate([position[:, 1:, -1], heading[:, 1:, -1:]], -1)
-    derived = [
-        derived_outputs({name: value[row] for name, value in ours.items()}, here)
-        for row, here in enumerate(present)
-    ]
-    ours |= {name: np.stack([scene[name] for scene in derived]) for name in derived[0]}
-    compare_outputs(file.below("out/"), file.name, planner, variant, ours)
-    compare_inputs(file, planner, radius)
-    file.note("the network does not read them", "in/origin", "in/angle")
-    file.note("the network does not read the yaw rate, the last value of in/current_state")
-
-
-def manifest_of(network: Any, **builder: object) -> dict[str, Any]:
-    """Fields of `state_dict.json`; `builder` are the planner's settings of the features."""
-    heads = {
-        layer: {"C": len(head.gain), **{name: list(v) for name, v in asdict(head).items()}}
-        for layer, head in network.DRIVE_HEADS.items()
-    }
-    scale = getattr(network, "DRIVE_SCALES", {})
-    prose = dict.fromkeys(("container", "loading", "other_entries"), PROSE)
-    history, future = (SAMPLES - 1) * STEP, STEPS * STEP
-    times = {"history_horizon": history, "future_horizon": future, "sample_interval": STEP}
-    return {
-        "checkpoint": {"weights_under": "state_dict", "prefix": network.PREFIXES[0], **prose},
-        "hyper_parameters": network.RELEASED,
-        "feature_builder": times | builder,
-        "drive_overrides": {"meaning": PROSE, "heads": heads, "scale": scale},
-    }
-
-
-def compare_inputs(file: Source, planner: str, radius: float) -> None:
+def _compare_inputs(file: Source, planner: str, radius: float) -> None:
     """Check the arrays of a synthetic input against each other.
 
     The network reads one of two arrays that say the same, or neither. Points beyond `radius` [m]
@@ -243,20 +214,21 @@ def _gaps(given: Arrays, present: BoolArray, near: BoolArray, radius: float) -> 
     """What is 0 in every input: differences of what says the same, and what is always 0."""
     position, heading, velocity, shape = (given[f"agent.{name}"] for name in HISTORIES)
     points, center = given["map.point_position"], given["map.polygon_center"]
-    vectors, angles = given["map.point_vector"], given["map.point_orientation"]
     exists, state = near.any(axis=-1), given["current_state"]
+    limit, is_known = given["map.polygon_speed_limit"], given["map.polygon_has_speed_limit"]
+    angles = given["map.point_orientation"]
+    is_inside = (np.abs(points[:, :, 0]) < radius).all(axis=-1)
+    # no rule, but nearly everywhere in a synthetic world
+    moved = np.diff(position, axis=2) - velocity[:, :, :-1] * STEP
+    aside = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
     gaps = {
-        "map.point_vector": np.diff(points, axis=3) - vectors[..., :-1, :],
-        "map.point_orientation": np.arctan2(vectors[..., 1], vectors[..., 0]) - angles,
         "map.point_side": (given["map.point_side"] - np.arange(3))[exists],
         "map.polygon_center": points[:, :, 0, 10] - center[..., :2],
         "map.polygon_center orientation": angles[:, :, 0, 10] - center[..., 2],
         "map.polygon_position": points[:, :, 0, 0] - given["map.polygon_position"],
         "map.polygon_orientation": angles[:, :, 0, 0] - given["map.polygon_orientation"],
-        "map.polygon_speed_limit": given["map.polygon_speed_limit"]
-        * (1.0 - given["map.polygon_has_speed_limit"]),
-        "map.valid_mask": 1.0 * ((np.abs(points[:, :, 0]) < radius).all(axis=-1) ^ near)[exists],
-        "agent.target": given["agent.target"],
+        "map.polygon_speed_limit": limit * (1.0 - is_known),
+        "map.valid_mask": 1.0 * (is_inside ^ near)[exists],
         "ego shape": shape[:, 0] - [EGO_WIDTH, EGO_LENGTH],
         "ego speed": state[:, 3] - velocity[:, 0, -1, 0],
         "ego position": position[:, 0, -1],
@@ -264,49 +236,60 @@ def _gaps(given: Arrays, present: BoolArray, near: BoolArray, radius: float) -> 
         "ego category": given["agent.category"][:, 0],
         "ego current_state": state[:, :3],
         "ego valid_mask": 1.0 - present[:, 0],
+        "motion of agents": moved[present[..., 1:] & present[..., :-1]],
+        "headings of agents": aside[present],
+        "shapes of agents": (shape - shape[:, :, -1:])[present],
         **{f"{name} code": given[name] - np.rint(given[name]) for name in CODES & set(given)},
+        **{name: given[name] for name in ZEROS & set(given)},
     }
-    if "reference_line.vector" in given:
-        lines, steps = given["reference_line.position"], given["reference_line.vector"]
-        pairs = given["reference_line.valid_mask"][..., 1:, None]
-        angles = given["reference_line.orientation"]
-        gaps["reference_line.vector"] = (np.diff(lines, axis=-2) - steps[..., :-1, :]) * pairs
-        gaps["reference_line.orientation"] = np.arctan2(steps[..., 1], steps[..., 0]) - angles
-        gaps["reference_line.future_projection"] = given["reference_line.future_projection"]
-    # no rule, but nearly everywhere in a synthetic world
-    moved = np.diff(position, axis=2) - velocity[:, :, :-1] * STEP
-    gaps["motion of agents"] = moved[present[..., 1:] & present[..., :-1]]
-    aside = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
-    gaps["headings of agents"] = aside[present]
-    gaps["shapes of agents"] = (shape - shape[:, :, -1:])[present]
+    for start, mask in (("map.point_", ""), ("reference_line.", "reference_line.valid_mask")):
+        if f"{start}vector" in given:
+            steps, angles = given[f"{start}vector"], given[f"{start}orientation"]
+            gap = np.diff(given[f"{start}position"], axis=-2) - steps[..., :-1, :]
+            gaps[f"{start}vector"] = gap * given[mask][..., 1:, None] if mask else gap
+            gaps[f"{start}orientation"] = np.arctan2(steps[..., 1], steps[..., 0]) - angles
     return gaps
+
+
+def manifest_of(network: Any, **builder: object) -> dict[str, Any]:
+    """Fields of `state_dict.json`; `builder` are the planner's settings of the features."""
+    heads = {
+        layer: {"C": len(head.gain), **{name: list(v) for name, v in asdict(head).items()}}
+        for layer, head in network.DRIVE_HEADS.items()
+    }
+    scale = getattr(network, "DRIVE_SCALES", {})
+    prose = dict.fromkeys(("container", "loading", "other_entries"), PROSE)
+    history, future = (SAMPLES - 1) * STEP, STEPS * STEP
+    times = {"history_horizon": history, "future_horizon": future, "sample_interval": STEP}
+    return {
+        "checkpoint": {"weights_under": "state_dict", "prefix": network.PREFIXES[0], **prose},
+        "hyper_parameters": network.RELEASED,
+        "feature_builder": times | builder,
+        "drive_overrides": {"meaning": PROSE, "heads": heads, "scale": scale},
+    }
 
 
 def _compare(loop: Loop) -> None:
     """Compare features, raw outputs and plan of one iteration."""
     loop.compare_plan(POSITION)
-    theirs = loop.recorded("trajectory")
+    theirs = loop.row["trajectory"]
     again = plan_of_poses(theirs[1:, :3], loop.seen.history).states[:, 3:PLAN_COLUMNS]
     loop.compare("motion of the recorded plan", again, theirs[:, 3:], MOTION)
     if not list(loop.stored):
         return
     features = loop.features
-    others = {
-        "current_state": features.current_state,
-        # the official code gives every agent the category of the ego at inference
-        "agent.category": np.zeros(len(features.agents.valid), np.int64),
-    }
+    # the official code gives every agent the category of the ego at inference
+    categories = np.zeros(len(features.agents.valid), np.int64)
+    others = {"current_state": features.current_state, "agent.category": categories}
     compare_features(loop, features.agents, features.road, features.route, others)
-    raw = run_network(NAME, loop.planner.network, make_batch([features], "cpu"))
-    ours = {name: value[0] for name, value in raw.items()}
-    ours |= derived_outputs(ours, None)
-    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
+    compare_network(loop, make_batch([features], "cpu"))
 
 
+_BUILDER = {"radius": RADIUS, "max_agents": MAX_AGENTS}
 FILES = {
     "state_dict.json": partial(
-        verify_manifest, NAME, SIZES, partial(manifest_of, radius=RADIUS, max_agents=MAX_AGENTS)
+        verify_manifest, PlanTF.name, SIZES, partial(manifest_of, **_BUILDER)
     ),
-    "forward_*.npz": partial(verify_forward, NAME, RADIUS),
+    "forward_*.npz": partial(verify_forward, PlanTF.name, RADIUS),
     "closed_loop_*.npz": partial(verify_loop, PlanTF, _compare, PLANS),
 }

@@ -6,42 +6,30 @@ from typing import Any
 import numpy as np
 
 from shiftsim.planners.learned.map_features import CROSSWALK
+from shiftsim.planners.learned.pluto import scoring
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import stack
 from shiftsim.planners.learned.pluto.planner import MAX_AGENTS, RADIUS, Choice, Pluto, Sight
-from shiftsim.planners.learned.pluto.scoring import Place, Scores, aggregate, nearest_line, score
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets import loops
-from shiftsim.verify.nets.loops import PLANS, POSITION, Loop, verify_loop
+from shiftsim.verify.nets import loops, plantf
+from shiftsim.verify.nets.loops import POSITION, Loop, verify_loop
 from shiftsim.verify.nets.networks import FEATURE, OUTPUT, verify_manifest
-from shiftsim.verify.nets.plantf import (
-    INPUTS,
-    SIZES,
-    compare_features,
-    compare_outputs,
-    derived_outputs,
-    manifest_of,
-    run_network,
-    verify_forward,
-)
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
-NAME = Pluto.name
 NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
 EXACT = 1e-8  # what follows from stored candidates and predictions alone
 MOTION = 1e-2  # m/s, m/s^2: derivatives of poses 0.1 s apart
-SCORE = 1e-4
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
-SCORES = {  # stored array → field of `Scores`, tolerance where proposals are made from the log on
-    "rollout": ("driven", POSITION),
-    "progress": ("progress", POSITION),
-    "rule": ("rule", SCORE),
-    "weighted": ("terms", SCORE),
-    "multi": ("factors", 0.0),
-    "fault_t": ("fault_times", EXACT),
-    "footprints": ("flags", 0.0),
-    "speed_limit": ("speed_limits", 0.0),
+SCORES = (  # stored arrays, in the order of the fields of `Scores` behind the total
+    *("rule", "multi", "weighted", "progress", "fault_t", "rollout", "footprints", "speed_limit"),
+)
+POSES = np.array([POSITION, POSITION, loops.HEADING])
+BOUNDS: dict[str, Any] = {  # where proposals are made from the log on
+    **{"cand": POSES, "agents_pred": POSES, "progress": POSITION},
+    "rollout": np.append(POSES, [POSITION] * (NUM_STATE - len(POSES))),
+    **dict.fromkeys(("lscore", "rule", "weighted"), 1e-4),
+    "fault_t": EXACT,
 }
 
 
@@ -54,28 +42,36 @@ def _verify_brake(file: Source, scenes: Scenes) -> None:
     for case in np.flatnonzero(must).tolist():
         states[case] = brake(poses[case], egos[case], float(times[case]), PACIFICA)
     file.match("file", {"columns": list(loops.FILE_COLUMNS)})
-    file.match_rows(
-        {"speed": speeds, "braked": must, "states": states}, {"speed": LINE, "": loops.STATE}
-    )
+    ours = {"speed": speeds, "braked": must, "states": states}
+    file.match_rows(ours, {"speed": LINE, "": loops.STATE})
 
 
 def _compare(loop: Loop) -> None:
     """Compare everything stored of one iteration."""
-    sight, choice = loop.planner.sight, loop.planner.choice
-    if "agent_tokens" in loop.stored:  # one of the iterations stored in full
+    from shiftsim.planners.learned.pluto.network import Inputs
+
+    sight, choice, report = loop.planner.sight, loop.planner.choice, loop.file.report
+    is_full = "agent_tokens" in loop.stored  # one of the iterations stored in full
+    if is_full:
         _compare_sight(loop, sight)
-        _compare_network(loop)
+        batch = Inputs(*stack([loop.features], "cpu"))
+        plantf.compare_network(loop, batch, "trajectory", "candidate_trajectories")
     if choice is None:
-        loop.file.report.fail(f"{NAME} reference lines", loop.where, "none found")
+        report.fail(f"{loop.name} reference lines", loop.where, "none found")
         return
     _compare_choice(loop, choice)
-    if "agent_tokens" in loop.stored:
+    if is_full:
         _compare_from_stored(loop, sight)
-    best = int(loop.recorded("best_index"))
-    if not _is_near_tie(loop, choice.best, best):
-        loop.compare("best proposal", choice.best, best)
-        loop.compare("emergency brake", choice.braked, bool(loop.recorded("emergency_brake")))
-        loop.compare_plan(MOTION)
+    stored, best = loop.stored.below("post/"), int(loop.row["best_index"])
+    total = stored["rule"] + 0.3 * stored["lscore"]
+    first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
+    if choice.best != best and first - second <= NEAR_TIE:
+        what = f"proposal {choice.best} instead of {best}, scores {first:.6f} and {second:.6f}"
+        report.note(f"{loop.name} {loop.where}: near-tie, {what}")
+        return
+    loop.compare("best proposal", choice.best, best)
+    loop.compare("emergency brake", choice.braked, bool(loop.row["emergency_brake"]))
+    loop.compare_plan(MOTION)
 
 
 def _compare_sight(loop: Loop, sight: Sight) -> None:
@@ -84,14 +80,13 @@ def _compare_sight(loop: Loop, sight: Sight) -> None:
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
     ]
+    given = ("current_state", "category", *(name for name in inputs if name.startswith("line_")))
     others = {
-        "current_state": inputs["current_state"],
-        "agent.category": inputs["category"],
         "map.polygon_road_block_id": np.array(blocks, np.int64),
         "reference_line.future_projection": np.zeros((len(sight.lines), 8, 2)),
-        **{INPUTS[name]: value for name, value in inputs.items() if name.startswith("line_")},
+        **{plantf.INPUTS[name]: inputs[name] for name in given},
     }
-    compare_features(loop, sight.agents, near, loop.planner.route.blocks, others)
+    plantf.compare_features(loop, sight.agents, near, loop.planner.route.blocks, others)
     stored = [name for name in loop.stored if name.startswith("reference_line_")]
     loop.compare("reference lines", len(sight.lines), len(stored))
     loop.match({f"reference_line_{i}": line for i, line in enumerate(sight.lines)}, LINE)
@@ -111,79 +106,50 @@ def _compare_sight(loop: Loop, sight: Sight) -> None:
 
 def _by_place(positions: Any) -> Any:
     """Order by place, to the centimetre."""
-    rounded = np.rint(np.asarray(positions, np.float64) * 100.0)
-    return np.lexsort((rounded[:, 1], rounded[:, 0]))
-
-
-def _compare_network(loop: Loop) -> None:
-    from shiftsim.planners.learned.pluto.network import Inputs
-
-    inputs = loop.features
-    raw = run_network(NAME, loop.planner.network, Inputs(*stack([inputs], "cpu")))
-    ours = {name: value[0] for name, value in raw.items()}
-    present = np.concatenate([inputs.position[1:, -1], inputs.heading[1:, -1:]], axis=1)
-    ours |= derived_outputs(ours, present)
-    del ours["trajectory"], ours["candidate_trajectories"]  # too large, not stored
-    compare_outputs(loop.stored.below("net/"), loop.where, NAME, loop.variant, ours)
+    return np.lexsort(np.rint(np.asarray(positions, np.float64) * 100.0).T[::-1])
 
 
 def _compare_choice(loop: Loop, choice: Choice) -> None:
     """Compare proposals and scores that were made from the log on."""
-    stored, scores = loop.stored.below("post/"), choice.scores
+    stored = loop.stored.below("post/")
     ours = {
-        "cand": (choice.poses, POSITION),
-        "lscore": (choice.learned, SCORE),
-        "agents_pred": (choice.agents.poses, POSITION),
-        "agents_vel": (choice.agents.speeds, OUTPUT[loop.variant]),
-        **{name: (getattr(scores, field), atol) for name, (field, atol) in SCORES.items()},
+        "cand": choice.poses,
+        "lscore": choice.learned,
+        "agents_pred": choice.agents.poses,
+        "agents_vel": choice.agents.speeds,
+        **dict(zip(SCORES, choice.scores[1:], strict=True)),
     }
-    for name, (value, atol) in ours.items():
-        if name in stored:
-            loop.compare(name, value, stored[name], atol)
-            if name in ("cand", "rollout", "agents_pred"):
-                loop.compare(f"{name} heading", value[..., 2], stored[name][..., 2], loops.HEADING)
+    ours = {name: value for name, value in ours.items() if name in stored}
+    loop.match(ours, {**BOUNDS, "agents_vel": OUTPUT[loop.variant]}, "post/")
     # what follows from the other stored scores
-    progress, rule = aggregate(stored["multi"], stored["weighted"], stored["progress"])
+    parts = (stored["multi"], stored["weighted"], stored["progress"])
+    progress, rule = scoring.aggregate(*parts)
     loop.compare("aggregated progress", progress, stored["weighted"][0], EXACT)
     loop.compare("aggregated rule", rule, stored["rule"], EXACT)
 
 
 def _compare_from_stored(loop: Loop, sight: Sight) -> None:
     """Compare what the scores of the stored proposals are, against the stored predictions."""
-    stored, scenario, ego = (loop.stored.below("post/"), loop.scenario, loop.seen.history.ego[-1])
+    stored, scenario, ego = loop.stored.below("post/"), loop.scenario, loop.seen.history.ego[-1]
     tokens = [scenario.tracks.tokens[track] for track in sight.agents.tracks.tolist()]
-    line = nearest_line(sight.lines, ego)
-    ours: dict[str, Any] = {"agents_tok": tokens, "baseline": line}
-    stored.match(loop.where, ours, EXACT, quantity=NAME)
-    agents = loop.planner.choice.agents._replace(
-        poses=stored["agents_pred"], speeds=stored["agents_vel"]
-    )
-    world = loop.planner.world_of(loop.seen, agents)
-    place = Place(sight.drivable, scenario.map.edges.polygons, line)
+    line = scoring.nearest_line(sight.lines, ego)
+    loop.match({"agents_tok": tokens, "baseline": line}, EXACT, "post/")
+    motion = {"poses": stored["agents_pred"], "speeds": stored["agents_vel"]}
+    world = loop.planner.world_of(loop.seen, loop.planner.choice.agents._replace(**motion))
+    place = scoring.Place(sight.drivable, scenario.map.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
-    scores: Scores = score(proposals, stored["lscore"], ego, world, place, PACIFICA)
-    ours = {name: getattr(scores, field) for name, (field, _) in SCORES.items()}
-    stored.match(loop.where, ours, EXACT, quantity=f"{NAME} stored proposals'")
-
-
-def _is_near_tie(loop: Loop, ours: int, theirs: int) -> bool:
-    """Whether another proposal was chosen in a near-tie, which is listed."""
-    stored = loop.stored.below("post/")
-    total = stored["rule"] + 0.3 * stored["lscore"]
-    first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
-    if ours == theirs or first - second > NEAR_TIE:
-        return False
-    what = f"proposal {ours} instead of {theirs}, scores {first:.6f} and {second:.6f}"
-    loop.file.report.note(f"{NAME} {loop.where}: near-tie, {what}")
-    return True
+    scores = scoring.score(proposals, stored["lscore"], ego, world, place, PACIFICA)
+    ours = dict(zip(SCORES, scores[1:], strict=True))
+    stored.match(loop.where, ours, EXACT, quantity=f"{loop.name} stored proposals'")
 
 
 _BUILDER = {"radius": RADIUS, "max_agents": MAX_AGENTS, "build_reference_line": True}
-_RECORDED = (*PLANS, "best_index", "emergency_brake")
+_MANIFEST = partial(plantf.manifest_of, **_BUILDER)
+_RECORDED = (*loops.PLANS, "best_index", "emergency_brake")
 FILES = {
-    "state_dict.json": partial(verify_manifest, NAME, SIZES, partial(manifest_of, **_BUILDER)),
+    "state_dict.json": partial(verify_manifest, Pluto.name, plantf.SIZES, _MANIFEST),
     # the official code masks the agents of a batch in the wrong order
-    "forward_*.npz": partial(verify_forward, NAME, RADIUS, misordered_masks=True),
+    "forward_*.npz": partial(plantf.verify_forward, Pluto.name, RADIUS, misordered_masks=True),
     "closed_loop_*.npz": partial(verify_loop, Pluto, _compare, _RECORDED),
     "emergency_brake.npz": _verify_brake,
 }

@@ -3,12 +3,7 @@
 import numpy as np
 
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.routes.correction import (
-    RouteCorrector,
-    correct_route,
-    find_start,
-    known_blocks,
-)
+from shiftsim.planners.routes import correction
 from shiftsim.verify.files import Source
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.scenario import Scenario
@@ -29,17 +24,17 @@ def _verify_routes(file: Source, scenes: Scenes) -> None:
 
 
 def _verify_case(case: Source, where: str, scenario: Scenario) -> None:
-    rear_axle = np.array(case["rear_axle"], np.float64)
+    rear_axle, road = np.array(case["rear_axle"], np.float64).reshape(3), scenario.map
     if case["case"] == "as_logged":
         logged = {"rear_axle": scenario.expert[0, :3], "route": list(scenario.route)}
         case.match(where, logged, 1e-8, quantity=NAME)
-    road = scenario.map
-    blocks = known_blocks(road, case["route"], "of the file", "route correction")
+    blocks = correction.known_blocks(road, case["route"], "of the file", "route correction")
     size = np.array([PACIFICA.length, PACIFICA.width])
     footprint = boxes_to_corners(center_poses(rear_axle), size)
+    start = correction.find_start(road, blocks, rear_axle, footprint)
     ours = {
-        "square_1m": RouteCorrector(road, blocks, SQUARE).at(rear_axle),
-        "footprint": correct_route(road, blocks, find_start(road, blocks, rear_axle, footprint)),
+        "square_1m": correction.RouteCorrector(road, blocks, SQUARE).at(rear_axle),
+        "footprint": correction.correct_route(road, blocks, start),
     }
     named = {name: [road.blocks.ids[block] for block in found] for name, found in ours.items()}
     case.match(where, named, quantity=NAME)

@@ -10,8 +10,8 @@ from shiftsim.data.nuplan.log import open_log
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import find_maps, list_scenarios, load_map, read_scenario
 from shiftsim.errors import DataError
-from shiftsim.verify.files import Source, read_fields
-from shiftsim.verify.nuplan.logs import excerpt_rows
+from shiftsim.verify.files import read_fields
+from shiftsim.verify.nuplan.logs import excerpt_rows, name_rest
 from shiftsim.verify.nuplan.maps import attributes_of, near_square
 from shiftsim.verify.report import Report
 from shiftsim.world.layers import in_any
@@ -26,21 +26,15 @@ _NEAR = 80.0  # m, half width of the square of `proximal`
 _DRIVABLE = ((30.0, 0.0), (100.0, -6.0), (30.0, -8.0), (210.0, -6.0))
 _ORIGINS = {32632: (600000.0, 5300000.0)}  # of the coordinates, by coordinate system
 _POSE = np.array([1e-6, 1e-6, 1e-9])
-_TOLERANCES: dict[str, Any] = {
-    "interval": 1e-12,
-    "rear": _POSE,
-    "center": 1e-6,
-    "speed": 1e-9,
-    "goal": _POSE,
-    "length": 1e-3,
-}
+_TOLERANCES: dict[str, Any] = {"rear": _POSE, "goal": _POSE, "center": 1e-6, "length": 1e-3}
+_TOLERANCES |= {"interval": 1e-12, "speed": 1e-9}
 # Fields of a lane and of a connector as of `attributes_of`
 _BOTH = {"out": "outgoing", "inc": "incoming"}
 _LANE = {"roadblock": "roadblock_id", "speed": "speed_limit_mps", **_BOTH}
 _LANE |= {"length": "baseline_length", "index": "index"}
 _CONNECTOR = {"rb": "roadblock_id", "lights": "has_traffic_lights", "stop": "stop_lines", **_BOTH}
 # Lists whose order means nothing
-_SETS = {"tagged", "objects", "lights", "lanes_at_point", "out", "inc", "stop", "interior"}
+_UNORDERED = {"tagged", "objects", "lights", "lanes_at_point", "out", "inc", "stop", "interior"}
 
 
 def verify_nuplan_format(folder: Path, report: Report) -> None:
@@ -52,25 +46,10 @@ def verify_nuplan_format(folder: Path, report: Report) -> None:
         raise DataError(f"{folder / 'logs'}: there is no log (.db)")
     for extra in logs[1:]:
         report.skip(f"logs/{extra.name}: a second log")
-    _compare(expected, _read_back(folder, logs[0]), path.name)
+    ours = _read_back(folder, logs[0])
+    expected.match_tree(path.name, ours, _TOLERANCES, unordered=_UNORDERED)
     expected.finish()
-    known = {*logs, *find_maps(folder / "maps").values(), path}
-    known |= set((folder / "maps").glob("*maps*.json"))
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path not in known and path.name != "README.md":
-            report.skip(f"{path.relative_to(folder)} is not part of the folder's format")
-    report.note("README.md (for reading)")
-
-
-def _compare(theirs: Source, ours: dict[str, Any], where: str) -> None:
-    for name, value in ours.items():
-        if isinstance(value, dict):
-            _compare(theirs.each(name)[0], value, f"{where} {name}")
-        elif name in _SETS and isinstance(value, list):
-            same = sorted(map(repr, value)) == sorted(map(repr, theirs[name]))
-            theirs.match(where, {name: theirs[name] if same else value}, quantity="readback")
-        else:
-            theirs.match(where, {name: value}, _TOLERANCES, quantity="readback")
+    name_rest(folder, {*logs, path}, report)
 
 
 def _read_back(folder: Path, path: Path) -> dict[str, Any]:

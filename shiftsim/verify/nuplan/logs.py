@@ -1,6 +1,7 @@
 """The importer against what the official stack reads from the same logs and maps."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LightStatus
 
-POSE = np.array([METRES, METRES, RADIANS])
-_EGO = {
+_POSE = np.array([METRES, METRES, RADIANS])
+_POSES = dict.fromkeys(("mission_goal", "expert_goal_state"), _POSE)
+_TOLERANCES = {
     **dict.fromkeys(("x", "y", "center_x", "center_y"), METRES),
     **dict.fromkeys(("heading", "center_heading"), RADIANS),
 }
@@ -48,71 +50,70 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
         with report.attempt("importer", name), open_log(folder / entry["db"]) as log:
             scene = scenes[name]
             drawn = sorted(planner[9:] for of, planner in scripts if of == name)  # scripted_…
-            _compare_entry(entry, scene, log, drawn)
-            _compare_meta(name, meta.each(name)[0], scene, log)
+            _compare_facts(entry, meta.each(name)[0], scene, log, drawn)
             for kind in ("iteration", *_EXCERPTS):
-                _compare_ego((name, kind), scene, ego)
-            _compare_objects((name, "NR", "*"), scene, log, objects)
-            _compare_lights(name, scene, lights)
+                ego.match((name, kind), _ego(kind, scene), _TOLERANCES)
+            objects.match((name, "NR", "*"), _objects(scene, log), _TOLERANCES)
+            lights.match((name,), _lights(scene))
     for table in (ego, lights):
         table.finish()
     for source in (meta, *listed):
         source.finish()
-    _name_files(folder, scenes, report)
-
-
-def _name_files(folder: Path, scenes: Scenes, report: Report) -> None:
-    """Name every file among the inputs that nothing reads."""
-    used = {folder / entry["db"] for entry in scenes.entries.values()}
-    used |= {*find_maps(folder / "maps").values(), *(folder / "maps").glob("*maps*.json")}
-    for path in sorted(p for sub in ("logs", "maps") for p in (folder / sub).rglob("*")):
-        if path.is_file() and path not in used:
-            report.skip(f"{path.relative_to(folder)} is not named by scenes.json or the map index")
-    report.note("README.md, RESULTS.md (for reading; RESULTS repeats scores.parquet)")
+    read = {*expected.iterdir(), *(folder / entry["db"] for entry in scenes.entries.values())}
+    read |= {folder / name for name in ("scenes.json", "scripted.parquet", "RESULTS.md")}
+    name_rest(folder, read, report)
+    report.note("RESULTS.md (for reading; repeats scores.parquet)")
     report.note("maps/*.json: raster layers of the index (not used for planning)")
     report.note("scenes.json: purpose of each script (a label)")
 
 
-def _compare_entry(entry: Source, scene: Scenario, log: Log, scripts: list[str]) -> None:
-    where, report = entry["scene"], entry.report
+def name_rest(folder: Path, read: set[Path], report: Report) -> None:
+    """Name every file below a folder that nothing reads; its maps, and their index, are read."""
+    read |= {*find_maps(folder / "maps").values(), *(folder / "maps").glob("*maps*.json")}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path not in read and path.name != "README.md":
+            report.skip(f"file {path.relative_to(folder)}")
+    report.note("README.md (for reading)")
+
+
+def _compare_facts(
+    entry: Source, meta: Source, scene: Scenario, log: Log, drawn: list[str]
+) -> None:
+    """Compare what `scenes.json` and `scenario_meta.json` say of a scene."""
+    where, times, tracks = entry["scene"], scene.iteration_times, "SELECT COUNT(*) FROM track"
+    # nuPlan rule 602: both stamps become seconds first, the difference is cut to microseconds
+    duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
     offered = bool(log.is_offered[log.row_of[entry["token"]]])
-    report.compare("scenes.json offered by the log", where, offered, True)
+    entry.report.compare("scenes.json offered by the log", where, offered, True)
     names = sorted(script["name"] for script in entry["scripts"])
-    report.compare("scenes.json scripts", where, scripts, names)
+    entry.report.compare("scenes.json scripts", where, drawn, names)
+    both = {
+        "token": scene.token,
+        "route_roadblock_ids": list(scene.route),
+        "mission_goal": scene.mission_goal,
+    }
     ours = {
         "scene": scene.log_name,
         "db": f"logs/{scene.log_name}.db",
         "map": log.map_name,
         "scenario_type": scene.scenario_type,
-        "token": scene.token,
-        "t0_us": int(scene.iteration_times[0]),
-        "route_roadblock_ids": list(scene.route),
+        "t0_us": int(times[0]),
         "n_lidar_pc": len(log.time_us),
-        "n_tracks": log.database.query("SELECT COUNT(*) FROM track", "table 'track'")[0][0],
+        "n_tracks": log.database.query(tracks, "table 'track'")[0][0],
         "time_jitter": bool((np.diff(log.time_us) != 50_000).any()),
         "epsg": scene.map.epsg,
-        "mission_goal": scene.mission_goal,
     }
-    entry.match(where, ours, {"mission_goal": POSE})
-
-
-def _compare_meta(where: str, meta: Source, scene: Scenario, log: Log) -> None:
-    times = scene.iteration_times
-    # nuPlan rule 602: both stamps become seconds first, the difference is cut to microseconds
-    duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
+    entry.match(where, both | ours, _POSES)
     ours = {
-        "token": scene.token,
         "log_name": scene.log_name,
         "iterations": scene.num_iterations,
-        "route_roadblock_ids": list(scene.route),
         "route_from_expert": expert_route(scene.map, expert_points(log, log.row_of[scene.token])),
         "database_interval": 0.05 / scene.mapping[2],
         "duration_s": int(duration * 1e6) / 1e6,
-        "time_us": times.tolist(),
-        "mission_goal": scene.mission_goal,
+        "time_us": times,
         "expert_goal_state": scene.expert[-1, :3],
     }
-    meta.match(where, ours, {"mission_goal": POSE, "expert_goal_state": POSE}, quantity="meta")
+    meta.match(where, both | ours, _POSES, quantity="meta")
 
 
 def expert_points(log: Log, row: int) -> FloatArray:
@@ -151,32 +152,31 @@ def excerpt_rows(scene: Scenario, row: int, num: int, horizon: int, direction: i
     return np.sort(rows[(rows >= 0) & (rows < len(scene.time_us))])
 
 
-def _compare_ego(key: tuple[str, str], scene: Scenario, ego: Groups) -> None:
+def _ego(kind: str, scene: Scenario) -> dict[str, Any]:
     rows = scene.iteration_rows
-    if key[1] in _EXCERPTS:
-        num, horizon, direction, iteration = _EXCERPTS[key[1]]
+    if kind in _EXCERPTS:
+        num, horizon, direction, iteration = _EXCERPTS[kind]
         rows = excerpt_rows(scene, int(rows[iteration]), num, horizon, direction)
     samples = {"index": np.arange(len(rows)), "time_us": scene.time_us[rows]}
-    ego.match(key, {**samples, **ego_columns(scene.ego[rows])}, _EGO)
+    return {**samples, **ego_columns(scene.ego[rows])}
 
 
-def _compare_objects(key: tuple[str, ...], scene: Scenario, log: Log, objects: Groups) -> None:
+def _objects(scene: Scenario, log: Log) -> dict[str, Any]:
     """Objects of every sample, in nuPlan's order, with their heights (which only the log has)."""
     sampled = np.searchsorted(log.time_us, scene.iteration_times[:-1])
     boxes = read_boxes(log, int(sampled[0]), int(sampled[-1]) + 1)
     tracks = scene.tracks.rows(scene.iteration_rows[:-1])
-    heights = {"height": boxes.values[np.isin(boxes.row, sampled), 7]}
-    objects.match(key, object_columns(tracks, *np.nonzero(tracks.valid)) | heights, _EGO)
+    heights = boxes.values[np.isin(boxes.row, sampled), 7]
+    return {**object_columns(tracks, *np.nonzero(tracks.valid)), "height": heights}
 
 
-def _compare_lights(name: str, scene: Scenario, table: Groups) -> None:
+def _lights(scene: Scenario) -> dict[str, Any]:
     sampled, lights = scene.iteration_rows[:-1], scene.traffic_lights
     iteration, connector = np.nonzero(lights.status[sampled] != LightStatus.ABSENT)
     status = lights.status[sampled][iteration, connector]
-    ours = {
+    return {
         "iteration": iteration,
         "lane_connector_id": [int(lights.connector_ids[index]) for index in connector],
         "status": [LightStatus(code).name for code in status.tolist()],
         "timestamp": scene.time_us[sampled][iteration],
     }
-    table.match((name,), ours)

@@ -1,5 +1,6 @@
 """Metrics of the nuplan folder: recorded rollouts, scored by us and by the official stack."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,11 @@ from shiftsim.world.state import AgentKind, Tracks
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 PROFILE_KEY = (*RUN_KEY, "thresholds")
 _TABLES = {
-    **dict.fromkeys(("objects", "route", "collisions", "time_series"), RUN_KEY),
-    **dict.fromkeys(("metrics", "statistics", "scores"), PROFILE_KEY),
+    **dict.fromkeys(("objects", "route", "collisions"), RUN_KEY),
+    "scores": PROFILE_KEY,
+    "metrics": (*PROFILE_KEY, "metric"),
+    "statistics": (*PROFILE_KEY, "metric", "statistic"),
+    "time_series": (*RUN_KEY, "metric"),
 }
 # coordinates near 4e6 are spaced 5e-10
 _RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
@@ -70,7 +74,8 @@ def verify_nuplan_metrics(
             for thresholds, profile in PROFILES.items():
                 result = judge(measured, profile)
                 _compare_profile((*run, thresholds), result, entry, tables)
-            _compare_series(run, judge(measured, "nuplan"), tables["time_series"][run])
+                if profile == "nuplan":
+                    _compare_series(run, result, tables["time_series"])
     for table in (runs, *tables.values()):
         table.finish(mode)
 
@@ -82,11 +87,11 @@ def _measure(
     ego, logged = (
         worlds.ego_states({n: part[n] for n in worlds.EGO_COLUMNS}) for part in (rows, expert)
     )
-    tracks = tracks_of(objects, len(ego))
-    stamps = rows["time_us"].astype(np.int64), expert["time_us"].astype(np.int64)
-    log = worlds.recorded_log(run[0], stamps[0], ego, tracks, stamps[1], logged)
+    times, tracks = expert["time_us"].astype(np.int64), tracks_of(objects, len(ego))
+    scenario = worlds.make_scenario(run[0], road, times, logged, tracks)
+    log = replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
     columns, count = worlds.ego_columns(ego), len(logged) - 1
-    ours = {"iteration": np.arange(count), "time_us": stamps[1][:count]}
+    ours = {"iteration": np.arange(count), "time_us": times[:count]}
     ours |= {name: columns[name] for name in _RECORDED}
     rows.match(" ".join(run), ours, _RECORDED, quantity="recorded")
     return measure(log, road)
@@ -98,6 +103,8 @@ def tracks_of(rows: Source, count: int) -> Tracks:
     kinds = dict(zip(names, rows["type"].tolist(), strict=True))
     column = {token: index for index, token in enumerate(kinds)}
     track = [column[token] for token in names]
+    if not ((iteration >= 0) & (iteration < count)).all():
+        raise DataError(f"objects at iterations which the ego does not have, of {count}")
     if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
         raise DataError("an object occurs twice at one iteration")
     if [kinds[token] for token in names] != rows["type"].tolist():
@@ -137,41 +144,27 @@ def _compare_profile(
     key: tuple[str, ...], result: MetricResult, entry: dict[str, Any], tables: dict[str, Groups]
 ) -> None:
     """Compare scores and statistics under one threshold set."""
-    where = " ".join(key)
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
-    rows = tables["metrics"][key]
-    labels = {
-        "metric": list(scores),
-        "category": [_CATEGORIES.get(name, "Planning") for name in scores],
-        "unit": [_UNITS.get(name) for name in scores],
-    }
-    if rows.match(where, labels):
-        rows.by("metric", "score").match(where, scores, SCORE_TOLERANCES)
-    rows = tables["scores"][key]
-    labels = {"scenario": [entry["token"]], "scenario_type": [entry["scenario_type"]]}
-    columns = {name: [score] for name, score in {**scores, "score": result.score}.items()}
-    rows.match(where, {**labels, **columns}, SCORE_TOLERANCES)
-    rows = tables["statistics"][key]
-    rows = rows.at(np.lexsort((rows["statistic"].astype(str), rows["metric"].astype(str))))
-    ours = sorted(result.statistics, key=lambda s: (s.metric, s.name))
-    labels = {
-        "metric": [s.metric for s in ours],
-        "statistic": [s.name for s in ours],
-        "unit": [s.unit or None for s in ours],
-        "type": [s.kind or None for s in ours],
-    }
-    if rows.match(where, labels):
-        exact = {s.name: EXACT for s in ours if s.unit in ("boolean", "count")}
-        values = {s.name: s.value for s in ours}
-        rows.by("statistic", "value").match(where, values, {"": TOLERANCE, **exact})
+    row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
+    row |= {"score": result.score}
+    tables["scores"].match(key, {name: [value] for name, value in row.items()}, SCORE_TOLERANCES)
+    tables["metrics"].match_keys(key, [(name,) for name in scores])
+    for name, score in scores.items():
+        filed = {"category": [_CATEGORIES.get(name, "Planning")], "unit": [_UNITS.get(name)]}
+        atol = {"score": SCORE_TOLERANCES.get(name, EXACT)}
+        tables["metrics"].match((*key, name), {**filed, "score": [score]}, atol)
+    found = result.statistics
+    tables["statistics"].match_keys(key, [(s.metric, s.name) for s in found])
+    for s in found:
+        filed = {"unit": [s.unit or None], "type": [s.kind or None]}
+        atol = {"value": EXACT if s.unit in ("boolean", "count") else TOLERANCE}
+        tables["statistics"].match((*key, s.metric, s.name), {**filed, "value": [s.value]}, atol)
 
 
-def _compare_series(run: tuple[str, ...], result: MetricResult, rows: Source) -> None:
-    groups, times = rows.groups("metric"), result.measurements.time_us
-    names = sorted(metric for (metric,) in groups)
-    rows.report.compare("series present", " ".join(run), sorted(result.series), names)
-    for metric in sorted(set(names) & set(result.series)):
-        ours = result.series[metric]
+def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -> None:
+    times = result.measurements.time_us
+    table.match_keys(run, [(metric,) for metric in result.series])
+    for metric, ours in result.series.items():
         columns = {
             "unit": [ours.unit or None] * len(times),
             "index": np.arange(len(times)),
@@ -179,4 +172,4 @@ def _compare_series(run: tuple[str, ...], result: MetricResult, rows: Source) ->
             "value": ours.values,
         }
         atol = {"value": EXACT if ours.unit == "boolean" else TOLERANCE}
-        groups[metric,].match(f"{' '.join(run)} {metric}", columns, atol, quantity="series")
+        table.match((*run, metric), columns, atol, quantity="series")

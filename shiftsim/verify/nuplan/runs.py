@@ -6,9 +6,11 @@ too, a scored one score by score.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from shiftsim.errors import DataError
 from shiftsim.metrics import judge, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
@@ -57,51 +59,47 @@ def verify_simulation(
         if mode not in (None, challenge):
             continue
         with report.attempt("simulation", where):
+            if challenge not in CHALLENGES or scene not in scenes:
+                raise DataError("no such challenge or scene")
             controller, traffic = CHALLENGES[challenge]
             driver = _load_planner(planner, folder.parent / "scripted.parquet")
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
             samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
-            ours = {**samples, **ego_columns(log.ego)}
-            runs[key].match(where, ours, EGO_TOLERANCES, quantity="ego")
+            runs.match(key, samples | ego_columns(log.ego), EGO_TOLERANCES, quantity="ego")
             if challenge == "R":
-                heights = _heights(replayed[scene, "NR", "*"])
-                _compare_objects(where, log, objects[key], heights)
+                found = _objects(log, replayed[scene, "NR", "*"])
+                objects.match(key, found, OBJECT_TOLERANCES, quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                found = known_scores(judge(measured, profile)).items()
-                rows, at = scores[*key, thresholds], f"{where} {thresholds}"
-                rated = {name: [score] for name, score in found}
-                rows.match(at, rated, TOLERANCE, quantity="simulated score")
+                rated = known_scores(judge(measured, profile)).items()
+                columns = {name: [score] for name, score in rated}
+                scores.match((*key, thresholds), columns, TOLERANCE, quantity="simulated score")
     if mode in (None, "R"):
         objects.table.finish()
 
 
 def _load_planner(name: str, scripts: Path) -> Planner:
-    if name.startswith(_SCRIPTED):
-        script = name.removeprefix(_SCRIPTED)
-        return load_planner("scripted", {"file": str(scripts), "name": script})
-    return load_planner(name.replace("_", "-"))
+    kind, _, script = name.partition("_") if name.startswith(_SCRIPTED) else (name, "", "")
+    args = {"file": str(scripts), "name": script} if script else {}
+    return load_planner(kind.replace("_", "-"), args)
 
 
-def _heights(rows: Source) -> dict[tuple[int, str], float]:
-    """Heights of logged objects by iteration and token; shiftsim keeps none."""
-    columns = (rows[name].tolist() for name in ("iteration", "track_token", "height"))
-    return {(index, token): height for index, token, height in zip(*columns, strict=True)}
+def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
+    """Objects in the order of observation.
 
-
-def _compare_objects(
-    where: str, log: SimulationLog, rows: Source, heights: dict[tuple[int, str], float]
-) -> None:
-    tracks = log.tracks
+    Heights, which shiftsim does not keep, are of vehicles as in the first frame of the log, of
+    others as in the same one.
+    """
+    tracks, columns = log.tracks, ("iteration", "track_token", "height")
+    logged = zip(*(replayed[name].tolist() for name in columns), strict=True)
+    heights = {(iteration, token): height for iteration, token, height in logged}
     orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
     track = np.concatenate(orders)
     ours = object_columns(tracks, iteration, track)
-    # of vehicles as in the first frame, of others as replayed
     first = np.where(tracks.kinds[track] == AgentKind.VEHICLE, 0, iteration).tolist()
     pairs = zip(first, ours["track_token"], strict=True)
-    ours["height"] = [heights.get(pair, np.nan) for pair in pairs]
-    rows.match(where, ours, OBJECT_TOLERANCES, quantity="reactive")
+    return {**ours, "height": [heights.get(pair, np.nan) for pair in pairs]}
 
 
 def verify_planners(
@@ -120,6 +118,8 @@ def verify_planners(
             report.skip(f"plans of {name} in {scene}, which is not known")
             continue
         with report.attempt("plan", " ".join(key)):
+            if not egos[key].num_rows:
+                raise DataError("no ego states of this run are recorded")
             seen = Seen(scenes[scene], egos[key], objects[key], challenge)
             _plan_again(" ".join(key), load_planner(spec), seen, plans[key])
     plans.finish(mode)

@@ -18,18 +18,13 @@ def verify_pdm(
 ) -> None:
     """Compare every file of the folder; arguments as for `shiftsim.verify.verify`."""
     known = Scenes(scenes or folder.resolve().parent / "nuplan")
-    loops = partial(verify_loops, mode=mode)
-    parts: dict[str, Callable[[Path, Report, Scenes], object]] = {
-        "routes.json": verify_routes,
-        "idm_calls.json": verify_idm_calls,
-        "loop": loops,
+    parts: dict[str, Callable[[Path], object]] = {
+        "routes.json": partial(verify_routes, report=report, scenes=known),
+        "idm_calls.json": partial(verify_idm_calls, report=report, scenes=known),
+        "loop": partial(verify_loops, report=report, scenes=known, mode=mode),
     }
-
-    def with_scenes(path: Path) -> None:
-        if known:
-            parts[path.name](path, report, known)
-        else:
-            report.skip(f"{path.name}: the logs and maps of the scenes are not at hand")
-
-    kernels = {"kernels": partial(verify_kernels, report=report)}
-    verify_files(folder, report, {**kernels, **dict.fromkeys(parts, with_scenes)})
+    if not known:
+        lack = "the logs and maps of the scenes are not at hand"
+        parts = dict.fromkeys(parts, lambda path: report.skip(f"{path.name}: {lack}"))
+    kernels = partial(verify_kernels, report=report)
+    verify_files(folder, report, {"kernels": kernels, **parts})

@@ -9,11 +9,11 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
+from shiftsim.errors import DataError
 from shiftsim.geometry.polylines import make_path, project, window
+from shiftsim.planners.pdm import rollout, step
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.rollout import follow, read_pose
 from shiftsim.planners.pdm.route import offset_poses
-from shiftsim.planners.pdm.step import brake_poses
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
 from shiftsim.planners.routes.graph import search_cheapest, search_levels
@@ -29,14 +29,14 @@ SIGNAL_TOLERANCE = 1e-6  # comfort signals: rounded to 8 decimals, then differen
 def verify_kernels(folder: Path, report: Report) -> None:
     """Compare every file of the folder."""
     facts: dict[str, dict[str, Any]] = {}
-    parts = {f"{stem}.npz": partial(_verify_file, report, part) for stem, part in CHECKS.items()}
-    others: dict[str, Callable[[Path], object]] = {
+    parts: dict[str, Callable[[Path], object]] = {
+        **{f"{stem}.npz": partial(_verify_file, report, part) for stem, part in CHECKS.items()},
         "graph_search.json": partial(_graph_search, report),
         "step_core_summary.json": partial(verify_summary, report, facts),  # sorted behind the steps
         "step_*.json": partial(verify_step, report, facts),
         "step_*.npz": lambda path: path.with_suffix(".json").stat(),  # must have its inputs
     }
-    verify_files(folder, report, {**parts, **others})
+    verify_files(folder, report, parts)
     if facts and not (folder / "step_core_summary.json").exists():
         report.skip("file kernels/step_core_summary.json is missing")
 
@@ -54,8 +54,8 @@ def _idm(file: Source) -> None:
     before = file.take("prev_progress_velocity", len(limits), 2)
     leads = file.take("lead_progress_velocity_rear", len(limits), 3)
     ours = np.empty((len(limits), 2))
-    for case, target in enumerate(targets):
-        follow(before[case], leads[case], target, DEFAULT.following, ours[case])
+    for case in zip(before, leads, targets, ours, strict=True):
+        rollout.follow(*case[:3], DEFAULT.following, case[3])
     file.match_rows({"next_progress_velocity": ours}, TOLERANCE)
 
 
@@ -68,8 +68,7 @@ def _tracker(file: Source) -> None:
 
 
 def _comfort(file: Source) -> None:
-    states = file.take("states", -1, SCORED + 1, NUM_STATE)
-    signals, bounded = comfort(states, DEFAULT.comfort)
+    signals, bounded = comfort(file.take("states", -1, SCORED + 1, NUM_STATE), DEFAULT.comfort)
     ours = dict(zip(SIGNALS, signals.transpose(1, 0, 2), strict=True))
     file.match_rows({"is_comfortable": bounded, **ours}, SIGNAL_TOLERANCE)
     file.note("states: all but heading, ax and ay are not read by the test")
@@ -77,24 +76,26 @@ def _comfort(file: Source) -> None:
 
 def _emergency_brake(file: Source) -> None:
     states = file.take("ego_state", -1, NUM_STATE)
-    ours = [center_poses(brake_poses(ego, PACIFICA))[::20] for ego in states]
+    ours = [center_poses(step.brake_poses(ego, PACIFICA))[::20] for ego in states]
     file.match_rows({"center_poses_every_2s": ours}, COORDINATES)
     file.note("ego_state: all but pose, vx, ax and yaw rate are not read by the brake")
 
 
 def _path(file: Source) -> None:
     for case in sorted({int(name.split("_")[0]) for name in file}):
-        given, where = file.below(f"{case}_"), f"case {case}"
-        poses = given.take("vertices", -1, 3)
-        path = make_path(poses)
-        at = np.empty((len(given["query_s"]), 3))
-        for row, progress in enumerate(given.take("query_s", -1).tolist()):
-            read_pose(path, progress, at[row])
+        given = file.below(f"{case}_")
+        poses, queries = given.take("vertices", -1, 3), given.take("query_s", -1)
+        path, at = make_path(poses), np.empty((len(queries), 3))
+        for progress, pose in zip(queries.tolist(), at, strict=True):
+            rollout.read_pose(path, progress, pose)
         points = given.take("query_xy", -1, 2).tolist()
-        along = [project(path, x, y, 0)[0] for x, y in points]
-        given.match(where, {"progress": path.progress, "projection": along}, TOLERANCE)
-        offsets = {"offset_m": offset_poses(poses, -1.0), "offset_p": offset_poses(poses, 1.0)}
-        ours = {"poses": at, **offsets}
+        ours = {
+            "progress": path.progress,
+            "projection": [project(path, x, y, 0)[0] for x, y in points],
+            "poses": at,
+            "offset_m": offset_poses(poses, -1.0),
+            "offset_p": offset_poses(poses, 1.0),
+        }
         for row, (low, high) in enumerate(given.take("substring_iv", -1, 2).tolist()):
             first, last = window(path, low, high)
             line = path.xy[first:last]
@@ -102,46 +103,41 @@ def _path(file: Source) -> None:
                 ends = np.clip([low, high], 0.0, path.progress[-1]).tolist()
                 line = np.array(substring(shapely.LineString(path.xy), *ends).coords)
             ours[f"substring_{row}"] = line
-        given.match(where, ours, COORDINATES)
+        along = dict.fromkeys(("progress", "projection"), TOLERANCE)
+        given.match(f"case {case}", ours, {**along, "": COORDINATES})
 
 
 def _graph_search(report: Report, path: Path) -> None:
     for number, content in enumerate(read_json(path)):
         case = Source(content["kind"], "field", content, report)
-        found, nodes = _SEARCHES[case["kind"]](case)
+        found, nodes = _search(case)
         ours = {"found": found, "path": [str(node) for node in nodes]}
         case.match(f"case {number}", ours)
         case.finish()
 
 
-def _neighbours(case: Source, *, forward: bool = True) -> list[list[int]]:
-    out: list[list[int]] = [[] for _ in range(case["n"])]
+def _search(case: Source) -> tuple[bool, list[int]]:
+    is_forward = case["kind"] != "bfs_roadblock" or case["forward"]
+    after: list[list[int]] = [[] for _ in range(case["n"])]
     for edge in case["edges"]:
-        start, end = edge if forward else edge[::-1]
-        out[start].append(end)
-    return out
-
-
-def _search_blocks(case: Source) -> tuple[bool, list[int]]:
-    goals, forward = {int(target) for target in case["targets"]}, case["forward"]
-    neighbours = _neighbours(case, forward=forward)
-    found = search_levels(neighbours.__getitem__, int(case["start"]), goals, case["max_depth"])
-    return found.found, found.path if forward else found.path[::-1]
-
-
-def _search_lanes(case: Source) -> tuple[bool, list[int]]:
-    after, allowed = _neighbours(case), {int(lane) for lane in case["candidates"]}
-    lengths, blocks, target = case["length"], case["block"], case["target_block"]
+        start, end = edge if is_forward else edge[::-1]
+        after[start].append(end)
+    if case["kind"] == "bfs_roadblock":
+        goals = {int(target) for target in case["targets"]}
+        found = search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
+        return found.found, found.path if is_forward else found.path[::-1]
+    allowed, lengths, blocks = set(map(int, case["candidates"])), case["length"], case["block"]
+    if not len(lengths) == len(blocks) == case["n"]:
+        raise DataError("a lane has no length or no block")
     found = search_cheapest(
         case["start"],
         lambda lane: [n for n in after[lane] if n in allowed],
         lengths.__getitem__,
-        lambda lane: blocks[lane] == target,
+        lambda lane: blocks[lane] == case["target_block"],
     )
     return found.found, found.path
 
 
-_SEARCHES = {"bfs_roadblock": _search_blocks, "lane_dijkstra": _search_lanes}
 CHECKS = {
     **{"idm": _idm, "tracker_sim": _tracker, "comfort": _comfort},
     **{"emergency_brake": _emergency_brake, "path": _path},

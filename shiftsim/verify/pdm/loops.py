@@ -13,7 +13,7 @@ from shiftsim.sim.planner import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation
-from shiftsim.verify.pdm.steps import STEP_TOLERANCE, Planned, compare_scores, step_arrays
+from shiftsim.verify.pdm.steps import STEP_TOLERANCE, compare_scores, step_arrays
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world import state
@@ -24,15 +24,8 @@ _TABLES = (
     *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects", "ego"),
     *("steps", "proposals"),
 )
-_CALL = ("scene", "challenge")
-_DRIVEN = {  # column of proposals.parquet → index in a state row
-    "sim_x": state.X,
-    "sim_y": state.Y,
-    "sim_heading": state.HEADING,
-    "sim_vx": state.VX,
-    "sim_ax": state.AX,
-    "sim_steering": state.STEERING,
-}
+_DRIVEN = ("sim_x", "sim_y", "sim_heading", "sim_vx", "sim_ax", "sim_steering")
+_ENDS = [state.X, state.Y, state.HEADING, state.VX, state.AX, state.STEERING]  # likewise
 
 
 def verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None = None) -> None:
@@ -48,10 +41,12 @@ def verify_calls(
 ) -> None:
     """Make every planning call again from the recorded ego state."""
     egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
-    steps = Groups(folder / "steps.parquet", report, _CALL)
-    proposals = Groups(folder / "proposals.parquet", report, _CALL)
+    steps, proposals = (
+        Groups(folder / f"{name}.parquet", report, ("scene", "challenge"))
+        for name in ("steps", "proposals")
+    )
     static = Source("static.json", "scene", read_json(folder / "static.json"), report)
-    known = {f"{name}.parquet" for name in _TABLES} | {"static.json"}
+    known = {"static.json", *(f"{name}.parquet" for name in _TABLES)}
     for key in egos:
         scene, challenge, _ = key
         where, arrays = f"{scene} {challenge}", folder / f"{scene}_{challenge}.npz"
@@ -63,41 +58,36 @@ def verify_calls(
             continue
         with report.attempt("PDM loop", where):
             seen = Seen(scenes[scene], egos[key], objects[key], challenge)
-            facts = static.each(scene)[0].each(challenge)[0]
-            rows, scored = steps[key[:2]], proposals[key[:2]]
-            _compare_calls(where, seen, rows, scored, facts, read_arrays(arrays, report, "PDM"))
+            call, file = (scene, challenge), read_arrays(arrays, report, "PDM")
+            planner = _compare_calls(where, seen, steps[call], proposals[call], file)
+            _compare_facts(where, seen, planner, static.each(scene)[0].each(challenge)[0])
     for table in (steps, proposals):
         table.finish(mode)
     if mode is None:
         static.finish()
-    for path in sorted(folder.iterdir()):
-        if path.name not in known:
-            report.skip(f"file loop/{path.name}")
+    for name in sorted({path.name for path in folder.iterdir()} - known):
+        report.skip(f"file loop/{name}")
 
 
 def _compare_calls(
-    where: str, seen: Seen, steps: Source, proposals: Source, facts: Source, file: Source
-) -> None:
-    planner, report = PdmClosed(), file.report
-    planner.reset(scene_info(seen.scenario, planner=planner))
-    count = len(seen.ego)
+    where: str, seen: Seen, steps: Source, proposals: Source, file: Source
+) -> PdmClosed:
+    """Compare every call; the planner after the last one."""
+    planner, road = PdmClosed(), seen.scenario.map
+    planner.reset(scene_info(seen.scenario))
+    count, per_call = len(seen.ego), proposals.num_rows // len(seen.ego)
+    calls, numbers = np.arange(count), np.arange(per_call)
     times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
-    steps.match(where, {"iteration": np.arange(count)})
-    per_call = proposals.num_rows // count
-    numbers = {
-        "proposal": np.tile(np.arange(per_call), count),
-        "iteration": np.repeat(np.arange(count), per_call),
-    }
-    proposals.match(where, numbers)
+    steps.match(where, {"iteration": calls})
+    rows = {"proposal": np.tile(numbers, count), "iteration": np.repeat(calls, per_call)}
+    proposals.match(where, rows)
     plans = file.take("trajectory", count, STEPS + 1, 3).astype(np.float64)
     plans[:, :, :2] += file.take("trajectory_origin", 3)[:2]
     for index, plan in enumerate(plans):
         at, observation = f"{where} iteration {index}", seen.at(index)
-        step = planner.step(observation)
-        sight, road = planner.seen, seen.scenario.map
+        step, sight = planner.step(observation), planner.seen
         assert sight is not None
-        planned = Planned(seen.ego[index], sight.tokens, sight.forecast, sight.place, step)
-        rows, theirs = steps.at(index), proposals.at(np.arange(per_call) + index * per_call)
+        row, theirs = steps.at(index), proposals.at(numbers + index * per_call)
         ours: dict[str, Any] = {
             "time_us": observation.time_us,
             "current_lane_id": road.edges.ids[sight.lane],
@@ -106,27 +96,24 @@ def _compare_calls(
             "n_map_tokens": len(sight.tokens),
             "n_drivable_tokens": len(sight.place.selected),
         }
-        rows.match(at, ours, quantity="PDM step")
-        best = {"best_score": float(theirs["score"].max())}
-        rows.match(at, best, TOLERANCE, quantity="PDM")
-        ends = {column: step.driven.states[:, -1, number] for column, number in _DRIVEN.items()}
+        row.match(at, ours, quantity="PDM step")
+        row.match(at, {"best_score": theirs["score"].max()}, TOLERANCE, quantity="PDM")
+        ends = dict(zip(_DRIVEN, step.driven.states[:, -1, _ENDS].T, strict=True))
         theirs.match(at, ends, STEP_TOLERANCE, quantity="PDM")
-        if compare_scores(at, planned, theirs, (int(rows["best"]), bool(rows["braked"]))):
-            report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
-        if f"proposals_{index}" not in file:
-            continue
-        ids = [*road.edges.ids, *road.car_parks.ids]
-        arrays = step_arrays(planned)
-        arrays["proposals"] = arrays.pop("proposal_poses")
-        tokens = {
-            "map_tokens": sight.tokens,
-            "drivable_tokens": [ids[area] for area in sight.place.selected.tolist()],
-        }
-        stored = {f"{name}_{index}": array for name, array in {**arrays, **tokens}.items()}
-        file.match(at, stored, STEP_TOLERANCE)
+        choice = (int(row["best"]), bool(row["braked"]))
+        if compare_scores(at, seen.ego[index], sight, step, theirs, choice):
+            file.report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
+        if f"proposals_{index}" in file:
+            ids = [*road.edges.ids, *road.car_parks.ids]
+            arrays: dict[str, Any] = step_arrays(step)
+            arrays["proposals"] = arrays.pop("proposal_poses")
+            arrays["map_tokens"] = sight.tokens
+            arrays["drivable_tokens"] = [ids[area] for area in sight.place.selected.tolist()]
+            stored = {f"{name}_{index}": array for name, array in arrays.items()}
+            file.match(at, stored, STEP_TOLERANCE)
     file.match(where, {"trajectory_time_us": times})
     file.finish()
-    _compare_facts(where, seen, planner, facts)
+    return planner
 
 
 def _compare_facts(where: str, seen: Seen, planner: PdmClosed, facts: Source) -> None:
@@ -140,8 +127,6 @@ def _compare_facts(where: str, seen: Seen, planner: PdmClosed, facts: Source) ->
         "route_lane_ids": [road.edges.ids[edge] for edge in route.lanes.tolist()],
         "centerline": line,
         "centerline_length": float(make_path(line).progress[-1]),
+        "ego_state": None,
     }
     facts.match(where, ours, TOLERANCE, quantity="PDM static")
-    if "ego_state" in facts and facts["ego_state"] is None:
-        facts.used.add("ego_state")
-        facts.report.note("static.json: ego_state is null")

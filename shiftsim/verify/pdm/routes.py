@@ -1,6 +1,7 @@
 """Route correction, current lane and centerline of PDM-Closed (`routes.json`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +19,27 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, PACIFICA, center_poses
 
 
-def verify_routes(path: Path, report: Report, scenes: Mapping[str, Scenario]) -> None:
-    """Correct every route again and compare; those of unknown scenes are not covered."""
+def verify_cases(
+    compare: Callable[[Source, str, Scenario], None],
+    path: Path,
+    report: Report,
+    scenes: Mapping[str, Any],
+) -> None:
+    """`compare` every entry of a list, in its scene; those of unknown scenes are not covered."""
     for number, content in enumerate(read_json(path)):
-        case = Source("routes.json", "field", content, report)
-        case.note("label", "route_name", "pose_name")
-        where = f"routes.json {number} ({case['scene']} {content.get('route_name')})"
+        case = Source(path.name, "field", content, report)
         if case["scene"] not in scenes:
-            report.skip(f"routes of scene {case['scene']}, which is not at hand")
-        elif "error" in case:
-            report.note(f"{where}: the official code fails on it")
-        else:
-            with report.attempt("PDM route", where):
-                ours = _solve(case, scenes[case["scene"]])
-                case.match(where, ours, TOLERANCE, quantity="PDM")
-            case.finish()
+            report.skip(f"{path.name}: scene {case['scene']}, which is not at hand")
+            continue
+        where = f"{path.name} {number} ({case['scene']})"
+        with report.attempt(path.stem, where):
+            compare(case, where, scenes[case["scene"]])
+        case.finish()
 
 
-def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
-    road = scenario.map
-    ego = np.zeros(NUM_STATE)
+def _compare(case: Source, where: str, scenario: Scenario) -> None:
+    road, ego = scenario.map, np.zeros(NUM_STATE)
+    case.note("label", "route_name", "pose_name")
     ego[:3] = case["rear_axle"]
     route = routes.start_route(road, tuple(case["route"]), ego, scenario.token)
     center = center_poses(ego[None, :3])[0]
@@ -47,7 +49,7 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
     lane = routes.current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
     line = centerline(road, routes.follow_route(road, route.corrected, lane).path)
     edge_ids, block_ids = road.edges.ids, road.blocks.ids
-    return {
+    ours = {
         "start_block": block_ids[route.start.block],
         "start_candidates": [block_ids[block] for block in route.start.others],
         "corrected": [block_ids[block] for block in route.corrected],
@@ -60,3 +62,7 @@ def _solve(case: Source, scenario: Scenario) -> dict[str, Any]:
         "centerline_last": line[-1],
         "centerline_length": float(make_path(line).progress[-1]),
     }
+    case.match(where, ours, TOLERANCE, quantity="PDM")
+
+
+verify_routes = partial(verify_cases, _compare)

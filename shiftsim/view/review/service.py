@@ -23,7 +23,7 @@ from shiftsim.data.store.review import (
 )
 from shiftsim.errors import ConfigError
 from shiftsim.runs.filter import read_verdicts
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import as_recorded
 from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.scene import (
     Fields,
@@ -86,7 +86,7 @@ class ReviewService:
             DataError: The store has no such scenario.
         """
         recorded = self.store.read_recorded(token)
-        replay = Replay(recorded, [Shown("recorded", "none", 0, _as_recorded(recorded))])
+        replay = Replay(recorded, [Shown("recorded", "none", 0, as_recorded(recorded))])
         blocks = _blocks_near(replay)
         verdict = self._verdicts.get(token) or {}
         numbers = ("max_outside_m", "path_m", "progress_m", "first_violation_s", "partner_token")
@@ -177,27 +177,6 @@ def _start_block(scenario: Scenario) -> int | None:
     found = scenario.map.blocks.containing(x, y).tolist()
     on_route = [b for b in found if scenario.map.blocks.ids[b] in scenario.route]
     return next(iter(on_route or found), None)
-
-
-def _as_recorded(scenario: Scenario) -> SimulationLog:
-    """The recording as if it had been driven."""
-    rows = scenario.iteration_rows[:-1]
-    count = len(rows)
-    return SimulationLog(
-        token=scenario.token,
-        time_us=scenario.time_us[rows],
-        ego=scenario.ego[rows],
-        tracks=scenario.tracks.rows(rows),
-        traffic_lights=scenario.traffic_lights.rows(rows),
-        expert_time_us=scenario.iteration_times,
-        expert_ego=scenario.expert,
-        route=scenario.route,
-        commands=np.full((count, 2), np.nan),
-        noise=np.zeros((count, 2)),
-        plans=np.full((count, 11, 3), np.nan),
-        planning_seconds=np.zeros(count),
-        degraded=np.zeros(count, np.bool_),
-    )
 
 
 def _blocks_near(replay: Replay) -> list[int]:

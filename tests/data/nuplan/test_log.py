@@ -208,3 +208,17 @@ def test_a_log_is_never_written_to(log_path: Path, road: VectorMap) -> None:
 def test_pickled_columns_are_never_read(log_path: Path, road: VectorMap) -> None:
     edit(log_path, "UPDATE lidar SET translation = x'8004', rotation = NULL")
     assert read(log_path, road).num_iterations == 151
+
+
+def test_an_implausible_number_is_a_warning(log_path: Path, road: VectorMap) -> None:
+    edit(log_path, "UPDATE lidar_box SET vx = 1000 WHERE rowid = 1", "UPDATE ego_pose SET vx = 999")
+    flaws: Counter[str] = Counter()
+    assert read(log_path, road, flaws).ego[0, 3] == 999
+    assert flaws["lidar_box: vx beyond -150 … 150 m/s"] == 1
+    assert flaws["ego_pose: vx beyond -150 … 150 m/s"] == 360
+
+
+def test_a_number_that_no_store_can_hold_is_refused(log_path: Path, road: VectorMap) -> None:
+    edit(log_path, "UPDATE ego_pose SET x = 1e300")
+    with pytest.raises(ConversionError, match="'x_m', row 0: 1e\\+300 is beyond"):
+        read(log_path, road)

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.special import fresnel
 
 from shiftsim.data.opendrive.curves import ReferenceLine, length_error
-from shiftsim.data.opendrive.records import Geometry
+from shiftsim.data.opendrive.records import SPIRAL, Geometry
 
 
 def line_of(*plan: str) -> ReferenceLine:
@@ -138,5 +138,5 @@ def test_joint_belongs_to_the_later_record():
 
 
 def test_curve_that_winds_a_million_times_does_not_hang():
-    line = line_of(geometry('<spiral curvStart="0" curvEnd="1e6"/>'))
+    line = ReferenceLine((Geometry(0.0, 0.0, 0.0, 0.0, 100.0, SPIRAL, (0.0, 1e6)),))
     assert np.isfinite(poses(line, 50.0)).all()

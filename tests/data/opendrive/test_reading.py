@@ -1,6 +1,7 @@
 """Reading OpenDRIVE files: what is in them, what is wrong with them, what is refused."""
 
 import contextlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -249,3 +250,21 @@ def test_damaged_files_give_records_or_one_clear_error(data: st.DataObject):
     with contextlib.suppress(ConversionError):  # any other error, or a hang, fails the test
         od = parse_opendrive(original[:start] + filler + original[stop:], "fuzzed.xodr")
         assert all(np.isfinite(found.length) for found in od.roads.values())
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (
+            road(plan=geometry('<arc curvature="1e6"/>')),
+            "arc .* curvature='1e6', not within -100 …",
+        ),
+        (road("1").replace('length="100" junction', 'length="1e9" junction'), "road .* length="),
+        (road(sections=section(lane(-1, width=1e5))), "width .* a='100000.0'"),
+        (road(inner='<type s="0"><speed max="1e9"/></type>'), "speed .* max='1e9'"),
+        (road(inner='<objects><object s="0" t="nan"/></objects>'), "object .* t=nan"),
+    ],
+)
+def test_a_number_outside_of_its_range_names_road_element_and_value(part: str, message: str):
+    error = refused(document(part))
+    assert re.search(f"road '1': {message}", str(error))

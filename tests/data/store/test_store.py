@@ -336,3 +336,19 @@ def test_columns_carry_their_units(store: Path) -> None:
     tracks = pq.read_schema(next(store.rglob("tracks.parquet")))
     assert {"x_m", "heading_rad", "vx_mps"} <= set(tracks.names)
     assert pa.types.is_float64(tracks.field("x_m").type)
+
+
+@pytest.mark.parametrize(
+    ("part", "column"), [("poses", "x_m"), ("velocities", "vx_mps"), ("sizes", "length_m")]
+)
+@pytest.mark.parametrize("value", [1e300, -np.inf])
+def test_an_implausible_number_names_file_track_and_column(
+    part: str, column: str, value: float, tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    recording = make_recording(100, 4, rng)
+    recording.tracks.valid[50, 1] = True
+    getattr(recording.tracks, part)[50, 1, 0] = value
+    write_store(tmp_path / "s", road, recording, make_window("a", 0, 100))
+    what = f"tracks.parquet: track '.*', row 50: column '{column}': "
+    with pytest.raises(DataError, match=what):
+        open_store(tmp_path / "s").read("a")

@@ -140,3 +140,21 @@ def test_a_truncated_file_is_a_mismatch(tmp_path):
     (tmp_path / "idm_steps.npz").write_bytes(whole[: len(whole) // 2])
 
     assert verified(tmp_path).exit_code() == 1
+
+
+BROKEN = {  # file, array: what is written into it, what the mismatch says
+    ("closed_loop", "mode"): ("other", "neither 'full' nor 'window'"),
+    ("closed_loop", "ref_time_us"): (0, "increasing integer time stamps"),
+    ("trajectory_interpolation", "knot_time_us"): (0, "increasing integer time stamps"),
+    ("lqr_commands", "traj_ptr"): (1, "which are not those of"),
+}
+
+
+@pytest.mark.parametrize(("stem", "name"), BROKEN)
+def test_what_is_broken_in_an_input_is_named(tmp_path, stem, name):
+    value, message = BROKEN[stem, name]
+    arrays = arrays_of(stem)
+    arrays[name][:] = value
+    np.savez(tmp_path / f"{stem}.npz", **arrays)
+
+    assert message in " ".join(verified(tmp_path).mismatches)

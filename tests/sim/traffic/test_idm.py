@@ -284,6 +284,10 @@ def falsify_lights(world: dict) -> None:
         row.update(dict.fromkeys(row, "UNKNOWN"))
 
 
+def add_light_on_unknown_lane(world: dict) -> None:
+    world["lights"][3]["nowhere"] = "RED"
+
+
 def falsify_length(world: dict) -> None:
     world["objects"][0]["length"] += 0.5
 
@@ -298,6 +302,7 @@ def falsify_length(world: dict) -> None:
         falsify_columns,
         falsify_ego,
         falsify_lights,
+        add_light_on_unknown_lane,
         falsify_length,
     ],
 )

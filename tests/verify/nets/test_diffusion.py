@@ -160,6 +160,15 @@ def test_a_changed_manifest_is_seen(tmp_path, scenes, change):
     assert report_of(tmp_path, scenes).mismatches
 
 
+def test_unknown_fields_of_the_sampler_are_named(tmp_path, scenes):
+    content = json.loads((GOLDEN / "sampler.json").read_text())
+    content["steps"][4]["extra"] = 1
+    (tmp_path / "sampler.json").write_text(json.dumps(content))
+    report = report_of(tmp_path, scenes)
+    assert sum(report.not_covered.values()) == 1
+    assert report.mismatches == []
+
+
 def test_unknown_arrays_and_files_are_named(tmp_path, scenes):
     with np.load(GOLDEN / AGENTS) as archive:
         np.savez(tmp_path / AGENTS, **archive, extra=np.zeros(1))

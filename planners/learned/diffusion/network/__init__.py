@@ -16,6 +16,7 @@ from shiftsim.planners.learned.diffusion.network.decoder import DiT, Prepared
 from shiftsim.planners.learned.diffusion.network.encoder import SceneEncoder
 from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE, STATE, sample
 from shiftsim.planners.learned.network.rows import Attention
+from shiftsim.world.ranges import CHECKPOINT, require
 
 ROWS = 4  # of agents; a matrix product of 12 rows is faster than one of 11
 PREFIXES = ("module.",)  # of the official file; left by distributed training
@@ -54,6 +55,7 @@ DEFAULT_ARGS: Mapping[str, Any] = {
     },
 }
 
+_NAME = "diffusion-planner"
 _FIXED = {name for name in DEFAULT_ARGS if name.endswith(("_num", "_len"))}  # by the features
 _FINAL = "decoder.decoder.dit.final_layer.proj.4"
 _DRIVE_AMPLITUDES = (0.3, 0.05, 0.0, 0.05)
@@ -186,6 +188,8 @@ def _check(args: Mapping[str, Any]) -> None:
             raise _wrong(f"{name!r} is missing")
         if name in _FIXED and args[name] != value:
             raise _wrong(f"{name} is {args[name]!r}, the features have {value}")
+        if name in CHECKPOINT:
+            require(CHECKPOINT, name, float(args[name]), f"args of {_NAME}:", error=CheckpointError)
     kind = args.get("diffusion_model_type", "x_start")
     if kind != "x_start":
         raise _wrong(f"diffusion_model_type is {kind!r}, known is 'x_start'")
@@ -194,6 +198,7 @@ def _check(args: Mapping[str, Any]) -> None:
     for name, row in known.items():
         for part in ("mean", "std"):
             values = np.asarray(given.get(name, {}).get(part, []), np.float64)
+            require(CHECKPOINT, part, values, f"args of {_NAME}: {name}", error=CheckpointError)
             if values.ndim == 0 or values.shape[-1] != len(row[part]) or not values.size:
                 what = f"{part} of the normaliser of {name!r} has shape {values.shape}"
                 raise _wrong(f"{what}, not ({len(row[part])},)")
@@ -201,7 +206,7 @@ def _check(args: Mapping[str, Any]) -> None:
 
 def _wrong(what: str) -> CheckpointError:
     hint = "use the args.json that was published with the checkpoint"
-    return CheckpointError(f"args of diffusion-planner: {what}", hint)
+    return CheckpointError(f"args of {_NAME}: {what}", hint)
 
 
 def drive_overrides(state: dict[str, np.ndarray]) -> None:

@@ -13,7 +13,7 @@ from nuplan.planning.simulation.planner.abstract_planner import PlannerInitializ
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.planners.learned.features import PerMap
+from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import Trajectory
 

@@ -1,0 +1,157 @@
+"""Is what a store holds usable? Rows of windows, numbers in their ranges, indices that exist."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.data.recording import Window
+from shiftsim.data.store.schema import EGO_COLUMNS, TRACKS
+from shiftsim.data.store.tables import FRAMES, REPAIR, ego_file
+from shiftsim.data.store.tables import TRACKS as TRACKS_FILE
+from shiftsim.errors import DataError
+from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
+from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.ranges import STORE, require
+from shiftsim.world.scenario import Scenario
+
+_BOX = TRACKS.names[2:]  # x, y, heading, velocity, size
+_EGO_LIMITS, _BOX_LIMITS = (
+    np.array([STORE[name][:2] for name in names]) for names in (EGO_COLUMNS, _BOX)
+)
+
+
+def require_rows(window: Window, where: str) -> None:
+    """Refuse a window whose iterations are not increasing rows of it."""
+    rows = window.iteration_rows
+    inside = len(rows) and window.first_row <= rows[0] and rows[-1] < window.last_row
+    if not inside or (np.diff(rows) <= 0).any():
+        what = f"{where}: scenario {window.token!r}: iteration_rows do not increase within its rows"
+        raise DataError(what, REPAIR)
+
+
+def require_plausible(scene: Scenario, ego: str, folder: Path) -> None:
+    """Refuse a scenario with a number outside of its range; `folder` is that of its recording."""
+    frames, tracks = f"{folder / FRAMES}: column", scene.tracks
+    require(STORE, "time_us", scene.time_us, frames)
+    if (np.diff(scene.time_us) <= 0).any():
+        raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
+    require(STORE, "light_status", scene.traffic_lights.status, frames)
+    low, high = _EGO_LIMITS.T
+    if not ((scene.ego >= low) & (scene.ego <= high)).all():
+        for name, values in zip(EGO_COLUMNS, scene.ego.T, strict=True):
+            require(STORE, name, values, f"{ego_file(folder, ego)}: column")
+    arrays = tracks.poses, tracks.velocities, tracks.sizes
+    row, track = _first_outside(tracks.valid, *arrays, _BOX_LIMITS)
+    if row >= 0:
+        where = f"{folder / TRACKS_FILE}: track {tracks.tokens[track]!r}, row {row}: column"
+        values = np.concatenate([array[row, track] for array in arrays])
+        for name, value in zip(_BOX, values, strict=True):
+            require(STORE, name, value, where, may_be_nan=name in ("vx_mps", "vy_mps"))
+
+
+@kernel
+def _first_outside(
+    valid: BoolArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    limits: FloatArray,
+) -> tuple[int, int]:
+    """Row and track of the first box with a number outside of `limits` (7, 2), or -1 and -1."""
+    low, high = limits[:, 0], limits[:, 1]
+    for row in range(valid.shape[0]):
+        for track in range(valid.shape[1]):
+            if not valid[row, track]:
+                continue
+            good = True
+            for axis in range(3):
+                value = poses[row, track, axis]
+                good &= (value >= low[axis]) & (value <= high[axis])
+            for axis in range(2):
+                value = sizes[row, track, axis]
+                good &= (value >= low[5 + axis]) & (value <= high[5 + axis])
+                value = velocities[row, track, axis]  # NaN where the object is static
+                good &= not ((value < low[3 + axis]) | (value > high[3 + axis]))
+            if not good:
+                return row, track
+    return -1, -1
+
+
+def require_sound(road: VectorMap, where: str) -> None:
+    """Refuse a map with a number outside of its range, or an index of something that is not there.
+
+    Kernels follow the indices without looking.
+    """
+    num_edges, num_blocks = len(road.edges), len(road.blocks)
+    for name, part in vars(road).items():
+        column = f"{where}: {name}:"
+        if isinstance(part, Layer):
+            _require_polygons(part.polygons, column)
+            if len(part.ids) != len(part.polygons.bounds) or len(part.index) != len(part.ids):
+                raise DataError(f"{column} an id is missing or occurs twice", REPAIR)
+        elif isinstance(part, Polylines):
+            require(STORE, "xy", part.xy, column)
+            require(STORE, "arc", part.arc, column)
+            _require_parts(
+                part.ptr, len(part.xy), num_edges, column, least=2 * (name == "baselines")
+            )
+            _require(len(part.arc) == len(part.xy), column)
+    require(STORE, "speed_limits", road.speed_limits, f"{where}:", may_be_nan=True)
+    lists = {
+        "incoming": (num_edges, num_edges),
+        "outgoing": (num_edges, num_edges),
+        "stop_lines": (num_edges, len(road.stop_polygons)),
+        "block_edges": (num_blocks, num_edges),
+        "block_incoming": (num_blocks, num_blocks),
+        "block_outgoing": (num_blocks, num_blocks),
+    }
+    for name, (count, others) in lists.items():
+        found: Lists = getattr(road, name)
+        _require_parts(found.ptr, len(found.items), count, f"{where}: {name}")
+        _require_index(found.items, 0, others, f"{where}: {name}")
+    for name, others in {
+        "left_lane": num_edges,
+        "right_lane": num_edges,
+        "block_of": num_blocks,
+        "intersection_of": len(road.intersections),
+    }.items():
+        _require_index(getattr(road, name), NONE, others, f"{where}: {name}")
+    per_edge = "speed_limits lane_index left_lane right_lane block_of has_traffic_lights"
+    for name in f"{per_edge} intersection_of turn_type is_bike boundary_ids".split():
+        _require(len(getattr(road, name)) == num_edges, f"{where}: {name}")
+    _require(
+        len(road.intersection_kinds) == len(road.intersections), f"{where}: intersection_kinds"
+    )
+    _require(len(road.stop_kinds) == len(road.stop_polygons), f"{where}: stop_kinds")
+    _require(0 <= road.num_lanes <= num_edges, f"{where}: num_lanes")
+    _require(0 <= road.num_roadblocks <= num_blocks, f"{where}: num_roadblocks")
+
+
+def _require_polygons(flat: Polygons, where: str) -> None:
+    count = len(flat.bounds)
+    for name in ("xy", "bounds", "grid"):
+        require(STORE, name, getattr(flat, name), where)
+    _require_parts(flat.poly_ptr, len(flat.ring_ptr) - 1, count, where, least=1)
+    _require_parts(flat.ring_ptr, len(flat.xy), len(flat.ring_ptr) - 1, where, least=1)
+    _require(len(flat.grid) == 3 and flat.grid[2] > 0 and len(flat.shape) == 2, where)
+    cells = int(flat.shape[0]) * int(flat.shape[1])
+    _require(flat.shape.min() >= 0 and cells == len(flat.cell_ptr) - 1, where)
+    _require_parts(flat.cell_ptr, len(flat.cell_items), cells, where)
+    _require_index(flat.cell_items, 0, count, where)
+
+
+def _require_parts(ptr: IntArray, total: int, count: int, where: str, least: int = 0) -> None:
+    """Whether `ptr` cuts `total` items into `count` parts of at least so many."""
+    whole = len(ptr) == count + 1 and ptr[0] == 0 and ptr[-1] == total
+    _require(whole and (np.diff(ptr) >= least).all(), where)
+
+
+def _require_index(items: IntArray, lowest: int, count: int, where: str) -> None:
+    if items.size and not (items.min() >= lowest and items.max() < count):
+        raise DataError(f"{where} names something that does not exist", REPAIR)
+
+
+def _require(good: object, where: str) -> None:
+    if not good:
+        raise DataError(f"{where.removesuffix(':')}: the arrays do not fit together", REPAIR)

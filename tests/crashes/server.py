@@ -1,0 +1,82 @@
+"""A process that knows all of shiftsim and runs commands in forks of itself, under the shim.
+
+One command per line of the standard input, as JSON: words, root, mode, at. One answer per line.
+With mode `warm` the process itself runs the command, so that its forks find everything loaded.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import sys
+import tempfile
+import time
+import traceback
+
+MODES = ("count", "before", "after", "eio", "eio on", "full")
+PATIENCE = 120.0  # s
+
+
+def serve(library: str) -> None:
+    shim = ctypes.CDLL(library)
+    shim.shim_calls.restype = ctypes.c_char_p
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        answers.write(json.dumps(answer(shim, json.loads(line))) + "\n")
+        answers.flush()
+
+
+def answer(shim: ctypes.CDLL, asked: dict) -> dict:
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as calls:
+        if asked["mode"] == "warm":
+            return {"code": command(asked["words"]), "output": "", "calls": []}
+        child = os.fork()
+        if child == 0:
+            os.dup2(output.fileno(), 1)
+            os.dup2(output.fileno(), 2)
+            os._exit(work(shim, asked, calls.fileno()))
+        code = wait(child)
+        output.seek(0)
+        calls.seek(0)
+        text = output.read().decode(errors="replace")
+        return {"code": code, "output": text, "calls": calls.read().decode().splitlines()}
+
+
+def work(shim: ctypes.CDLL, asked: dict, calls: int) -> int:
+    shim.shim_arm(os.fsencode(asked["root"]), MODES.index(asked["mode"]), asked["at"])
+    code = command(asked["words"])
+    with os.fdopen(calls, "wb") as file:
+        file.write(shim.shim_calls())
+    return code
+
+
+def command(words: list[str]) -> int:
+    from shiftsim.cli import main
+
+    sys.argv = ["shiftsim", *words]
+    code: object = 70
+    try:
+        main(words)
+    except SystemExit as error:
+        code = error.code or 0
+    except BaseException:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return code if isinstance(code, int) else 71
+
+
+def wait(child: int) -> int:
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.001)
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])
