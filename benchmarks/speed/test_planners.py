@@ -24,8 +24,8 @@ def scenario():
 
 @pytest.mark.parametrize("name", ["constant-velocity", "simple", "log-future", "idm"])
 def test_plan(measure, scenario, name):
-    scene, observations = recorded_inputs(scenario)
     planner = load_planner(name)
+    scene, observations = recorded_inputs(scenario, planner)
     planner.reset(scene)
     planner.plan(observations[0])
     measure(planner.plan, observations[0], calls=10)
