@@ -7,11 +7,12 @@ infraction: a corner of the ego off the road, or a collision of the moving ego.
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from shiftsim.arrays import FloatArray
 from shiftsim.env.episode import Episode, Reward, reward_of
@@ -56,7 +57,7 @@ def _opened(name: str) -> Any:
 class DrivingEnv(gymnasium.Env[Any, Any]):
     """A scenario per episode, driven by commands or trajectories."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -96,8 +97,10 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if split:
             folder = Path(getattr(self._store, "path", ""))
             self._tokens = find_split(split, folder, self._tokens).tokens
-        if not self._tokens:
-            raise DataError(f"store {str(store)!r} has no scenarios", hint="convert some")
+        missing = set(self._tokens) - set(self._store.tokens)
+        if missing or not self._tokens:
+            what = f"lacks {len(missing)} of the split {split!r}" if missing else "has no scenarios"
+            raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
         self._setting = Setting(
             noise=parse_noise(noise) if isinstance(noise, str) else noise,
             traffic=traffic_name(traffic) if isinstance(traffic, str) else traffic,
@@ -117,8 +120,8 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_space = self._observer.space
         high = np.ones(2) if self._is_command else np.tile([REACH, REACH, np.pi], (POSES, 1))
-        self.action_space = spaces.Box(-high.astype(np.float32), high.astype(np.float32))
-        self._none = np.zeros(self.action_space.shape, np.float32)
+        self._high = high.astype(np.float32)
+        self.action_space = spaces.Box(-self._high, self._high)
         self._episode: Episode | None = None
 
     @property
@@ -151,7 +154,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         chosen = drawn | (options or {})
         scenario = self._store.read(chosen["token"])
         setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
-        self._episode = episode = Episode(scenario, setting, self._none)
+        self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
         self._observer.start(episode)
         info = {"scenario_type": scenario.scenario_type, "log_name": scenario.log_name}
         return self._observer.look(episode), chosen | info
@@ -166,12 +169,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if episode.is_over:
             raise ConfigError("the episode has ended", hint="call reset()")
         given = np.asarray(action, np.float32)
-        if given.shape != self.action_space.shape:
-            raise ConfigError(
-                f"the action has shape {given.shape}; it must be {self.action_space.shape}"
-            )
-        high = self.action_space.high
-        episode.action = given = np.minimum(np.maximum(given, -high), high)
+        if given.shape != self._high.shape:
+            raise ConfigError(f"the action has shape {given.shape}; it must be {self._high.shape}")
+        episode.action = given = np.minimum(np.maximum(given, -self._high), self._high)
         ego = episode.log.ego[episode.iteration]
         episode.advance(command_of(given, ego) if self._is_command else _trajectory(given, ego))
         infraction, is_over = episode.infraction, episode.is_over
@@ -188,7 +188,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         return picture_of(self.episode) if self.render_mode == "rgb_array" else None
 
 
-def _trajectory(action: FloatArray, ego: FloatArray) -> Trajectory:
+def _trajectory(action: NDArray[np.float32], ego: FloatArray) -> Trajectory:
     """The plan that (10, 3) poses in the frame of the rear axle stand for."""
     poses = np.concatenate([ego[None, :3], from_frame(action.astype(np.float64), ego[:3])])
     return Trajectory.from_poses(SPACING * np.arange(POSES + 1), poses)

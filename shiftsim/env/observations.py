@@ -22,7 +22,7 @@ class Observer(Protocol):
 class Nothing:
     """No observation, for policies that need none."""
 
-    space = spaces.Discrete(1)
+    space: Space[Any] = spaces.Discrete(1)
 
     def start(self, episode: Episode) -> None:
         """Nothing to prepare."""

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import Space, spaces
 
 from shiftsim.arrays import BoolArray
 from shiftsim.env.episode import Episode
@@ -55,7 +55,7 @@ class Canvas:
 class RasterObserver:
     """CaRL's raster and measurements, and what only its critic sees."""
 
-    space = spaces.Dict(
+    space: Space[Any] = spaces.Dict(
         {
             "raster": spaces.Box(0, 255, SHAPE, np.uint8),
             "measurements": spaces.Box(-LARGEST, LARGEST, (10,)),

@@ -7,7 +7,7 @@ by 50, m/s by 20, m/s^2 by 5.
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     ego: Values  # (9,) vx, ax, ay, steering angle and rate, yaw rate and acceleration, last action
     route: Values  # (16, 2) points of the route's lanes from the ego on, 5 m apart
     # (16, 11) the nearest first: 1, x, y, cosine and sine of the heading, vx, vy, length, width,
-    # whether it is a pedestrian or bicycle, whether it is a static object; zeros where there is none
+    # whether it is a pedestrian or bicycle, whether it is a static object; zeros where none
     tracks: Values
     # (8, 16) the nearest first: 1, whether it is on the route, speed limit or 0, whether its light
     # is red, six points of the centre line from the ego on, 5 m apart; zeros where there is none
@@ -76,7 +76,7 @@ class Surroundings(NamedTuple):
 class VectorObserver:
     """The compact observation."""
 
-    space = spaces.Dict(
+    space: Space[Any] = spaces.Dict(
         {
             name: spaces.Box(-LARGEST, LARGEST, shape)
             for name, shape in zip(Seen._fields, SHAPES, strict=True)
