@@ -131,7 +131,7 @@ def _distance_below(polygons: Polygons, poly: int, x: float, y: float, limit: fl
     dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])
     dy = max(polygons.bounds[poly, 1] - y, 0.0, y - polygons.bounds[poly, 3])
     best = limit
-    if dx * dx + dy * dy < best * best:
+    if dx * dx + dy * dy < best * best * (1.0 + 1e-12):  # rounding, as for the edges
         for ring in range(polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]):
             start, stop = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
             best = boundary_distance_below(polygons.xy, start, stop, x, y, best)

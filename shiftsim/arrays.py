@@ -2,14 +2,15 @@
 
 Shapes and units are in the docstrings; the aliases say the kind of number only.
 
-Compiled kernels are cached on disk. numba's cache looks only at the file of the outermost kernel,
-so in a checkout, where a kernel or constant of another file may change under it, every file with
-kernels has a cache of its own, named by a hash of that file and of all that it imports. An
-installed package is replaced as a whole and needs no such care. `NUMBA_CACHE_DIR` overrides both.
+Compiled kernels are kept on disk: in a checkout in `CACHE`, for an installed package where numba
+would keep them, and in `NUMBA_CACHE_DIR` where that is set. What is kept counts only as long as the
+file of the kernel and all that it imports are the same. Trouble with it costs time, nothing else.
 """
 
 import hashlib
+import logging
 import os
+import pickle
 import re
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,8 @@ from typing import Any, TypeAlias
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
+from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
 from shiftsim.files import PACKAGE, sources
@@ -30,25 +33,96 @@ _USES_CACHE = "NUMBA_CACHE_DIR" not in os.environ and (CACHE.parent / "pyproject
 _COMPILED = re.compile(rb"kernel|^[A-Z][A-Z0-9_, ]* = ", re.MULTILINE)  # constants are, too
 
 
+_LOG = logging.getLogger(__name__)
+
+
 def cache_folder(file: str = "") -> str:
     """Where the compiled kernels of a source file are; without one, where all of them are."""
     if not _USES_CACHE:
         return str(vars(numba.config)["CACHE_DIR"])
-    return _folder_of(Path(file)) if file else str(CACHE)
+    return str(CACHE / _fingerprint(Path(file))) if file else str(CACHE)
 
 
 @cache
-def _folder_of(path: Path) -> str:
+def _fingerprint(path: Path) -> str:
+    """Hash of all that the kernels of a source file are made of."""
     digest = hashlib.sha256()
     is_ours = path.is_relative_to(PACKAGE)
     for name, source in sorted(sources([path] if is_ours else PACKAGE.rglob("*.py")).items()):
         if _COMPILED.search(source):
             digest.update(name.encode() + b"\n" + source)
-    return str(CACHE / digest.hexdigest()[:16])
+    return digest.hexdigest()[:16]
+
+
+class _Kept(FunctionCache):
+    """What is kept of one kernel: a file for each signature, whole and with its hash, or ignored.
+
+    numba's own files have no hash. They have an index, which a kill or a second process can make
+    point to the code of another signature; and numba looks only at the file of the outermost
+    kernel, while a kernel or constant of another file may have changed.
+    """
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        source = Path(function.__code__.co_filename)
+        stamp = self._impl.locator.get_source_stamp()
+        self._made_of = (numba.__version__, stamp, _fingerprint(source))
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel, None where it is to be compiled."""
+        target_context.refresh()
+        path, key = self._file(sig, target_context.codegen())
+        try:
+            content = path.read_bytes()
+            digest, content = content[:_DIGEST], content[_DIGEST:]
+            if hashlib.sha256(content).digest() != digest:
+                raise ValueError(f"{path} is damaged")
+            found, compiled = pickle.loads(content)
+            return self._impl.rebuild(target_context, compiled) if found == key else None
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # unpickling may run into anything
+            _say_once("kernels that were kept cannot be used and are compiled again", error)
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled kernel, if possible."""
+        if not self._impl.check_cachable(data):
+            return
+        path, key = self._file(sig, data.codegen)
+        partial = path.with_name(f".{path.name}.{os.getpid()}")  # others may write the same file
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                content = dumps((key, self._impl.reduce(data)))  # type: ignore[no-untyped-call]
+                partial.write_bytes(hashlib.sha256(content).digest() + content)
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+        except OSError as error:
+            _say_once(_UNKEPT, error)
+
+    def _file(self, sig: Any, codegen: Any) -> tuple[Path, Any]:
+        """Where the code for a signature and processor is, and what it must be made of."""
+        key = self._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        name = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:16]
+        path = Path(self.cache_path) / f"{self._impl.filename_base}.{name}.nbc"
+        return path, (self._made_of, key)
+
+
+_DIGEST = hashlib.sha256().digest_size
+_UNKEPT = "compiled kernels cannot be kept and are compiled anew by every process"
+_SAID = set[str]()
+
+
+def _say_once(what: str, error: Exception) -> None:
+    if what not in _SAID:
+        _SAID.add(what)
+        _LOG.warning("%s: %s", what, error)
 
 
 # The entry point for C, which nobody calls, would take a tenth of the time to compile.
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 def kernel(function: Any) -> Any:
@@ -64,7 +138,8 @@ def kernel(function: Any) -> Any:
 def lean_kernel(function: Any) -> Any:
     """As `kernel`, for functions that make no arrays and count no references.
 
-    Neither may they return one, nor call a kernel that does: it would never be given back.
+    Neither may they return one, nor call a kernel that does: it would never be given back (a test
+    looks at all of them).
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """
@@ -72,6 +147,11 @@ def lean_kernel(function: Any) -> Any:
 
 
 def _compiled(function: Any, *, counts_references: bool) -> Any:
-    # a setting that numba makes at run time, and reads when a function is decorated
+    compiled = numba.njit(**(_OPTIONS | {"_nrt": counts_references}))(function)
+    # a setting that numba makes at run time, and reads when it looks for a folder
     vars(numba.config)["CACHE_DIR"] = cache_folder(function.__code__.co_filename)
-    return numba.njit(**(_OPTIONS | {"_nrt": counts_references}))(function)
+    try:
+        compiled._cache = _Kept(function)
+    except (OSError, RuntimeError) as error:  # no folder can be written to
+        _say_once(_UNKEPT, error)
+    return compiled

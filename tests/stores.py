@@ -22,7 +22,7 @@ def write_toy_store(path, *, count=4, iterations=ITERATIONS, first=0):
 
 
 def _add(writer, number, iterations):
-    bare = cruise_scenario(speed=6.0 + number, iterations=iterations)
+    bare = cruise_scenario(speed=6.0 + number % 50, iterations=iterations)
     rows = len(bare.time_us)
     poses = np.array([[60.0 if number % 2 else 30.0, 0.0 if number % 2 else 3.5, 0.0]])
     scene = replace(bare, tracks=standing_tracks(rows, poses, [AgentKind.VEHICLE]))

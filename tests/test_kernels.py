@@ -1,47 +1,180 @@
 """Rules for kernels that cannot be seen when they run."""
 
-import ast
+import gc
+import importlib
+import inspect
 import re
+import shutil
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("shiftsim", "planners", "metrics", "data")
-MAKES_ARRAYS = re.compile(r"\bnp\.(array|copy|empty|full|ones|zeros)|\.(copy|reshape)\(")
+import dsc3d_writer
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import _nrt_python, rtsys
+from worlds import cruise_scenario, standing_tracks
+
+from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.files import PACKAGE
+from shiftsim.planners.registry import load_planner
+from shiftsim.planners.table import PLANNERS
+from shiftsim.sim.loop import simulate
+from shiftsim.sim.planner import Planner
+from shiftsim.sim.traffic import _MODELS
+from shiftsim.verify.warmup import SHARES
+from shiftsim.world.layers import nearest
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind
+
+PARTS = ("", "planners", "metrics", "data", "benchmarks")  # linked into the package
+DECORATED = re.compile(r"^@(lean_)?kernel$", re.MULTILINE)
+RAISES = re.compile(r"^\s*(raise|assert)\b", re.MULTILINE)
 
 
-def kernels(decorator: str) -> dict[str, tuple[str, ast.FunctionDef]]:
-    """Functions under a decorator: source text and syntax tree, by file and name."""
+@pytest.fixture(scope="module")
+def kernels() -> dict[str, Dispatcher]:
+    """All kernels by module and name."""
     out = {}
-    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        text = path.read_text()
-        for node in ast.parse(text).body if "kernel" in text else ():
-            if isinstance(node, ast.FunctionDef) and any(
-                isinstance(name, ast.Name) and name.id == decorator for name in node.decorator_list
-            ):
-                out[f"{path}:{node.name}"] = (ast.get_source_segment(text, node) or "", node)
+    for path in {path for part in PARTS for path in (PACKAGE / part).rglob("*.py")}:
+        if DECORATED.search(path.read_text("utf-8")):
+            name = ".".join(("shiftsim", *path.relative_to(PACKAGE).with_suffix("").parts))
+            for value in vars(importlib.import_module(name)).values():
+                if isinstance(value, Dispatcher):
+                    out[f"{value.py_func.__module__}.{value.py_func.__name__}"] = value
     return out
 
 
-def test_lean_kernels_make_and_receive_no_arrays() -> None:
-    # their references would never be given back
-    lean, usual = kernels("lean_kernel"), kernels("kernel")
-    returning = {
-        name
-        for name, (_, node) in usual.items()
-        if node.returns is not None and "Array" in ast.unparse(node.returns)
-    }
-    public = {name.rpartition(":")[2] for name in returning}
+def is_lean(kernel: Dispatcher) -> bool:
+    return not kernel.targetoptions["_nrt"]
 
-    assert len(lean) > 50
-    for name, (text, node) in lean.items():
-        called = {
-            call.func.id
-            for call in ast.walk(node)
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
-        }
-        assert not MAKES_ARRAYS.search(text), name
-        assert node.returns is None or "Array" not in ast.unparse(node.returns), name
-        file = name.rpartition(":")[0]
-        own = {other for other in called if f"{file}:{other}" in lean.keys() | usual.keys()}
-        assert not {f"{file}:{other}" for other in own} & returning, name
-        assert not (called - own) & public, name
+
+def holds_array(hint: typing.Any) -> bool:
+    """Whether values of an annotation are arrays or (named) tuples with arrays in them."""
+    if hasattr(hint, "_fields"):
+        return any(map(holds_array, typing.get_type_hints(hint).values()))
+    return np.ndarray in (hint, typing.get_origin(hint)) or any(
+        map(holds_array, typing.get_args(hint))
+    )
+
+
+def returns_array(kernel: Dispatcher) -> bool:
+    hints = typing.get_type_hints(kernel.py_func)
+    if "return" not in hints:
+        assert not re.search(r"^\s*return .", inspect.getsource(kernel.py_func), re.MULTILINE), (
+            kernel
+        )
+    return holds_array(hints.get("return"))
+
+
+def called_by(kernel: Dispatcher) -> Iterator[Dispatcher]:
+    code, names = kernel.py_func.__code__, kernel.py_func.__globals__
+    assert not any(inspect.iscode(constant) for constant in code.co_consts), kernel  # a closure
+    for name in code.co_names:
+        value = names.get(name)
+        assert value is np or not inspect.ismodule(value), kernel  # its kernels would go unseen
+        if isinstance(value, Dispatcher):
+            yield value
+
+
+def test_lean_kernels_neither_return_nor_receive_arrays(kernels: dict[str, Dispatcher]) -> None:
+    # what they receive they never give back; what they return is given back once too often. That
+    # they make none themselves the compiler checks
+    lean = {name: kernel for name, kernel in kernels.items() if is_lean(kernel)}
+    assert len(lean) > 100
+    assert not [name for name, kernel in lean.items() if returns_array(kernel)]
+    assert not [
+        f"{name} calls {callee.py_func.__name__}"
+        for name, kernel in lean.items()
+        for callee in called_by(kernel)
+        if returns_array(callee)
+    ]
+
+
+def test_no_kernel_raises(kernels: dict[str, Dispatcher]) -> None:
+    # its arrays would never be given back
+    assert not [
+        name for name, kernel in kernels.items() if RAISES.search(inspect.getsource(kernel.py_func))
+    ]
+
+
+def scene() -> Scenario:
+    """A slow ego close behind a car, a cone on the lane, another car, in time for every model."""
+    scenario = cruise_scenario(speed=4.0, iterations=6, start=(205.0, 0.0, 0.0))
+    poses = np.array([[217.0, 0.0, 0.0], [240.0, 0.2, 0.0], [225.0, 3.5, 0.1]])
+    kinds = [AgentKind.VEHICLE, AgentKind.TRAFFIC_CONE, AgentKind.VEHICLE]
+    return replace(scenario, tracks=standing_tracks(len(scenario.time_us), poses, kinds))
+
+
+def works(folder: Path) -> dict[str, Callable[[], object]]:
+    """A rollout of each planner in each mode of traffic, and what else has kernels."""
+    scenario, times = scene(), dsc3d_writer.frame_times(18.08)
+    cars = [dsc3d_writer.car(1, times), dsc3d_writer.car(2, times, x0=60.0)]
+    site = dsc3d_writer.write_site(folder / "site", cars, 18.08)
+
+    @cache
+    def load(name: str) -> Planner:
+        is_learned = PLANNERS[name].kind == "learned"
+        return load_planner(name, {"checkpoint": "deterministic:drive"} if is_learned else {})
+
+    def drive(name: str, mode: str) -> None:
+        simulate(scenario, load(name), traffic=mode)
+
+    def convert() -> None:
+        shutil.rmtree(folder / "store", ignore_errors=True)
+        assert convert_dsc3d(site, folder / "store").accepted
+        assert len(list(ScenarioStore(folder / "store"))) == 2
+
+    # a scripted planner needs a file, and has no kernels
+    names = [name for name in PLANNERS if name != "scripted"]
+    drives = {f"{name}, {mode}": partial(drive, name, mode) for name in names for mode in _MODELS}
+    return {
+        **drives,
+        **SHARES,
+        "conversion": convert,
+        "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
+    }
+
+
+def num_kept() -> int:
+    stats = rtsys.get_allocation_stats()
+    return stats.alloc - stats.free
+
+
+def num_lost(work: Callable[[], object]) -> int:
+    """Allocations of kernels that work leaves behind, where it was done before."""
+    work()  # what is kept for all later ones
+    before = num_kept()
+    work()
+    if num_kept() == before:  # nothing was collected meanwhile: the collector is off
+        return 0
+    gc.collect()
+    before = num_kept()
+    work()
+    gc.collect()
+    return num_kept() - before
+
+
+@pytest.mark.slow
+@pytest.mark.learned
+def test_no_kernel_loses_an_array(kernels: dict[str, Dispatcher], tmp_path: Path) -> None:
+    _nrt_python.memsys_enable_stats()
+    gc.disable()
+    try:
+        lost = {name: num_lost(work) for name, work in works(tmp_path).items()}
+    finally:
+        gc.enable()
+    assert rtsys.get_allocation_stats().alloc > 10_000
+    assert not {name: count for name, count in lost.items() if count}
+    called = {kernel for kernel in kernels.values() if kernel.signatures}
+    for _ in range(9):
+        called |= {callee for kernel in called for callee in called_by(kernel)}
+    assert not [
+        name
+        for name, kernel in kernels.items()
+        if kernel not in called and ".benchmarks." not in name
+    ]

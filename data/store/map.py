@@ -13,18 +13,8 @@ from shiftsim.data.store.plausible import require_sound
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
-from shiftsim.world.map import VectorMap
+from shiftsim.world.map import LAYERS, VectorMap
 
-_LAYERS = (
-    "edges",
-    "blocks",
-    "intersections",
-    "stop_polygons",
-    "crosswalks",
-    "walkways",
-    "car_parks",
-    "drivable_areas",
-)
 _LINES = ("baselines", "left_boundaries", "right_boundaries")
 _LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
 _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its unit
@@ -43,7 +33,7 @@ def _columns(name: str, kind: type[Any]) -> dict[str, str]:
 
 
 def _groups() -> dict[str, type[Any]]:
-    kinds = {name: Polygons for name in _LAYERS}
+    kinds = {name: Polygons for name in LAYERS}
     return {**kinds, **dict.fromkeys(_LINES, Polylines), **dict.fromkeys(_LISTS, Lists)}
 
 
@@ -55,7 +45,7 @@ def _schema() -> pa.Schema:
     for name, column in _ARRAYS.items():
         numbers = pa.float64() if name == "speed_limits" else pa.int64()
         out[column] = pa.bool_() if name in ("has_traffic_lights", "is_bike") else numbers
-    for name in _LAYERS:
+    for name in LAYERS:
         out[f"{name}_ids"] = pa.string()
     out["left_boundary_ids"] = out["right_boundary_ids"] = pa.string()
     return pa.schema(
@@ -79,7 +69,7 @@ def write_map(path: Path, road: VectorMap) -> None:
             values[column] = getattr(flat, part).reshape(-1)
     for name, column in _ARRAYS.items():
         values[column] = getattr(road, name)
-    for name in _LAYERS:
+    for name in LAYERS:
         values[f"{name}_ids"] = list(getattr(road, name).ids)
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
@@ -131,7 +121,7 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
             for part, column in _columns(name, kind).items()
         }
         parts[name] = kind(**flat)
-    for name in _LAYERS:
+    for name in LAYERS:
         ids = items[f"{name}_ids"]
         if len(ids) != len(parts[name].poly_ptr) - 1:
             raise ValueError(f"{name}: {len(ids)} ids")

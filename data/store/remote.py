@@ -4,6 +4,7 @@ Any file system that pyarrow knows will do (`s3://`, `gs://`, `hdfs://`, `file:/
 lie in a folder named by the content hash of the store, so that they are never those of another one.
 """
 
+import logging
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,6 +16,7 @@ from shiftsim.data.store.tables import MANIFEST, REVIEW, SCENARIOS, digest, read
 from shiftsim.errors import DataError
 from shiftsim.files import below, remote_store_folder
 
+_LOG = logging.getLogger(__name__)
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
 
 
@@ -34,22 +36,32 @@ class RemoteFiles:
             hint = "give a URL such as s3://bucket/folder"
             raise DataError(f"store {url!r}: {error}", hint) from error
         self._files: dict[str, str] = {}
-        self.path = self._identify(remote_store_folder())
+        self._checked = set[str]()  # files whose copy is what it should be
+        try:
+            self.path = self._identify(remote_store_folder())
+        except OSError as error:
+            _LOG.warning("copies of %s are not kept: %s", self.url, error)
+            self._own = tempfile.TemporaryDirectory()  # goes away with this object
+            self.path = self._identify(Path(self._own.name))
         self.need(SCENARIOS)
         for name in self._overlays():
             self._fetch(name, below(self.path, name))
 
     def need(self, name: str) -> None:
-        """Copy a file of the store, or all of a folder, as far as they are not here already.
+        """Copy a file of the store, or all of a folder, as far as they are not here, and whole.
 
         Raises:
             DataError: A file cannot be read, or is not what the store was written with.
         """
         for file in self._files:
-            if file == name or file.startswith(f"{name}/"):
+            if (file == name or file.startswith(f"{name}/")) and file not in self._checked:
                 place = below(self.path, file)
-                if not place.exists():
+                is_here = place.exists()
+                if not is_here or digest(place) != self._files[file]:
+                    if is_here:
+                        _LOG.warning("%s is damaged and copied again", place)
                     self._fetch(file, place)
+                self._checked.add(file)
 
     def _identify(self, cache: Path) -> Path:
         """Folder of the copies of this content."""

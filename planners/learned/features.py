@@ -1,14 +1,13 @@
 """What the feature builders of the learned planners share."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.sim.planner import History, SceneInfo
-from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, Tracks, Trajectory
 
 SAMPLES = 21  # of a history of 2 s
@@ -16,29 +15,6 @@ PLAN_POSES = 80
 EGO_LENGTH, EGO_WIDTH = PACIFICA.length, PACIFICA.width
 
 NO_ROUTE = "the scenario has no route on the map"
-MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
-
-Arrays = TypeVar("Arrays")
-
-
-class PerMap(Generic[Arrays]):
-    """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
-
-    def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
-        self._build = build
-        self._kept: list[tuple[VectorMap, Arrays]] = []
-
-    def __call__(self, road: VectorMap) -> Arrays:
-        """The arrays of a map; maps are told apart by identity."""
-        for index, (known, arrays) in enumerate(self._kept):
-            if known is road:
-                if index:
-                    self._kept.insert(0, self._kept.pop(index))
-                return arrays
-        arrays = self._build(road)
-        self._kept.insert(0, (road, arrays))
-        del self._kept[MAPS_KEPT:]
-        return arrays
 
 
 def route_blocks(scene: SceneInfo) -> list[int]:

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.features import PerMap
+from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights

@@ -110,7 +110,8 @@ def _forecast(poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out:
                 ring[corner, 0] = box[corner, 0] + seconds * step_x
                 ring[corner, 1] = box[corner, 1] + seconds * step_y
             # nuPlan rule 187: bearings and progress are those of the ring's centroid
-            middle = centroid(ring)
+            if forecast == 0 or out.moves[index]:
+                middle = centroid(ring)
             others.centroids[forecast, index, 0] = middle[0]
             others.centroids[forecast, index, 1] = middle[1]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
 from shiftsim.geometry.polylines import HIT, Path, pose_at, project
 from shiftsim.geometry.rings import ring_distance
@@ -21,7 +21,7 @@ from shiftsim.world.state import VX
 
 MIN_PROGRESS = 1e-5  # m, nuPlan rule 190: keeps clear of a duplicate vertex at the very start
 _DONE = -1
-_NOBODY, _TIED = -1, -2  # instead of what is nearest
+_TIED = -2  # instead of what is nearest
 
 
 class Scene(NamedTuple):
@@ -92,9 +92,10 @@ def _roll_path(proposals: Proposals, scene: Scene, index: int, rows: Rows, steps
     last = steps[-1]
     fill_corridor(path, corridor, forecast, (steps[0] + 1) // 2, last // 2 + 1)
     ranks = np.full((NUM_FORECASTS, len(forecast.ignored)), -1)
+    around, scratch = (path, corridor, forecast, ranks), (np.empty((4, 2)), ranks[0].copy())
     step = steps[0]
     while True:
-        step = _roll(step, last, path, corridor, forecast, ranks, scene.size, scene.model, rows)
+        step = _roll(step, last, *around, scene.size, scene.model, rows, *scratch)
         if step == _DONE:
             return
         ranks[step // 2] = forecast_ranks(forecast, step // 2)
@@ -111,7 +112,7 @@ def read_pose(path: Path, progress: float, out: FloatArray) -> None:
     out[2] = np.arctan2(np.sin(turn), np.cos(turn))
 
 
-@kernel
+@lean_kernel
 def _roll(
     first: int,  # first time index to fill; the one before it is filled
     last: int,  # last time index to fill
@@ -122,22 +123,23 @@ def _roll(
     size: EgoBox,
     model: FollowingModel,  # the longitudinal policy
     rows: Rows,
+    footprint: FloatArray,  # (4, 2) scratch
+    hits: IntArray,  # (M,) scratch
 ) -> int:
     """Roll the policies of one path on, from time index `first` to `last`.
 
     Returns:
         _DONE, or the time index whose ranks are needed to break a tie.
     """
-    footprint = np.empty((4, 2))
-    hits = np.empty(len(forecast.ignored), np.int64)
-    num_boxes = len(forecast.headings)
+    others, num_boxes = forecast.others, len(forecast.headings)
     for step in range(first, last + 1):
         row = step // 2
-        num_hits = 0
+        num_hits, farthest = 0, -np.inf
         for index in range(len(hits)):
             if corridor.sides[row, index] == HIT and not forecast.ignored[index]:
                 hits[num_hits] = index
                 num_hits += 1
+                farthest = max(farthest, corridor.progress[row, index])
         # nuPlan rule 192: one lead for all policies of a path, cleared once per time index; what a
         # policy does not overwrite it inherits from the one before
         lead_speed, rear = 0.0, 0.0
@@ -148,28 +150,31 @@ def _roll(
                 for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
                     lead[column] = rows.leads[policy, step - 1, column]
             else:
-                x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
-                y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
                 lead[0] = path.progress[-1]
-                box_corners(x, y, pose[2], size.length, size.width, footprint)
-                found, distance = _nearest(
-                    hits[:num_hits],
-                    corridor.progress[row],
-                    progress,
-                    footprint,
-                    forecast,
-                    row,
-                    ranks[row],
-                )
-                if found == _TIED:
-                    return step
-                if found == _NOBODY:
-                    rear = 0.5 * size.length
-                else:
+                if farthest > progress:
+                    x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
+                    y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
+                    box_corners(x, y, pose[2], size.length, size.width, footprint)
+                    found, distance = _nearest(
+                        hits[:num_hits],
+                        corridor.progress[row],
+                        progress,
+                        footprint,
+                        others.boxes[row],
+                        others.centers[row],
+                        others.radii,
+                        forecast.light_xy,
+                        forecast.light_ptr,
+                        ranks[row],
+                    )
+                    if found == _TIED:
+                        return step
                     lead[0] = progress + distance
                     if found < num_boxes:
                         turn = wrap_angle(forecast.headings[found] - pose[2])
-                        lead_speed = forecast.others.speeds[row, found] * np.cos(turn)
+                        lead_speed = others.speeds[row, found] * np.cos(turn)
+                else:
+                    rear = 0.5 * size.length
                 lead[1], lead[2] = lead_speed, rear
             follow(before, lead, rows.targets[policy], model, rows.motion[policy, step])
             read_pose(path, rows.motion[policy, step, 0], rows.poses[policy, step])
@@ -182,26 +187,29 @@ def _nearest(
     along: FloatArray,
     progress: float,
     footprint: FloatArray,
-    forecast: Forecast,
-    row: int,
+    boxes: FloatArray,
+    centers: FloatArray,
+    radii: FloatArray,
+    light_xy: FloatArray,
+    light_ptr: IntArray,
     ranks: IntArray,
 ) -> tuple[int, float]:
     """What is nearest to the footprint (4, 2) of all ahead, by rank on ties, and its distance [m].
 
-    It is _NOBODY where nothing is ahead, _TIED where ranks are needed and not known.
+    Something is ahead; it is _TIED where ranks are needed and not known. The rows of the forecast
+    map are handed over because the whole forecast takes longer to hand over than to use.
     """
-    others = forecast.others
     x, y, radius = circle_around(footprint)
-    best, found, is_tied = np.inf, _NOBODY, False
+    best, found, is_tied = np.inf, -1, False
     for index in hits:
         if not along[index] > progress:
             continue
-        light = index - len(others.radii)
+        light = index - len(radii)
         if light >= 0:
-            ring = forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
+            ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
         else:
-            ring, center = others.boxes[row, index], others.centers[row, index]
-            if np.hypot(center[0] - x, center[1] - y) - radius - others.radii[index] > best:
+            ring, center = boxes[index], centers[index]
+            if np.hypot(center[0] - x, center[1] - y) - radius - radii[index] > best:
                 continue
         distance = ring_distance(footprint, ring)
         if distance < best:

@@ -23,7 +23,6 @@ from shiftsim.world.map import VectorMap
 
 SEARCH_DEPTH = 30  # blocks of the route the centerline covers
 START_HALF_WIDTH = 1.0  # m, of the square around the rear axle that is searched for the start
-MAX_COVERING = 64  # areas over one point
 
 
 class Route(NamedTuple):
@@ -74,12 +73,11 @@ def lanes_at(
     road: VectorMap, route: Route, selected: IntArray, ego: FloatArray
 ) -> tuple[list[int], list[float]]:
     """Areas of the route under the rear axle, and their heading errors [rad]."""
-    found = np.empty(MAX_COVERING, np.int64)
-    areas, x, y = route.areas, float(ego[0]), float(ego[1])
-    under = found[: covering(areas, selected, x, y, found)].tolist()
-    under = [area for area in under if areas.on_route[area]]
-    lines, heading = road.baselines, float(ego[2])
-    return under, [deviation(lines, int(areas.lane[a]), 1, x, y, heading)[1] for a in under]
+    areas, (x, y, heading) = route.areas, ego[:3].tolist()
+    found = covering(areas.slabs, selected, ego[None, :2])
+    under = found[areas.on_route[found]].tolist()
+    lanes = areas.lane[under].tolist()
+    return under, [deviation(road.baselines, lane, 1, x, y, heading)[1] for lane in lanes]
 
 
 def in_index_order(route: Route, selected: IntArray, chosen: list[int]) -> list[int]:

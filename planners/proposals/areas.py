@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
-from shiftsim.geometry.rings import BOUNDARY, EXTERIOR, INTERIOR, ray_crossings
-from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.rings import ray_crossings
+from shiftsim.planners.per_map import PerMap
+from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
@@ -20,29 +21,31 @@ NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
 class Slabs(NamedTuple):
-    """Rings sliced into horizontal slabs. R rings, S slabs."""
+    """Areas sliced into horizontal slabs, each with the edges in it. M areas, S slabs, E edges."""
 
-    xy: FloatArray  # (V, 2) vertices of all rings [m]
-    # (R, 4) first vertex of each ring, one past its last, its first slab, number of slabs
-    rings: IntArray
-    grid: FloatArray  # (R, 2) y of the lowest slab [m], slabs per metre
-    edge_ptr: IntArray  # (S + 1,) first entry of each slab in `edge_ends`
-    edge_ends: IntArray  # vertices at which the edges of a slab end
-    poly_ptr: IntArray  # (M + 1,) first ring of each area
     bounds: FloatArray  # (M, 4) of the areas: min x, min y, max x, max y [m]
+    scale: FloatArray  # (M,) slabs per metre
+    slab_ptr: IntArray  # (M + 1,) first slab of each area, the lowest one
+    edge_ptr: IntArray  # (S + 1,) first edge of each slab
+    ends: FloatArray  # (2 E, 2) start and end of each edge in turn [m]
 
 
 class Areas(NamedTuple):
     """Areas of all lanes and connectors of a map, then of its car parks."""
 
     polygons: Polygons  # the areas
-    slabs: Slabs  # their rings
+    slabs: Slabs  # the same, to find out what they hold
     on_route: BoolArray  # (M,) whether the route holds a lane of that id
     lane: IntArray  # (M,) the lane of that id; for a car park usually -1
 
 
 def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
     """Areas of a map, with the lanes of a route marked."""
+    areas = _areas_on(road)
+    return areas._replace(on_route=np.isin(areas.lane, np.array(route_lanes)))
+
+
+def _make_unmarked(road: VectorMap) -> Areas:
     first, second = road.edges.polygons, road.car_parks.polygons
     polygons = first
     if len(road.car_parks):
@@ -54,46 +57,48 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
     # nuPlan rule 181: membership is a test on ids, which car parks may share with lanes
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
     lane = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])
-    return areas_of(polygons, np.isin(lane, np.array(route_lanes)), lane)
+    return areas_of(polygons, np.zeros(len(lane), np.bool_), lane)
+
+
+_areas_on = PerMap(_make_unmarked)
 
 
 def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     """Areas from polygons, and the fields of `Areas`."""
-    starts, stops = polygons.ring_ptr[:-1], polygons.ring_ptr[1:]
-    num_slabs = (stops - starts) // EDGES_PER_SLAB + 1
-    rings = np.column_stack([starts, stops, np.cumsum(num_slabs) - num_slabs, num_slabs])
-    grid, counts = np.empty((len(rings), 2)), np.zeros(num_slabs.sum(), np.int64)
-    _slice(polygons.xy, rings, grid, counts, np.zeros(0, np.int64))
+    num_slabs = np.diff(polygons.ring_ptr[polygons.poly_ptr]) // EDGES_PER_SLAB + 1
+    slab_ptr = np.concatenate([[0], np.cumsum(num_slabs)])
+    height = polygons.bounds[:, 3] - polygons.bounds[:, 1]
+    scale = np.where(height > 0.0, num_slabs / np.where(height > 0.0, height, 1.0), 0.0)
+    counts = np.zeros(slab_ptr[-1], np.int64)
+    _slice(polygons, scale, slab_ptr, counts, np.zeros(0, np.int64))
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
-    edge_ends, fill = np.empty(edge_ptr[-1], np.int64), edge_ptr[:-1].copy()
-    _slice(polygons.xy, rings, grid, fill, edge_ends)
-    slabs = Slabs(polygons.xy, rings, grid, edge_ptr, edge_ends, polygons.poly_ptr, polygons.bounds)
+    vertices = np.empty(2 * edge_ptr[-1], np.int64)
+    _slice(polygons, scale, slab_ptr, edge_ptr[:-1].copy(), vertices)
+    slabs = Slabs(polygons.bounds, scale, slab_ptr, edge_ptr, polygons.xy[vertices])
     return Areas(polygons, slabs, on_route, lane)
 
 
 @lean_kernel
 def _slice(
-    xy: FloatArray, rings: IntArray, grid: FloatArray, fill: IntArray, edge_ends: IntArray
+    polygons: Polygons, scale: FloatArray, slab_ptr: IntArray, fill: IntArray, vertices: IntArray
 ) -> None:
-    """Add the edges of every slab to `fill`, and write them to `edge_ends` unless that is empty."""
-    for ring in range(len(rings)):
-        start, stop, first_slab, num_slabs = rings[ring]
-        low, high = np.inf, -np.inf
-        for vertex in range(start, stop):
-            low, high = min(low, xy[vertex, 1]), max(high, xy[vertex, 1])
-        scale = num_slabs / (high - low) if high > low else 0.0
-        grid[ring, 0], grid[ring, 1] = low, scale
-        before = stop - 1
-        for vertex in range(start, stop):
-            bottom = min(xy[before, 1], xy[vertex, 1])
-            top = max(xy[before, 1], xy[vertex, 1])
-            first = min(int((bottom - low) * scale), num_slabs - 1)
-            last = min(int((top - low) * scale), num_slabs - 1)
-            for slab in range(first_slab + first, first_slab + last + 1):
-                if len(edge_ends) > 0:
-                    edge_ends[fill[slab]] = vertex
-                fill[slab] += 1
-            before = vertex
+    """Add the edges of every slab to `fill`; write their ends to `vertices` unless it is empty."""
+    xy = polygons.xy
+    for area in range(len(scale)):
+        low, last_slab = polygons.bounds[area, 1], slab_ptr[area + 1] - slab_ptr[area] - 1
+        for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
+            start, stop = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
+            before = stop - 1
+            for vertex in range(start, stop):
+                bottom = min(xy[before, 1], xy[vertex, 1])
+                top = max(xy[before, 1], xy[vertex, 1])
+                first = min(int((bottom - low) * scale[area]), last_slab)
+                last = min(int((top - low) * scale[area]), last_slab)
+                for slab in range(slab_ptr[area] + first, slab_ptr[area] + last + 1):
+                    if len(vertices) > 0:
+                        vertices[2 * fill[slab]], vertices[2 * fill[slab] + 1] = before, vertex
+                    fill[slab] += 1
+                before = vertex
 
 
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
@@ -102,64 +107,89 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
     Lanes come by block, in the order of the blocks.
     """
     square = square_around(x, y, half_width)
-    lanes = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
-    return np.concatenate([*lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
+    lanes = _joined(road.block_edges, meeting(road.blocks.polygons, square))
+    if not len(road.car_parks):
+        return lanes
+    return np.concatenate([lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
 
 
-def near_areas(areas: Areas, selected: IntArray, points: FloatArray) -> IntArray:
-    """Those of the selected areas whose bounds overlap the bounds of points (..., 2)."""
-    (x, y), bounds = points.reshape(-1, 2).T, areas.slabs.bounds[selected]
-    near = (bounds[:, 0] <= x.max()) & (bounds[:, 2] >= x.min())
-    near &= (bounds[:, 1] <= y.max()) & (bounds[:, 3] >= y.min())
-    return selected[near]
+@kernel
+def _joined(lists: Lists, chosen: IntArray) -> IntArray:
+    """Some of the lists, one after the other."""
+    count = 0
+    for index in chosen:
+        count += lists.ptr[index + 1] - lists.ptr[index]
+    out, count = np.empty(count, np.int64), 0
+    for index in chosen:
+        for entry in range(lists.ptr[index], lists.ptr[index + 1]):
+            out[count] = lists.items[entry]
+            count += 1
+    return out
+
+
+@kernel
+def near_areas(bounds: FloatArray, selected: IntArray, corners: FloatArray) -> IntArray:
+    """Those of the selected areas whose bounds overlap the bounds of boxes (P, T, 4, 2)."""
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for x, y in corners.reshape(-1, 2):
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+    out, count = np.empty_like(selected), 0
+    for area in selected:
+        if (
+            bounds[area, 0] <= high_x
+            and bounds[area, 2] >= low_x
+            and bounds[area, 1] <= high_y
+            and bounds[area, 3] >= low_y
+        ):
+            out[count] = area
+            count += 1
+    return out[:count]
 
 
 @lean_kernel
-def locate(slabs: Slabs, area: int, x: float, y: float) -> int:
-    """Where a point lies relative to an area: INTERIOR, BOUNDARY or EXTERIOR."""
-    xy, rings, grid, edge_ptr, edge_ends, poly_ptr, bounds = slabs
-    if not (bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]):
-        return EXTERIOR  # also where a coordinate is NaN
-    inside = False
-    for ring in range(poly_ptr[area], poly_ptr[area + 1]):
-        place = (y - grid[ring, 0]) * grid[ring, 1]
-        if not place >= 0.0:
-            continue
-        start, stop = rings[ring, 0], rings[ring, 1]
-        slab = rings[ring, 2] + min(int(place), rings[ring, 3] - 1)
-        for entry in range(edge_ptr[slab], edge_ptr[slab + 1]):
-            end = edge_ends[entry]
-            before = end - 1 if end > start else stop - 1
-            ay, by = xy[before, 1], xy[end, 1]
+def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
+    """Which points (K, 2) lie in the interior of an area, and which on its boundary: bits."""
+    bounds, scale, slab_ptr, edge_ptr, ends = slabs
+    inside = on_boundary = 0
+    for point in range(len(points)):
+        x, y, bit = points[point, 0], points[point, 1], 1 << point
+        if not (
+            bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
+        ):
+            continue  # also where a coordinate is NaN
+        slab = slab_ptr[area] + int((y - bounds[area, 1]) * scale[area])
+        slab = min(slab, slab_ptr[area + 1] - 1)
+        for edge in range(2 * edge_ptr[slab], 2 * edge_ptr[slab + 1], 2):
+            ay, by = ends[edge, 1], ends[edge + 1, 1]
             if ay != y and by != y:  # nearly always
                 if (ay > y) == (by > y):
                     continue
-                ax, bx = xy[before, 0], xy[end, 0]
+                ax, bx = ends[edge, 0], ends[edge + 1, 0]
                 if ax < x and bx < x:
                     continue
                 if ax > x and bx > x:
-                    inside = not inside
+                    inside ^= bit
                     continue
-            odd, on_edge = ray_crossings(xy, before, end, end + 1, x, y)
+            odd, on_edge = ray_crossings(ends, edge, edge + 1, edge + 2, x, y)
             if on_edge:
-                return BOUNDARY
+                on_boundary |= bit
+                break
             if odd:
-                inside = not inside
-    return INTERIOR if inside else EXTERIOR
+                inside ^= bit
+    return inside & ~on_boundary, on_boundary
 
 
-@lean_kernel
-def covering(areas: Areas, selected: IntArray, x: float, y: float, out: IntArray) -> int:
-    """Write the selected areas that hold a point, boundary included, into `out`; their number.
-
-    They are in the order of `selected`; at most `len(out)` are found.
-    """
-    found = 0
+@kernel
+def covering(slabs: Slabs, selected: IntArray, points: FloatArray) -> IntArray:
+    """The selected areas that hold a point (1, 2), boundary included, in their order."""
+    out, count = np.empty_like(selected), 0
     for area in selected:
-        if found < len(out) and locate(areas.slabs, area, x, y) != EXTERIOR:
-            out[found] = area
-            found += 1
-    return found
+        if held_points(slabs, area, points) != (0, 0):
+            out[count] = area
+            count += 1
+    return out[:count]
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

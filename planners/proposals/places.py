@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import box_corners, meets_bounds
-from shiftsim.geometry.rings import INTERIOR
-from shiftsim.planners.proposals.areas import Areas, Slabs, locate, near_areas
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.geometry.boxes import box_corners
+from shiftsim.planners.proposals.areas import Areas, Slabs, held_points, near_areas
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
@@ -56,7 +55,7 @@ def find_places(
     _place_ego(states, size, corners, centers)
     flags, speed_limits = np.empty((*shape, 3), np.bool_), np.empty(shape)
     points = centers if by_center else np.ascontiguousarray(states[..., :2])
-    near = near_areas(areas, selected, corners)
+    near = near_areas(areas.slabs.bounds, selected, corners)
     _find(areas.slabs, areas.on_route, near, limits, corners, points, flags, speed_limits)
     off_lane = flags[..., MULTIPLE] | flags[..., OFF_ROAD]
     return Places(states, corners, centers, flags, off_lane, speed_limits)
@@ -74,7 +73,7 @@ def _place_ego(states: FloatArray, size: EgoBox, corners: FloatArray, centers: F
             box_corners(x, y, heading, size.length, size.width, corners[row, step])
 
 
-@kernel
+@lean_kernel
 def _find(
     slabs: Slabs,
     on_route: BoolArray,
@@ -86,14 +85,18 @@ def _find(
     speed_limits: FloatArray,
 ) -> None:
     """Fill in flags and speed limits, from the areas near and the points (P, T, 2) of the ego."""
-    highest = 0.0
+    bounds, highest = slabs.bounds, 0.0
     for area in near:
         highest = max(highest, limits[area])
     guess = -1  # the area that held the whole ego last is tried first
     for row in range(corners.shape[0]):
         for step in range(corners.shape[1]):
             box = corners[row, step]
-            x, y = points[row, step, 0], points[row, step, 1]
+            point = points[row, step : step + 1]
+            low_x = min(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
+            low_y = min(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
+            high_x = max(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
+            high_y = max(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
             num_touched, held, is_on_route, limit = 0, 0, False, 0.0
             for entry in range(-1, len(near)):
                 area = guess if entry < 0 else near[entry]
@@ -102,15 +105,28 @@ def _find(
                 is_known = is_on_route and limit >= highest
                 if held == _WHOLE and is_known:
                     break
-                if not meets_bounds(box, slabs.bounds[area]):
+                if not (
+                    low_x <= bounds[area, 2]
+                    and high_x >= bounds[area, 0]
+                    and low_y <= bounds[area, 3]
+                    and high_y >= bounds[area, 1]
+                ):
                     continue
-                if not is_known and locate(slabs, area, x, y) == INTERIOR:
+                if not is_known and held_points(slabs, area, point)[0] != 0:
                     limit = max(limit, limits[area])
                     is_on_route = is_on_route or on_route[area]
-                if held == _WHOLE:
+                if held == _WHOLE or (
+                    num_touched > 1
+                    and held == _ALL_CORNERS  # only an area that holds the box changes anything
+                    and not (
+                        bounds[area, 0] <= low_x
+                        and bounds[area, 2] >= high_x
+                        and bounds[area, 1] <= low_y
+                        and bounds[area, 3] >= high_y
+                    )
+                ):
                     continue
-                only_whole = num_touched > 1 and held == _ALL_CORNERS  # may change anything
-                within = _corners_within(slabs, area, box, only_whole)
+                within = held_points(slabs, area, box)[0]
                 if within == _ALL_CORNERS:
                     held, guess = _WHOLE, area
                 elif within > 0:
@@ -120,18 +136,3 @@ def _find(
             flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
             flags[row, step, OFF_ROUTE] = not is_on_route
             speed_limits[row, step] = limit
-
-
-@lean_kernel
-def _corners_within(slabs: Slabs, area: int, box: FloatArray, only_all: bool) -> int:
-    """Which corners of a box (4, 2) an area holds, a bit for each.
-
-    With `only_all` the search ends at the first corner that it does not hold.
-    """
-    within = 0
-    for corner in range(4):
-        if locate(slabs, area, box[corner, 0], box[corner, 1]) == INTERIOR:
-            within |= 1 << corner
-        elif only_all:
-            return 0
-    return within

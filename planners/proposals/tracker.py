@@ -130,17 +130,29 @@ def drive_proposals(
 def _drive(
     poses: FloatArray, ego: FloatArray, params: LqrParameters, dt: float, out: Driven
 ) -> None:
-    last = poses.shape[1] - 2
     ahead = np.empty(params.horizon)
     for row in range(len(poses)):
         profiles = Profiles(out.speeds[row], out.curvatures[row], ahead)
         fit_profiles(poses[row], dt, params, profiles)
-        states = out.states[row]
-        for column in range(len(ego)):
-            states[0, column] = ego[column]
-        for step in range(len(states) - 1):
-            speed = profiles.speeds[min(step + params.horizon, last)]
-            lateral, turn = look_ahead(states[step], poses[row, step], step, profiles)
-            reference = Reference(TRACKED, lateral, turn, speed, ahead)
-            accel, rate = command(states[step], reference, params)
-            step_bicycle(states[step], accel, rate, params.wheel_base, dt, states[step + 1])
+        _follow(poses[row], ego, params, dt, profiles, out.states[row])
+
+
+@lean_kernel
+def _follow(
+    poses: FloatArray,
+    ego: FloatArray,
+    params: LqrParameters,
+    dt: float,
+    profiles: Profiles,
+    states: FloatArray,
+) -> None:
+    """Drive one proposal (T, 3) into `states` (41, 11)."""
+    for column in range(len(ego)):
+        states[0, column] = ego[column]
+    last = len(profiles.speeds) - 1
+    for step in range(len(states) - 1):
+        speed = profiles.speeds[min(step + params.horizon, last)]
+        lateral, turn = look_ahead(states[step], poses[step], step, profiles)
+        reference = Reference(TRACKED, lateral, turn, speed, profiles.ahead)
+        accel, rate = command(states[step], reference, params)
+        step_bicycle(states[step], accel, rate, params.wheel_base, dt, states[step + 1])

@@ -227,24 +227,42 @@ def polygon_distance(
 
 
 @lean_kernel
+def _geos_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
+    """As `point_segment_distance`, rounded as the library under shapely does it."""
+    dx, dy = bx - ax, by - ay
+    square = dx * dx + dy * dy
+    along = ((x - ax) * dx + (y - ay) * dy) / square  # NaN where a is b
+    if along >= 1.0:
+        return np.sqrt((x - bx) * (x - bx) + (y - by) * (y - by))
+    if along > 0.0:
+        return abs(((ay - y) * dx - (ax - x) * dy) / square) * np.sqrt(square)
+    return np.sqrt((x - ax) * (x - ax) + (y - ay) * (y - ay))
+
+
+@lean_kernel
 def boundary_distance_below(
     xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
 ) -> float:
     """Distance from a point to the edges of a ring, or `limit` where that is not below it [m].
 
     The ring has the vertices `start` … `stop` - 1. Edges beyond the limit cost a comparison each.
+    The distance is that of shapely, rounded alike: it is compared with thresholds.
     """
     best = limit
     ax, ay = xy[stop - 1, 0] - x, xy[stop - 1, 1] - y
     for index in range(start, stop):
         bx, by = xy[index, 0] - x, xy[index, 1] - y
+        reach = best * (1.0 + 1e-12)  # a rounded distance may be a little below the bounds
         if (
-            min(ax, bx) < best
-            and max(ax, bx) > -best
-            and min(ay, by) < best
-            and max(ay, by) > -best
+            min(ax, bx) < reach
+            and max(ax, bx) > -reach
+            and min(ay, by) < reach
+            and max(ay, by) > -reach
         ):
-            best = min(best, point_segment_distance(0.0, 0.0, ax, ay, bx, by))
+            before = index - 1 if index > start else stop - 1
+            best = min(
+                best, _geos_distance(x, y, xy[before, 0], xy[before, 1], xy[index, 0], xy[index, 1])
+            )
         ax, ay = bx, by
     return best
 

@@ -1,13 +1,11 @@
 import json
-from threading import Thread
 
 import pytest
+from review_servers import reviewing
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.view.review.server import ReviewServer
-from shiftsim.view.review.service import ReviewService
 
 SIZES = [(1440, 900), (800, 600)]
 FIRST, SECOND = "0000cafe", "0001cafe"
@@ -20,12 +18,8 @@ def store(tmp_path):
 
 @pytest.fixture
 def server(store):
-    with ReviewServer(ReviewService(store, "me")) as running:
-        thread = Thread(target=running.serve_forever, daemon=True)
-        thread.start()
+    with reviewing(store) as running:
         yield running
-        running.shutdown()
-        thread.join()
 
 
 @pytest.fixture

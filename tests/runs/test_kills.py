@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import children
 from stores import write_toy_store
 
 from shiftsim.runs.results import JOURNAL
@@ -52,19 +53,6 @@ def start(folder, name, *more, seeds=0):
         stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE), *PATH])},
     )
-
-
-def children(pid):
-    """Processes that have this one as their parent."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = entry.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid:
-            found.append(int(entry.parent.name))
-    return found
 
 
 def kill_all(process, *, workers_too):

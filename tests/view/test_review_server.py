@@ -1,13 +1,13 @@
 import http.client
 import json
-from threading import Thread
 
 import pytest
+from review_servers import reviewing
 from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.view.review.server import HOST, MAX_BODY, TOKEN_HEADER, ReviewServer
+from shiftsim.view.review.server import HOST, MAX_BODY, TOKEN_HEADER
 from shiftsim.view.review.service import ReviewService
 
 FIRST = "0000cafe"
@@ -20,12 +20,8 @@ def store(tmp_path):
 
 @pytest.fixture
 def server(store):
-    with ReviewServer(ReviewService(store, "me")) as running:
-        thread = Thread(target=running.serve_forever, daemon=True)
-        thread.start()
+    with reviewing(store) as running:
         yield running
-        running.shutdown()
-        thread.join()
 
 
 def ask(server, method, path, body=None, **headers):

@@ -19,8 +19,9 @@ from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
 from shiftsim.planners.learned.device import resolve_device
-from shiftsim.planners.learned.features import PerMap, route_blocks
+from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.per_map import PerMap
 from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world import state

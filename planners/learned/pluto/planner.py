@@ -17,7 +17,6 @@ from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
     NO_ROUTE,
     AgentFeatures,
-    PerMap,
     agent_features,
     route_blocks,
     short_history,
@@ -28,6 +27,7 @@ from shiftsim.planners.learned.pluto import proposals, reference, world
 from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import SceneInputs, scene_inputs, stack
 from shiftsim.planners.learned.pluto.scoring import Place, Scores, nearest_line, score
+from shiftsim.planners.per_map import PerMap
 from shiftsim.planners.proposals.tracker import STEP_US
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo

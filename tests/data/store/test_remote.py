@@ -50,6 +50,33 @@ def test_a_file_that_was_damaged_on_the_way_is_refused(remote):
         open_store(url).read(TOKEN)
 
 
+def test_a_damaged_copy_is_made_again_and_that_is_said_once(remote, caplog):
+    _, url = remote
+    store = open_store(url)
+    scene = store.read(TOKEN)
+    for copy in (store.path / "recordings").rglob("*.parquet"):
+        copy.write_bytes(copy.read_bytes()[: copy.stat().st_size // 2])
+    (store.path / "scenarios.parquet").write_bytes(b"")
+    again = open_store(url)
+    for _ in range(2):
+        np.testing.assert_array_equal(again.read(TOKEN).ego, scene.ego)
+    assert len({record.getMessage() for record in caplog.records}) == len(caplog.records) > 1
+    assert (
+        caplog.records[0].getMessage()
+        == f"{store.path}/scenarios.parquet is damaged and copied again"
+    )
+
+
+def test_without_a_folder_for_copies_a_store_is_read_all_the_same(remote, tmp_path, caplog):
+    folder, url = remote
+    (tmp_path / "cache").touch()
+    store = open_store(url)
+    np.testing.assert_array_equal(store.read(TOKEN).ego, open_store(folder).read(TOKEN).ego)
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "copies of file"
+    ]
+
+
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_a_run_on_a_url_gives_the_bytes_of_one_on_the_folder(remote, tmp_path, workers):
     folder, url = remote

@@ -14,7 +14,6 @@ from worlds import straight_road
 from shiftsim.planners.learned import features as features_module
 from shiftsim.planners.learned.features import (
     SAMPLES,
-    PerMap,
     agent_features,
     map_poses,
     straight_on,
@@ -31,6 +30,7 @@ from shiftsim.planners.learned.map_features import (
     road_objects,
 )
 from shiftsim.planners.learned.plan_states import plan_of_poses
+from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import History
 from shiftsim.world.build import AreaSpec, build_map
 from shiftsim.world.map import VectorMap

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boxes import to_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import cruise_scenario, moved, standing_tracks, straight_road
+from plans import crowd, first_sight, in_ego_frame, plan_of
+from worlds import cruise_scenario, moved, straight_road
 
 from shiftsim.errors import PlannerError
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
 from shiftsim.sim.planner import Planner
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AX, HEADING, VX, AgentKind, LightStatus, Tracks, TrafficLights
+from shiftsim.world.state import AX, HEADING, VX, LightStatus, Tracks, TrafficLights
 
 pytest.importorskip("torch")
 
@@ -34,29 +34,12 @@ def planner():
 def scene(seed: int = 0, count: int = 6, **changes) -> Scenario:
     """Vehicles, pedestrians, bicycles and a cone around an ego in the middle of a short road."""
     rng = np.random.default_rng(seed)
-    kinds = [AgentKind(int(kind)) for kind in rng.integers(0, 4, count)]
-    poses = np.c_[
-        rng.uniform(150, 270, count), rng.uniform(-9, 12, count), rng.uniform(-3, 3, count)
-    ]
-    tracks = standing_tracks(NUM_ROWS, poses, kinds)
+    tracks = crowd(rng, NUM_ROWS, count, 4)
     tracks.poses[:, :, 0] += np.arange(NUM_ROWS)[:, None] * 0.05 * rng.uniform(-1, 3, count)
     tracks.velocities[..., 0] += rng.uniform(-1, 3, count)
     tracks.valid[:50] = rng.random((50, count)) < 0.7
     given = {"iterations": 21, "tracks": tracks, "start": (210.0, 0.3, 0.02), **changes}
     return cruise_scenario(**given)
-
-
-def first_sight(scenario: Scenario, planner: Planner):
-    return Rollout(scenario, planner).observe()
-
-
-def plan_of(planner: Planner, scenario: Scenario):
-    return planner.plan(first_sight(scenario, planner))
-
-
-def in_ego_frame(plan, ego):
-    poses = to_frame(plan.states[1:, :3], ego[:3])
-    return np.c_[poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]
 
 
 def outputs(planner: Planner, scenarios: list[Scenario]):

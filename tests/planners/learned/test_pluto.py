@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boxes import to_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plans import crowd, first_sight, in_ego_frame, plan_of
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
-from shiftsim.sim.loop import Rollout, simulate
+from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLights
 
@@ -40,26 +40,8 @@ def rough():
 
 def scene(seed: int = 0, count: int = 6, **changes) -> Scenario:
     """Vehicles, pedestrians, bicycles and cones around an ego in the middle of a short road."""
-    rng = np.random.default_rng(seed)
-    kinds = [AgentKind(int(kind)) for kind in rng.integers(0, 5, count)]
-    poses = np.c_[
-        rng.uniform(150, 270, count), rng.uniform(-9, 12, count), rng.uniform(-3, 3, count)
-    ]
-    tracks = standing_tracks(NUM_ROWS, poses, kinds)
+    tracks = crowd(np.random.default_rng(seed), NUM_ROWS, count, 5)
     return cruise_scenario(**{"iterations": 11, "tracks": tracks, "start": MIDDLE, **changes})
-
-
-def first_sight(scenario: Scenario, planner: Pluto):
-    return Rollout(scenario, planner).observe()
-
-
-def plan_of(planner: Pluto, scenario: Scenario):
-    return planner.plan(first_sight(scenario, planner))
-
-
-def in_ego_frame(plan, ego):
-    poses = to_frame(plan.states[1:, :3], ego[:3])
-    return np.c_[poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]
 
 
 def test_a_plan_is_eighty_poses_of_which_the_first_stands_for_now_as_well(planner):

@@ -16,14 +16,13 @@ def test_areas_and_their_order_are_those_of_the_map():
     selected = select_areas(road, 195.0, 0.0, 10.0)
     ids = [road.edges.ids[i] for i in selected]
     assert ids == ["10", "11", "20", "21"]
-    found = np.empty(8, np.int64)
     for x, y, expected in (
         (195.0, 0.0, ["11"]),
         (200.0, 0.0, ["11", "21"]),
         (195.0, 1.75, ["10", "11"]),
         (195.0, 5.3, []),
     ):
-        under = found[: covering(areas, selected, x, y, found)]
+        under = covering(areas.slabs, selected, np.array([[x, y]]))
         assert [road.edges.ids[i] for i in under] == expected
 
 

@@ -27,7 +27,7 @@ def curve_capacity(num_points: int) -> int:
 
 
 @lean_kernel
-def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray):  # type: ignore[no-untyped-def]
+def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray) -> int:
     """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
     `keep` (K,) is scratch; `out` (V, 2) receives the curve.
@@ -41,7 +41,7 @@ def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatA
         count = _offset_side(line, distance, side == 0, keep, out, count)
         if count < 0:
             return -1
-    return count
+    return int(count)
 
 
 @lean_kernel

@@ -8,7 +8,7 @@ from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.paths import remaining_path
-from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Footprints, Scene, Scratch
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
     UNSURE,
@@ -41,7 +41,10 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         footprints [m].
     """
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
-    corridor = _corridor_ahead(fleet, agent, scratch)
+    size = remaining_path(fleet, agent, scratch.line)
+    line, runs = scratch.line[:size], scratch.runs[: (size - 2) // RUN + 1]
+    bound_runs(line, runs)
+    corridor = Corridor(line, runs, 0.5 * fleet.size[agent, 1])
     path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
     if not fleet.progress[agent] < path_end and not _in_corridor(
         footprints, agent, corridor, scratch
@@ -67,14 +70,6 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
             best, lead = gap, other
     gap = _stop_gap(scene, agent, corridor, best)
     return (len(footprints.present), gap) if gap < best else (lead, best)
-
-
-@lean_kernel
-def _corridor_ahead(fleet: Fleet, agent: int, scratch: Scratch) -> Corridor:
-    size = remaining_path(fleet, agent, scratch.line)
-    line, runs = scratch.line[:size], scratch.runs[: (size - 2) // RUN + 1]
-    bound_runs(line, runs)
-    return Corridor(line, runs, 0.5 * fleet.size[agent, 1])
 
 
 @lean_kernel

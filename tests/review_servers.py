@@ -1,0 +1,18 @@
+"""A review page that answers in this process."""
+
+from contextlib import contextmanager
+from threading import Thread
+
+from shiftsim.view.review.server import ReviewServer
+from shiftsim.view.review.service import ReviewService
+
+
+@contextmanager
+def reviewing(store):
+    """The server of the page of a store, while it answers."""
+    with ReviewServer(ReviewService(store, "me")) as running:
+        thread = Thread(target=running.serve_forever, daemon=True)
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
