@@ -11,8 +11,9 @@ from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.planner import draw, measure
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import make_roads
-from shiftsim.planners.learned.features import PerMap, route_blocks
+from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.per_map import PerMap
 from shiftsim.world.state import LightStatus
 
 LARGEST = 1e4  # of a measurement, in its unit; none comes near
