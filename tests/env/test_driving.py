@@ -1,5 +1,7 @@
 """The environment: what Gymnasium demands, and that it drives as a run does."""
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -256,3 +258,9 @@ def test_the_picture_shows_the_ego_on_the_road(source_of):
     np.testing.assert_array_equal(picture[127, 100], [180, 40, 120])
     np.testing.assert_array_equal(picture[120, 100], [185, 210, 190])  # the lane on the left
     np.testing.assert_array_equal(picture[10, 100], [245, 245, 245])
+
+
+def test_without_gymnasium_the_extra_is_named():
+    code = "import sys; sys.modules['gymnasium'] = None; import shiftsim.env"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "MissingExtraError: the environment needs gymnasium" in done.stderr

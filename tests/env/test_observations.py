@@ -18,7 +18,7 @@ POSES = np.array([[30.0, 3.5, 0.3], [25.0, -1.0, 0.0], [40.0, 0.0, 0.0], [18.0, 
 
 
 def busy(start=(10.0, 0.0, 0.0)):
-    tracks = standing_tracks(ROWS, POSES + [start[0] - 10.0, 0.0, 0.0], KINDS)
+    tracks = standing_tracks(ROWS, POSES + np.array([start[0] - 10.0, 0.0, 0.0]), KINDS)
     tracks.velocities[:, [0, 1]] = 3.0, -1.0
     scenario = cruise_scenario(tracks=tracks, start=start)
     status = np.full((ROWS, 2), LightStatus.RED, np.int8)

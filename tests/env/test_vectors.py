@@ -7,6 +7,7 @@ from gymnasium.vector import AutoresetMode
 
 import shiftsim.env
 
+CONTEXT = {"sync": {}, "async": {"context": "spawn"}}
 COUNT, STEPS = 3, 60  # so many steps are more than two episodes
 
 
@@ -15,7 +16,7 @@ def roll(toy, mode, autoreset):
         shiftsim.env.ID,
         num_envs=COUNT,
         vectorization_mode=mode,
-        vector_kwargs={"autoreset_mode": autoreset},
+        vector_kwargs={"autoreset_mode": autoreset} | CONTEXT[mode],
         store=str(toy),
         noise="ou-low",
         terminate=False,
