@@ -4,6 +4,7 @@ Everything is in the frame of the ego's box centre, scaled to about one and cut 
 by 50, m/s by 20, m/s^2 by 5.
 """
 
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ Values = NDArray[np.float32]
 
 
 class Seen(NamedTuple):
-    """One observation."""
+    """The parts of one observation, or of several of them."""
 
     ego: Values  # (9,) vx, ax, ay, steering angle and rate, yaw rate and acceleration, last action
     route: Values  # (16, 2) points of the route's lanes from the ego on, 5 m apart
@@ -52,6 +53,19 @@ class Seen(NamedTuple):
 
 
 SHAPES = ((9,), (ROUTE_POINTS, 2), (TRACKS, 11), (LANES, 4 + 2 * LANE_POINTS))
+
+
+SIZE = sum(prod(shape) for shape in SHAPES)
+
+
+def parts_of(values: Values) -> Seen:
+    """The parts of observations (…, 345), as views."""
+    parts, start, lead = [], 0, values.shape[:-1]
+    for shape in SHAPES:
+        stop = start + prod(shape)
+        parts.append(values[..., start:stop].reshape(lead + shape))
+        start = stop
+    return Seen(*parts)
 
 
 class Surroundings(NamedTuple):
@@ -74,14 +88,9 @@ class Surroundings(NamedTuple):
 
 
 class VectorObserver:
-    """The compact observation."""
+    """The compact observation: the parts of `Seen`, one after the other."""
 
-    space: Space[Any] = spaces.Dict(
-        {
-            name: spaces.Box(-LARGEST, LARGEST, shape)
-            for name, shape in zip(Seen._fields, SHAPES, strict=True)
-        }
-    )
+    space: Space[Any] = spaces.Box(-LARGEST, LARGEST, (SIZE,))
 
     def start(self, episode: Episode) -> None:
         """Find the route's lanes."""
@@ -109,15 +118,16 @@ class VectorObserver:
             np.zeros(max(TRACKS, LANES), np.int64),
         )
 
-    def look(self, episode: Episode) -> dict[str, Any]:
+    def look(self, episode: Episode) -> Values:
         """The present observation."""
         row = episode.iteration
         status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
-        seen = Seen(*(np.zeros(shape, np.float32) for shape in SHAPES))
+        values = np.zeros(SIZE, np.float32)
+        seen = parts_of(values)
         _look(self._around, row, status, seen)
         if episode.action.shape == (2,):
             seen.ego[7:] = episode.action
-        return seen._asdict()
+        return values
 
 
 def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:

@@ -69,11 +69,12 @@ def test_gymnasium_has_nothing_to_say(toy, observation, action):
         check_env(made.unwrapped)
 
 
-def test_stable_baselines_has_nothing_to_say(toy):
+@pytest.mark.parametrize("observation", ["none", "vector", "raster"])
+def test_stable_baselines_has_nothing_to_say(toy, observation):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        checker.check_env(DrivingEnv(store=str(toy), observation="vector"))
+        checker.check_env(DrivingEnv(store=str(toy), observation=observation))
 
 
 @pytest.mark.slow

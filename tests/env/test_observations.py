@@ -1,13 +1,15 @@
 """What the environment shows: CaRL's raster as the planner draws it, and the compact form."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import data_equivalence
 from worlds import cruise_scenario, moved, standing_tracks
 
 from shiftsim.env.driving import DrivingEnv
-from shiftsim.env.vector import LANE_STEP, METRES, ROUTE_STEP, SPEED, route_line
+from shiftsim.env.vector import LANE_STEP, METRES, ROUTE_STEP, SIZE, SPEED, parts_of, route_line
 from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.sim.planner import scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
@@ -33,7 +35,7 @@ def look(scenario, source_of, observation, actions=()):
     for action in actions:
         seen, *_ = env.step(action)
     assert seen in env.observation_space
-    return seen, env
+    return (parts_of(seen) if observation == "vector" else seen), env
 
 
 @pytest.mark.learned
@@ -63,16 +65,14 @@ def test_the_critic_sees_time_way_comfort_and_time_to_collision(source_of):
 def test_an_observation_is_not_written_to_later(source_of, observation):
     env = DrivingEnv(store=source_of(busy()), observation=observation)
     seen = [env.reset()[0], *(env.step(np.array([1.0, 0.1]))[0] for _ in range(3))]
-    copies = [{name: array.copy() for name, array in one.items()} for one in seen]
+    copies = deepcopy(seen)
     env.reset()
-    for one, copy in zip(seen, copies, strict=True):
-        for name, array in one.items():
-            np.testing.assert_array_equal(array, copy[name])
+    assert data_equivalence(seen, copies, exact=True)
 
 
 def test_the_nearest_tracks_come_first_as_the_ego_sees_them(source_of):
     seen, env = look(busy(), source_of, "vector")
-    tracks, center = seen["tracks"], env.episode.log.ego[0, 0] + 1.461
+    tracks, center = seen.tracks, env.episode.log.ego[0, 0] + 1.461
     assert tracks[:, 0].tolist() == [1.0] * 4 + [0.0] * 12
     order = [3, 1, 0, 2]
     np.testing.assert_allclose(tracks[:4, 1] * METRES, POSES[order, 0] - center, atol=1e-5)
@@ -90,7 +90,7 @@ def test_more_tracks_than_there_is_room_for_leave_the_nearest(source_of, rng):
     scenario = cruise_scenario(tracks=standing_tracks(ROWS, poses, [AgentKind.VEHICLE] * 50))
     seen, _ = look(scenario, source_of, "vector")
     away = np.hypot(poses[:, 0] - 11.461, poses[:, 1])
-    found = np.hypot(*seen["tracks"][:, 1:3].T) * METRES
+    found = np.hypot(*seen.tracks[:, 1:3].T) * METRES
     np.testing.assert_allclose(found, np.sort(away)[:16], rtol=1e-5)
 
 
@@ -98,8 +98,8 @@ def test_the_route_and_the_lanes_lie_ahead(source_of):
     scenario = busy(start=(180.0, 0.5, 0.0))
     seen, _ = look(scenario, source_of, "vector")
     ahead = np.arange(16) * ROUTE_STEP
-    np.testing.assert_allclose(seen["route"] * METRES, np.c_[ahead, np.full(16, -0.5)], atol=1e-4)
-    lanes = seen["lanes"]
+    np.testing.assert_allclose(seen.route * METRES, np.c_[ahead, np.full(16, -0.5)], atol=1e-4)
+    lanes = seen.lanes
     assert lanes[:, 0].tolist() == [1.0] * 6 + [0.0] * 2
     # the ego's own lane, that on the left, and the connectors before those behind them
     points = lanes[:, 4:].reshape(8, 6, 2) * METRES
@@ -117,7 +117,7 @@ def test_the_ego_sees_its_motion_and_its_last_action(source_of):
     seen, env = look(cruise_scenario(), source_of, "vector", [action] * 2)
     state = env.episode.log.ego[2]
     np.testing.assert_allclose(
-        seen["ego"], [state[3] / 20, state[5] / 5, state[6] / 5, *state[7:11], *action], rtol=1e-6
+        seen.ego, [state[3] / 20, state[5] / 5, state[6] / 5, *state[7:11], *action], rtol=1e-6
     )
 
 
@@ -126,9 +126,9 @@ def test_the_compact_form_does_not_depend_on_where_the_world_is(source_of):
     turned = moved(scenario, 1.1, np.array([400.0, -300.0]))
     actions = [np.array([0.3, 0.02])] * 12
     one, other = (look(s, source_of, "vector", actions)[0] for s in (scenario, turned))
-    for name in ("ego", "route", "tracks"):
-        np.testing.assert_allclose(one[name], other[name], atol=1e-4)
-    np.testing.assert_allclose(one["lanes"][0], other["lanes"][0], atol=1e-4)
+    for part, same in zip(one[:3], other[:3], strict=True):
+        np.testing.assert_allclose(part, same, atol=1e-4)
+    np.testing.assert_allclose(one.lanes[0], other.lanes[0], atol=1e-4)
 
 
 def test_a_route_goes_on_where_lanes_do_not(source_of):
@@ -140,3 +140,11 @@ def test_a_route_goes_on_where_lanes_do_not(source_of):
     assert [road.blocks.ids[0], road.blocks.ids[1]] == ["1", "3"]
     nowhere = route_line(scene, [], center)
     np.testing.assert_allclose(nowhere, [[11.0, 3.4], [1011.0, 3.4]])
+
+
+def test_many_compact_observations_are_taken_apart_at_once(rng):
+    values = rng.normal(size=(5, 3, SIZE)).astype(np.float32)
+    together, one = parts_of(values), parts_of(values[4, 1])
+    for part, alone in zip(together, one, strict=True):
+        np.testing.assert_array_equal(part[4, 1], alone)
+    assert sum(alone.size for alone in one) == SIZE

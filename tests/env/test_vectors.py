@@ -23,10 +23,10 @@ def roll(toy, mode, autoreset):
     )
     assert envs.metadata["autoreset_mode"] == autoreset
     first, infos = envs.reset(seed=5)
-    seen, rewards, ends = [first["ego"]], [], []
+    seen, rewards, ends = [first], [], []
     for _ in range(STEPS):
         observation, reward, _, truncated, _ = envs.step(np.zeros((COUNT, 2), np.float32))
-        seen.append(observation["ego"])
+        seen.append(observation)
         rewards.append(reward)
         ends.append(truncated)
     envs.close()
