@@ -39,6 +39,7 @@ class Episode:
         scene: What a planner would be told of it.
         log: The rollout; its arrays have a row per iteration, filled up to the present one.
         terms: How the last step was.
+        course: The same as the kernels see it.
         action: (…) the last action within its bounds, zeros at the beginning.
         error: Why there are no scores; empty otherwise.
     """
@@ -52,8 +53,8 @@ class Episode:
         self.log = self._rollout.log()
         self.action = action
         self._steps = np.diff(self.log.time_us / 1e6)
-        self._course = make_course(self.log, scenario.map)
-        self.terms: Terms = terms_of(self._course)
+        self.course = make_course(self.log, scenario.map)
+        self.terms: Terms = terms_of(self.course)
 
     @property
     def iteration(self) -> int:
@@ -80,8 +81,8 @@ class Episode:
         row = self._rollout.iteration
         # as the comfort metrics do it on the whole rollout
         step = float(np.add.reduce(self._steps[:row]) / row)
-        look_back(self._course, row, filters_of(max(row + 1, MIN_SAMPLES)), step, step**2)
-        self.terms = terms_of(self._course)
+        look_back(self.course, row, filters_of(max(row + 1, MIN_SAMPLES)), step, step**2)
+        self.terms = terms_of(self.course)
 
     @cached_property
     def scores(self) -> dict[str, float]:

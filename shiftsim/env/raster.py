@@ -75,7 +75,7 @@ class RasterObserver:
         action = episode.action if episode.action.shape == (2,) else np.zeros(2, np.float32)
         measured = measure(episode.log.ego[row], action)
         left = 1.0 - row / episode.scenario.num_iterations
-        value = [left, 1.0 - terms.completion, terms.comfort, terms.ttc] if row else [1.0] * 4
+        value = [left, 1.0 - terms.completion, terms.comfort, terms.ttc]
         return {
             "raster": self._canvas.draw(episode),
             "measurements": measured,

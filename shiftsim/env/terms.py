@@ -23,6 +23,7 @@ from shiftsim.world.state import (
     AX,
     AY,
     HEADING,
+    LAST_AGENT_KIND,
     PACIFICA,
     VX,
     VY,
@@ -37,6 +38,7 @@ TTC_STEP, TTC_TESTS = 0.2, 4  # s; a horizon of 1 s, which itself is not tested
 TTC_STOPPED_SPEED = 5e-3  # m/s
 NUM_CHECKS = len(BOUNDED_SIGNALS)
 _RC, _LANE, _SPEED, _ON_ROUTE, _COMFORT, _TTC, _OFF_ROAD, _COLLISION, _DONE = range(9)
+_LAST_AGENT = int(LAST_AGENT_KIND)
 _LENGTH, _WIDTH, _TO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
 
@@ -76,7 +78,7 @@ class Course(NamedTuple):
     poses: FloatArray  # (K, N, 3)
     velocities: FloatArray  # (K, N, 2)
     sizes: FloatArray  # (K, N, 2)
-    is_static: BoolArray  # (N,)
+    kinds: IntArray  # (N,) AgentKind codes
     bounds: FloatArray  # (6, 2) of the comfort checks, strict
     touched: BoolArray  # (N,) written: the ego has touched the track
     signals: FloatArray  # (10, K) written: raw signals, and scratch
@@ -115,7 +117,7 @@ def make_course(log: SimulationLog, road: VectorMap) -> Course:
         poses=tracks.poses,
         velocities=tracks.velocities,
         sizes=tracks.sizes,
-        is_static=tracks.is_static,
+        kinds=log.tracks.kinds.copy(),
         bounds=np.array(bounds_of(NUPLAN)),
         touched=np.zeros(len(tracks.is_static), np.bool_),
         signals=np.zeros((10, count)),
@@ -279,7 +281,7 @@ def _is_contact_ahead(course: Course, row: int, speed: float) -> bool:
             continue
         pose, size = course.poses[row, track], course.sizes[row, track]
         velocity, other_speed = course.velocities[row, track], 0.0
-        if not course.is_static[track]:
+        if course.kinds[track] <= _LAST_AGENT:
             other_speed = np.hypot(velocity[0], velocity[1])
         _set_ego(course, row)
         dx, dy = pose[0] - ego[0], pose[1] - ego[1]

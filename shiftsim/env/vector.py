@@ -11,15 +11,14 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.env.episode import Episode
+from shiftsim.env.terms import Course
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.graph import lane_at, lanes_of
 from shiftsim.sim.planner import SceneInfo
-from shiftsim.world.layers import Polygons, Polylines
-from shiftsim.world.map import VectorMap
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -53,8 +52,6 @@ class Seen(NamedTuple):
 
 
 SHAPES = ((9,), (ROUTE_POINTS, 2), (TRACKS, 11), (LANES, 4 + 2 * LANE_POINTS))
-
-
 SIZE = sum(prod(shape) for shape in SHAPES)
 
 
@@ -68,23 +65,13 @@ def parts_of(values: Values) -> Seen:
     return Seen(*parts)
 
 
-class Surroundings(NamedTuple):
-    """What the kernel reads. K samples, N tracks, E edges."""
+class Route(NamedTuple):
+    """The line along the route, and scratch for what is nearest to the ego."""
 
-    ego: FloatArray
-    valid: BoolArray
-    poses: FloatArray
-    velocities: FloatArray
-    sizes: FloatArray
-    kinds: IntArray
-    edges: Polygons
-    baselines: Polylines
-    limits: FloatArray
-    on_route: BoolArray  # (E,)
-    route: FloatArray  # (V, 2) vertices of the route's centre line [m]
-    route_arc: FloatArray  # (V,)
-    nearest: FloatArray  # (16,) scratch
-    indices: IntArray  # (16,) scratch
+    xy: FloatArray  # (V, 2) vertices [m]
+    arc: FloatArray  # (V,) arc length at each of them [m]
+    nearest: FloatArray  # (16,) scratch: distances
+    indices: IntArray  # (16,) scratch: of what
 
 
 class VectorObserver:
@@ -94,29 +81,11 @@ class VectorObserver:
 
     def start(self, episode: Episode) -> None:
         """Find the route's lanes."""
-        scene, log = episode.scene, episode.log
-        road, tracks = scene.map, log.tracks
-        blocks = route_blocks(scene)
-        on_route = np.zeros(len(road.edges), np.bool_)
-        on_route[lanes_of(road, blocks)] = True
-        line = route_line(scene, blocks, center_poses(log.ego[0, :3]))
-        self._lights = LightLookup(road, LightStatus.ABSENT)
-        self._around = Surroundings(
-            log.ego,
-            tracks.valid,
-            tracks.poses,
-            tracks.velocities,
-            tracks.sizes,
-            tracks.kinds.copy(),
-            road.edges.polygons,
-            road.baselines,
-            road.speed_limits,
-            on_route,
-            line,
-            arc_lengths(line, np.array([0, len(line)])),
-            np.zeros(max(TRACKS, LANES)),
-            np.zeros(max(TRACKS, LANES), np.int64),
-        )
+        scene, center = episode.scene, center_poses(episode.log.ego[0, :3])
+        line = route_line(scene, route_blocks(scene), center)
+        arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
+        self._route = Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""
@@ -124,7 +93,7 @@ class VectorObserver:
         status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
         values = np.zeros(SIZE, np.float32)
         seen = parts_of(values)
-        _look(self._around, row, status, seen)
+        _look(episode.course, self._route, row, status, seen)
         if episode.action.shape == (2,):
             seen.ego[7:] = episode.action
         return values
@@ -133,8 +102,7 @@ class VectorObserver:
 def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:
     """(V, 2) a line along the lanes of the route from the ego on, V >= 2 [m].
 
-    Where a lane does not lead on, the line goes on in the lane of the next block that begins
-    nearest to its end.
+    It goes on in the lane of the next block that begins nearest to its end.
     """
     road, size = scene.map, scene.vehicle
     lanes = lanes_of(road, blocks)
@@ -143,56 +111,50 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
         return np.stack([center[:2], center[:2] + ahead])
     chain = [lane_at(road, np.array(lanes), center, size.length, size.width)]
     for block in blocks[blocks.index(int(road.block_of[chain[0]])) + 1 :]:
-        chain += _next_lane(road, chain[-1], block)
+        end, there = road.baselines.at(chain[-1])[-1], road.block_edges.at(block).tolist()
+        away = {lane: np.hypot(*(road.baselines.at(lane)[0] - end)) for lane in there}
+        chain += [min(away, key=away.__getitem__)] if away else []
     return np.concatenate([road.baselines.at(lane) for lane in chain])
 
 
-def _next_lane(road: VectorMap, lane: int, block: int) -> list[int]:
-    there = road.block_edges.at(block).tolist()
-    after = [edge for edge in road.outgoing.at(lane).tolist() if edge in there]
-    end = road.baselines.at(lane)[-1]
-    starts = {edge: np.hypot(*(road.baselines.at(edge)[0] - end)) for edge in after or there}
-    return [min(starts, key=starts.__getitem__)] if starts else []
-
-
 @lean_kernel
-def _look(around: Surroundings, row: int, status: IntArray, seen: Seen) -> None:
+def _look(course: Course, route: Route, row: int, status: IntArray, seen: Seen) -> None:
     """Write one observation into zeros."""
-    ego = around.ego[row]
+    ego = course.ego[row]
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     x, y = ego[0] + _TO_CENTER * cos, ego[1] + _TO_CENTER * sin
     seen.ego[0] = _cut(ego[3] / SPEED)
     seen.ego[1], seen.ego[2] = _cut(ego[5] / ACCEL), _cut(ego[6] / ACCEL)
     for index in range(4):
         seen.ego[3 + index] = _cut(ego[7 + index])
-    arc, last = around.route_arc, len(around.route_arc)
-    start = project_on_polyline(around.route, arc, 0, last, x, y)
+    last = len(route.arc)
+    start = project_on_polyline(route.xy, route.arc, 0, last, x, y)
     for point in range(ROUTE_POINTS):
-        px, py = point_on_polyline(around.route, arc, 0, last, start + point * ROUTE_STEP)
+        px, py = point_on_polyline(route.xy, route.arc, 0, last, start + point * ROUTE_STEP)
         _place(px - x, py - y, cos, sin, METRES, seen.route[point])
-    _look_at_tracks(around, row, x, y, cos, sin, seen.tracks)
-    _look_at_lanes(around, status, x, y, cos, sin, seen.lanes)
+    _look_at_tracks(course, route, row, x, y, cos, sin, seen.tracks)
+    _look_at_lanes(course, route, status, x, y, cos, sin, seen.lanes)
 
 
 @lean_kernel
 def _look_at_tracks(
-    around: Surroundings, row: int, x: float, y: float, cos: float, sin: float, out: Values
+    course: Course, route: Route, row: int, x: float, y: float, cos: float, sin: float, out: Values
 ) -> None:
     count = 0
-    for track in range(len(around.kinds)):
-        if around.valid[row, track]:
-            dx, dy = around.poses[row, track, 0] - x, around.poses[row, track, 1] - y
-            count = _keep(around, count, len(out), np.hypot(dx, dy), track)
+    for track in range(len(course.kinds)):
+        if course.valid[row, track]:
+            dx, dy = course.poses[row, track, 0] - x, course.poses[row, track, 1] - y
+            count = _keep(route, count, len(out), np.hypot(dx, dy), track)
     for place in range(count):
-        track, line = around.indices[place], out[place]
-        pose, size = around.poses[row, track], around.sizes[row, track]
+        track, line = route.indices[place], out[place]
+        pose, size = course.poses[row, track], course.sizes[row, track]
         line[0] = 1.0
         _place(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
         _place(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
-        if around.kinds[track] <= _LAST_AGENT:
-            velocity = around.velocities[row, track]
+        if course.kinds[track] <= _LAST_AGENT:
+            velocity = course.velocities[row, track]
             _place(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
-            line[9] = 0.0 if around.kinds[track] == _VEHICLE else 1.0
+            line[9] = 0.0 if course.kinds[track] == _VEHICLE else 1.0
         else:
             line[10] = 1.0
         line[7], line[8] = _cut(size[0] / METRES), _cut(size[1] / METRES)
@@ -200,25 +162,32 @@ def _look_at_tracks(
 
 @lean_kernel
 def _look_at_lanes(
-    around: Surroundings, status: IntArray, x: float, y: float, cos: float, sin: float, out: Values
+    course: Course,
+    route: Route,
+    status: IntArray,
+    x: float,
+    y: float,
+    cos: float,
+    sin: float,
+    out: Values,
 ) -> None:
-    bounds, lines, count = around.edges.bounds, around.baselines, 0
+    bounds, lines, count = course.edges.bounds, course.baselines, 0
     for edge in range(len(bounds)):
         dx = max(bounds[edge, 0] - x, 0.0, x - bounds[edge, 2])
         dy = max(bounds[edge, 1] - y, 0.0, y - bounds[edge, 3])
-        limit = REACH if count < len(out) else around.nearest[count - 1]
+        limit = REACH if count < len(out) else route.nearest[count - 1]
         if dx * dx + dy * dy < limit * limit:
             first, stop = lines.ptr[edge], lines.ptr[edge + 1]
             along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
             px, py = point_on_polyline(lines.xy, lines.arc, first, stop, along)
             distance = np.hypot(px - x, py - y)
             if distance < REACH:
-                count = _keep(around, count, len(out), distance, edge)
+                count = _keep(route, count, len(out), distance, edge)
     for place in range(count):
-        edge, line = around.indices[place], out[place]
-        limit = around.limits[edge]
+        edge, line = route.indices[place], out[place]
+        limit = course.limits[edge]
         line[0] = 1.0
-        line[1] = 1.0 if around.on_route[edge] else 0.0
+        line[1] = 1.0 if course.edge_on_route[edge] else 0.0
         line[2] = 0.0 if np.isnan(limit) else _cut(limit / SPEED)
         line[3] = 1.0 if status[edge] == _RED else 0.0
         first, stop = lines.ptr[edge], lines.ptr[edge + 1]
@@ -230,9 +199,9 @@ def _look_at_lanes(
 
 
 @lean_kernel
-def _keep(around: Surroundings, count: int, most: int, distance: float, index: int) -> int:
+def _keep(route: Route, count: int, most: int, distance: float, index: int) -> int:
     """Sort something into the nearest ones; how many there are then."""
-    nearest, indices = around.nearest, around.indices
+    nearest, indices = route.nearest, route.indices
     if count == most:
         if not distance < nearest[most - 1]:
             return count

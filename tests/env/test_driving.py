@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from worlds import cruise_scenario
+from worlds import cruise_scenario, standing_tracks
 
 import shiftsim
 import shiftsim.env
@@ -17,6 +17,7 @@ from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError
 from shiftsim.planners.learned.carl.planner import command_of
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import sample_noise
+from shiftsim.world.state import AgentKind
 
 TOKEN = "0001cafe"  # of the toy store: a car is parked in the lane
 COAST = np.zeros(2, np.float32)
@@ -119,15 +120,21 @@ def test_a_seed_decides_scenarios_and_noise(toy):
     assert len({info["token"] for info in drawn(4)}) > 1
 
 
-def test_the_ego_moves_as_in_the_closed_loop(source_of):
-    scenario = cruise_scenario(iterations=41)
-    log = simulate(scenario, Acting(), noise="ou-high", seed=1)
-    env = DrivingEnv(
-        store=source_of(scenario), noise="ou-high", observation="none", terminate=False
-    )
+@pytest.mark.parametrize("traffic", ["nonreactive", "reactive", "constant-velocity"])
+def test_ego_and_traffic_move_as_in_the_closed_loop(source_of, traffic):
+    poses, kinds = np.array([[30.0, 0.0, 0.0], [15.0, 3.5, 0.0]]), [AgentKind.VEHICLE] * 2
+    tracks = standing_tracks(60 + 2 * 40 + 1 + 160, poses, kinds)
+    tracks.velocities[:] = 5.0, 0.0
+    scenario = cruise_scenario(iterations=41, tracks=tracks)
+    settings = {"noise": "ou-high", "traffic": traffic}
+    log = simulate(scenario, Acting(), seed=1, **settings)
+    env = DrivingEnv(store=source_of(scenario), observation="none", terminate=False, **settings)
     drive(env, weave(), noise_seed=1)
-    np.testing.assert_array_equal(env.episode.log.ego, log.ego)
-    np.testing.assert_array_equal(env.episode.log.commands[:-1], log.commands[:-1])
+    driven = env.episode.log
+    np.testing.assert_array_equal(driven.ego, log.ego)
+    np.testing.assert_array_equal(driven.commands[:-1], log.commands[:-1])
+    np.testing.assert_array_equal(driven.tracks.poses, log.tracks.poses)
+    assert (driven.tracks.poses[-1] == poses).all() == (traffic == "nonreactive")
 
 
 def test_an_infraction_ends_an_episode_unless_it_may_go_on(source_of):

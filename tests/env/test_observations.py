@@ -64,8 +64,11 @@ def test_the_critic_sees_time_way_comfort_and_time_to_collision(source_of):
 @pytest.mark.parametrize("observation", ["raster", "vector"])
 def test_an_observation_is_not_written_to_later(source_of, observation):
     env = DrivingEnv(store=source_of(busy()), observation=observation)
-    seen = [env.reset()[0], *(env.step(np.array([1.0, 0.1]))[0] for _ in range(3))]
+    seen = [env.reset()[0]]
     copies = deepcopy(seen)
+    for _ in range(3):
+        seen.append(env.step(np.array([1.0, 0.1]))[0])
+        copies.append(deepcopy(seen[-1]))
     env.reset()
     assert data_equivalence(seen, copies, exact=True)
 

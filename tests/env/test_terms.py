@@ -17,6 +17,7 @@ from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import NUPLAN
 from shiftsim.sim.log import as_recorded
 from shiftsim.sim.loop import Setting
+from shiftsim.world.layers import make_layer
 from shiftsim.world.state import AgentKind, Command, center_poses, speeds
 
 REPLAY = Setting(controller="log-playback")
@@ -148,15 +149,35 @@ def test_corners_off_the_road_are_those_that_shapely_finds():
     assert seen == {True, False}
 
 
+def test_connectors_are_road_only_where_there_is_an_intersection():
+    road = straight_road()
+    for intersections, expected in ((road.intersections, False), (make_layer([], []), True)):
+        scenario = cruise_scenario(
+            start=(203.0, 0.0, 0.0),
+            iterations=11,
+            road=replace(road, intersections=intersections),
+        )
+        assert {episode.terms.off_road for episode in replay(scenario)} == {expected}
+
+
 def parked(x, y=0.0, kind=AgentKind.VEHICLE):
     return standing_tracks(ROWS, np.array([[x, y, 0.0]]), [kind])
+
+
+def approaching():
+    """A car that comes up from behind and drives through the ego."""
+    tracks = parked(0.0)
+    tracks.poses[:, 0, 0] = np.linspace(-40.0, 60.0, ROWS)
+    return tracks
 
 
 def test_a_collision_counts_once_and_only_while_the_ego_moves():
     hits = [e.terms.collision for e in replay(cruise_scenario(tracks=parked(40.0)))]
     # at 8 m/s the front, 4.049 m ahead of 10 m, is at 37.75 m after 2.96 s
     assert np.flatnonzero(hits).tolist() == [29]
-    standing = cruise_scenario(speed=0.0, tracks=parked(14.0))
+    standing = cruise_scenario(speed=0.0, tracks=approaching())
+    episodes = list(replay(standing))
+    assert episodes[-1].course.touched.all()
     assert not any(e.terms.collision for e in replay(standing))
     inside = cruise_scenario(tracks=parked(12.0))  # touched before the ego could do anything
     assert not any(e.terms.collision for e in replay(inside))
