@@ -75,7 +75,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         scene = self._scene
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
-        ego, tracks = observation.history.ego[-1], observation.history.tracks
+        ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         on_route = self._on_route
         if on_route is None:
             on_route = self._start(scene, ego, state.center_poses(ego[:3], scene.vehicle))
