@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import DataError
 from shiftsim.metrics.result import (
     MetricPart,
@@ -29,6 +29,22 @@ _SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
 # nuPlan rule 79: an even window is centred half a sample ahead, so that interior output n is the
 # fitted value at n + 1/2, with a jump to the edge fits
 _SMOOTH_INTERIOR = np.array([-3.0, 3.0, 7.0, 9.0, 9.0, 7.0, 3.0, -3.0]) / 32.0
+
+
+class Filter(NamedTuple):
+    """A filter over a window of W samples."""
+
+    interior: FloatArray  # (W,) weights
+    fit: FloatArray  # (W, W) weights of the samples of the first or last window
+
+
+class Filters(NamedTuple):
+    """The filters that make the signals."""
+
+    smooth: Filter
+    jerk: Filter  # first derivative
+    yaw_rate: Filter  # first derivative
+    yaw_accel: Filter  # second derivative
 
 
 class ComfortSignals(NamedTuple):
@@ -82,16 +98,19 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
     center = center_accelerations(states)
     # nuPlan rule 80: magnitudes are taken at the rear axle, components at the centre
     magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
-    lon, lat, mag = (_smooth(np.ascontiguousarray(v)) for v in (*center.T, magnitude))
+    smooth, jerk, yaw_rate, yaw_accel = filters_of(len(time_us))
+    lon, lat, mag = (
+        _filtered(np.ascontiguousarray(v), smooth, 1.0) for v in (*center.T, magnitude)
+    )
     heading = _unwrap(states[:, HEADING])
     return ComfortSignals(
         lon_accel=lon,
         lat_accel=lat,
         mag_accel=mag,
-        lon_jerk=_derive(lon, _JERK_WINDOW, 2, 1, step),
-        mag_jerk=_derive(mag, _JERK_WINDOW, 2, 1, step),
-        yaw_rate=_derive(heading, _YAW_WINDOW, 2, 1, step),
-        yaw_accel=_derive(heading, _YAW_WINDOW, 3, 2, step),
+        lon_jerk=_filtered(lon, jerk, step),
+        mag_jerk=_filtered(mag, jerk, step),
+        yaw_rate=_filtered(heading, yaw_rate, step),
+        yaw_accel=_filtered(heading, yaw_accel, step**2),
     )
 
 
@@ -173,20 +192,38 @@ def _unwrap(angles: FloatArray) -> FloatArray:
     return out
 
 
-def _smooth(values: FloatArray) -> FloatArray:
-    window = min(_SMOOTH_WINDOW, len(values))
-    fit = _fit_matrix(window, 2, 0)
-    interior = _SMOOTH_INTERIOR if window == _SMOOTH_WINDOW else fit[window // 2]
-    return _filter(values, interior, fit, 1.0)
+def filters_of(count: int) -> Filters:
+    """The filters of signals with so many samples."""
+    return _filters_of(min(count, _JERK_WINDOW))
 
 
-def _derive(values: FloatArray, window: int, degree: int, order: int, step: float) -> FloatArray:
-    window = min(window, len(values))
-    fit = _fit_matrix(window, degree, order)
-    return _filter(values, fit[window // 2], fit, step**order)
+@lru_cache
+def _filters_of(count: int) -> Filters:
+    windows = (
+        (_SMOOTH_WINDOW, 2, 0),
+        (_JERK_WINDOW, 2, 1),
+        (_YAW_WINDOW, 2, 1),
+        (_YAW_WINDOW, 3, 2),
+    )
+    smooth, *others = (
+        _with_interior(_fit_matrix(min(window, count), degree, order))
+        for window, degree, order in windows
+    )
+    if count >= _SMOOTH_WINDOW:
+        smooth = smooth._replace(interior=_SMOOTH_INTERIOR)
+    return Filters(smooth, *others)
 
 
-@lru_cache(maxsize=64)
+def _with_interior(fit: FloatArray) -> Filter:
+    return Filter(fit[len(fit) // 2].copy(), fit)
+
+
+def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
+    out = np.empty(len(values))
+    filter_signal(values, how, scale, out)
+    return out
+
+
 def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
     """(window, window) that maps samples at unit spacing to derivatives of their fit there."""
     at = np.arange(window) - 0.5 * (window - 1)
@@ -199,16 +236,16 @@ def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
     return np.ascontiguousarray(derived @ fit)
 
 
-@kernel
-def _filter(values: FloatArray, interior: FloatArray, fit: FloatArray, scale: float) -> FloatArray:
-    """Filter a signal (K,), divide it by `scale`, and round it to 8 decimals.
+@lean_kernel
+def filter_signal(values: FloatArray, how: Filter, scale: float, out: FloatArray) -> None:
+    """Filter a signal (K,), divide it by `scale`, round it to 8 decimals; `out` (K,) is written.
 
-    Output n is the sum of the samples from n - (W - 1) // 2 on, weighted by `interior` (W,); at the
-    edges `fit` (W, W) gives it from the first or last W samples, W <= K.
+    Output n is the sum of the samples from n - (W - 1) // 2 on, weighted by the interior; at the
+    edges the fit gives it from the first or last W samples, W <= K.
     """
+    interior, fit = how.interior, how.fit
     count, window = len(values), len(fit)
     half = window // 2
-    out = np.empty(count)
     for n in range(count):
         total = 0.0
         if n < half:
@@ -222,4 +259,3 @@ def _filter(values: FloatArray, interior: FloatArray, fit: FloatArray, scale: fl
                 total += interior[j] * values[n - (window - 1) // 2 + j]
         # nuPlan rule 81: rounded between smoothing and differentiation, and before comparison
         out[n] = np.rint(total / scale * 1e8) / 1e8
-    return out

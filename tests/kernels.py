@@ -4,17 +4,21 @@ import hashlib
 import importlib.util
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+
+import numpy as np
 
 from shiftsim.arrays import cache_folder
 from shiftsim.files import PACKAGE, sources
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.verify.warmup import SHARES, scene
+from shiftsim.world.scenario import Scenario
 
 GROUPS = (
     ("routes", "contacts", "pdm-closed", "plantf", "pluto"),
-    ("planners", "reactive", "diffusion-planner", "carl"),
+    ("planners", "reactive", "environment", "diffusion-planner", "carl"),
 )
 LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 
@@ -38,10 +42,34 @@ def compile_share(name: str) -> None:
         SHARES[name]()
     elif name == "reactive":
         simulate(scene(), load_planner("constant-velocity"), traffic=name)
+    elif name == "environment":
+        compile_environment()
     elif name not in LEARNED:
         simulate(scene(), load_planner(name))
     elif importlib.util.find_spec("torch"):
         simulate(scene(), load_planner(name, {"checkpoint": "deterministic:drive"}))
+
+
+_scene = cache(scene)  # layouts of the last maps are kept
+
+
+def compile_environment() -> None:
+    """Drive a few steps of an environment, where there is Gymnasium."""
+    if not importlib.util.find_spec("gymnasium"):
+        return
+    from shiftsim.env.driving import DrivingEnv
+
+    class One:
+        tokens = ("it",)
+
+        def read(self, token: str) -> Scenario:
+            return _scene()
+
+    for observation in ("vector", "raster"):
+        env = DrivingEnv(store=One(), observation=observation, terminate=False)
+        env.reset()
+        for _ in range(5):
+            env.step(np.zeros(2))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ import typing
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import dsc3d_writer
 import numpy as np
 import pytest
+from kernels import compile_environment
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import _nrt_python, rtsys
 from worlds import cruise_scenario, standing_tracks
@@ -41,6 +43,8 @@ def kernels() -> dict[str, Dispatcher]:
     """All kernels by module and name."""
     out = {}
     for path in {path for part in PARTS for path in (PACKAGE / part).rglob("*.py")}:
+        if path.parent.name == "env" and not find_spec("gymnasium"):
+            continue
         if DECORATED.search(path.read_text("utf-8")):
             name = ".".join(("shiftsim", *path.relative_to(PACKAGE).with_suffix("").parts))
             for value in vars(importlib.import_module(name)).values():
@@ -135,6 +139,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     return {
         **drives,
         **SHARES,
+        "environment": compile_environment,
         "conversion": convert,
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }

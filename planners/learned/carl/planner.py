@@ -75,25 +75,16 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         scene = self._scene
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
-        ego = observation.history.ego[-1].copy()
-        center = state.center_poses(ego[:3], scene.vehicle)
-        velocity = state.center_velocities(ego, scene.vehicle)
-        if self._on_route is None:
-            self._start(scene, ego, center)
-        roads, scratch, frame = self._roads, self._scratch, view.picture_frame(center)
-        self.found = view.find_areas(roads, frame)
+        ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
+        on_route = self._on_route
+        if on_route is None:
+            on_route = self._start(scene, ego, state.center_poses(ego[:3], scene.vehicle))
         status = self._lights.at(observation.lights)
+        roads, scratch, pictures = self._roads, self._scratch, self._pictures
+        pictures.fill(0)
+        self.found = draw(pictures, roads, scratch, ego, tracks, -1, on_route, status)
         self._blindness = self._why_blind(scene.map, status)
-        self._pictures.fill(0)
-        view.draw_roads(self._pictures, roads, scratch, frame, self.found, self._on_route, status)
-        view.draw_objects(self._pictures, frame, _boxes(observation), scratch)
-        value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
-        box = (*center.tolist(), scene.vehicle.length, scene.vehicle.width)
-        view.draw_box(self._pictures[view.EGO], frame, *box, value, scratch)
-        acceleration = state.center_accelerations(ego, scene.vehicle)
-        turning = ego[state.STEERING : state.YAW_ACCEL + 1]
-        parts = [self._last_action, velocity, acceleration, turning]
-        return CarlFeatures(self._pictures, np.concatenate(parts, dtype=np.float32))
+        return CarlFeatures(pictures, measure(ego, self._last_action))
 
     def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
         """Actions (2,) in [-1, 1]: acceleration and steering."""
@@ -117,8 +108,8 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self.degraded = self._route_flaw or self._blindness
         return command_of(output, observation.history.ego[-1])
 
-    def _start(self, scene: SceneInfo, ego: FloatArray, center: FloatArray) -> None:
-        """Correct the route, once per scenario."""
+    def _start(self, scene: SceneInfo, ego: FloatArray, center: FloatArray) -> BoolArray:
+        """Correct the route, once per scenario; (B,) the blocks on it."""
         road, known = scene.map, route_blocks(scene)
         if not known:
             self._route_flaw = "the map has no block of the route"
@@ -130,6 +121,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
             self.route = correct_route(road, known, start)
         self._on_route = np.zeros(len(road.blocks), np.bool_)
         self._on_route[self.route] = True
+        return self._on_route
 
     def _why_blind(self, road: VectorMap, status: IntArray) -> str:
         """Why the official code would have failed at the raster; empty where it would not."""
@@ -141,6 +133,35 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         if len(unknown) and np.isin(road.block_of[unknown], self.found).any():
             return "a light in the raster has an unknown status"
         return ""
+
+
+def draw(
+    pictures: Raster,  # (9, 256, 256) zeros, written
+    roads: Roads,
+    scratch: view.Scratch,
+    ego: FloatArray,  # (11,) the present state
+    tracks: state.Tracks,
+    row: int,  # of the tracks that is the present
+    on_route: BoolArray,  # (B,) blocks of the route
+    status: IntArray,  # (E,) LightStatus by edge
+) -> IntArray:
+    """Draw the raster around an ego; the areas that are in it."""
+    center, velocity = state.center_poses(ego[:3]), state.center_velocities(ego)
+    frame = view.picture_frame(center)
+    found: IntArray = view.find_areas(roads, frame)
+    view.draw_roads(pictures, roads, scratch, frame, found, on_route, status)
+    view.draw_objects(pictures, frame, _boxes(tracks, row), scratch)
+    value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
+    box = (*center.tolist(), state.PACIFICA.length, state.PACIFICA.width)
+    view.draw_box(pictures[view.EGO], frame, *box, value, scratch)
+    return found
+
+
+def measure(ego: FloatArray, last_action: Action) -> Action:
+    """The measurements (10,) of `CarlFeatures`."""
+    velocity, acceleration = state.center_velocities(ego), state.center_accelerations(ego)
+    turning = ego[state.STEERING : state.YAW_ACCEL + 1]
+    return np.concatenate([last_action, velocity, acceleration, turning], dtype=np.float32)
 
 
 def command_of(action: Action, ego: FloatArray) -> state.Command:
@@ -159,10 +180,9 @@ def _lay_out(road: VectorMap) -> tuple[Roads, view.Scratch]:
     return roads, view.make_scratch(roads)
 
 
-def _boxes(observation: Observation) -> view.Boxes:
-    """The present objects."""
-    tracks = observation.history.tracks
-    rows = np.flatnonzero(tracks.valid[-1])
+def _boxes(tracks: state.Tracks, row: int) -> view.Boxes:
+    """The objects of one moment."""
+    present = np.flatnonzero(tracks.valid[row])
     parts = (tracks.poses, tracks.sizes, tracks.velocities)
-    poses, sizes, velocities = (part[-1][rows] for part in parts)
-    return view.Boxes(poses, sizes, velocities, tracks.kinds[rows])
+    poses, sizes, velocities = (part[row][present] for part in parts)
+    return view.Boxes(poses, sizes, velocities, tracks.kinds[present])

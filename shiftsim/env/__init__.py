@@ -1,0 +1,18 @@
+"""A Gymnasium environment: one scenario per episode, driven by whoever acts.
+
+Importing this module makes `shiftsim/Driving-v0` known to Gymnasium.
+"""
+
+from shiftsim.errors import MissingExtraError
+
+try:
+    from gymnasium.envs.registration import register, registry
+except ModuleNotFoundError as error:
+    raise MissingExtraError(
+        "the environment needs gymnasium", hint='pip install "shiftsim[gym]"'
+    ) from error
+
+ID = "shiftsim/Driving-v0"
+
+if ID not in registry:
+    register(ID, entry_point="shiftsim.env.driving:DrivingEnv")

@@ -1,0 +1,194 @@
+"""The environment `shiftsim/Driving-v0`.
+
+An episode is one scenario. It is truncated when the scenario is at its end, and terminated by an
+infraction: a corner of the ego off the road, or a collision of the moving ego.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray
+from shiftsim.env.episode import Episode, Reward, reward_of
+from shiftsim.env.observations import Nothing, Observer
+from shiftsim.env.raster import RasterObserver, picture_of
+from shiftsim.env.vector import VectorObserver
+from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.geometry.boxes import from_frame
+from shiftsim.planners.learned.carl.planner import command_of
+from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.sim.loop import Setting
+from shiftsim.sim.noise import NoiseModel, parse_noise
+from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Trajectory
+
+POSES, SPACING = 10, 0.1  # of a trajectory action; s between them
+REACH = 50.0  # m from the ego that a pose of it may be
+OBSERVATIONS: dict[str, Callable[[], Observer]] = {
+    "none": Nothing,
+    "raster": RasterObserver,
+    "vector": VectorObserver,
+}
+ACTIONS = ("command", "trajectory")
+
+
+class Source(Protocol):
+    """Where scenarios come from, if not from a store."""
+
+    tokens: Sequence[str]
+
+    def read(self, token: str) -> Scenario:
+        """The scenario of a token."""
+
+
+@cache
+def _opened(name: str) -> Any:
+    """A store, opened once in a process: many environments share its maps."""
+    return open_named_store(name)
+
+
+class DrivingEnv(gymnasium.Env[Any, Any]):
+    """A scenario per episode, driven by commands or trajectories."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        store: str | Source = "demo",
+        split: str = "",
+        observation: str | Observer = "vector",
+        reward: str | Reward = "regular",
+        noise: str | NoiseModel = "none",
+        traffic: str | Traffic = "nonreactive",
+        action: str = "command",
+        terminate: bool = True,
+        penalty: float = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        """Open the store and check the settings.
+
+        Args:
+            store: Store by name, path or URL, or an object with `tokens` and `read(token)`.
+            split: Name or file of a split of the store; all its scenarios if empty.
+            observation: `vector`, `raster`, `none`, or an `Observer` of one's own.
+            reward: `regular`, `nuplan` or `survival` as CaRL has them, `score`, or a function of
+                the `Episode`.
+            noise: Actuation noise, by name or model.
+            traffic: Traffic, by name or model.
+            action: `command` or `trajectory`.
+            terminate: Whether an infraction ends the episode.
+            penalty: Added to the reward of a step with an infraction.
+            render_mode: `rgb_array` or None.
+
+        Raises:
+            ConfigError: A setting is unknown.
+            DataError: The store is not there, or has no scenario.
+        """
+        self._store: Any = _opened(store) if isinstance(store, str) else store
+        self._tokens = tuple(self._store.tokens)
+        if split:
+            folder = Path(getattr(self._store, "path", ""))
+            self._tokens = find_split(split, folder, self._tokens).tokens
+        missing = set(self._tokens) - set(self._store.tokens)
+        if missing or not self._tokens:
+            what = f"lacks {len(missing)} of the split {split!r}" if missing else "has no scenarios"
+            raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
+        self._setting = Setting(
+            noise=parse_noise(noise) if isinstance(noise, str) else noise,
+            traffic=traffic_name(traffic) if isinstance(traffic, str) else traffic,
+        )
+        if isinstance(traffic, str):
+            make_traffic(traffic)
+        if isinstance(observation, str):
+            observer = OBSERVATIONS[one_of("observation", observation, OBSERVATIONS)]()
+        else:
+            observer = observation
+        self._observer: Observer = observer
+        self._reward = reward_of(reward)
+        self._is_command = one_of("action", action, ACTIONS) == "command"
+        self._terminate, self._penalty = terminate, penalty
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"render_mode {render_mode!r} unknown", hint="use 'rgb_array'")
+        self.render_mode = render_mode
+        self.observation_space = self._observer.space
+        high = np.ones(2) if self._is_command else np.tile([REACH, REACH, np.pi], (POSES, 1))
+        self._high = high.astype(np.float32)
+        self.action_space = spaces.Box(-self._high, self._high)
+        self._episode: Episode | None = None
+
+    @property
+    def episode(self) -> Episode:
+        """The episode under way.
+
+        Raises:
+            ConfigError: There was no reset.
+        """
+        if self._episode is None:
+            raise ConfigError("no episode is under way", hint="call reset() first")
+        return self._episode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin a scenario, drawn at random; `options` may name its `token` and `noise_seed`.
+
+        Raises:
+            ConfigError: There is another option.
+            DataError: The store has no scenario of that token.
+        """
+        super().reset(seed=seed)
+        drawn = {
+            "token": self._tokens[int(self.np_random.integers(len(self._tokens)))],
+            "noise_seed": int(self.np_random.integers(2**31)),
+        }
+        for name in options or {}:
+            one_of("option of reset", name, drawn)
+        chosen = drawn | (options or {})
+        scenario = self._store.read(chosen["token"])
+        setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
+        self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
+        self._observer.start(episode)
+        info = {"scenario_type": scenario.scenario_type, "log_name": scenario.log_name}
+        return self._observer.look(episode), chosen | info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drive one step of 0.1 s.
+
+        Raises:
+            ConfigError: The episode has ended.
+        """
+        episode = self.episode
+        if episode.is_over:
+            raise ConfigError("the episode has ended", hint="call reset()")
+        given = np.asarray(action, np.float32)
+        if given.shape != self._high.shape:
+            raise ConfigError(f"the action has shape {given.shape}; it must be {self._high.shape}")
+        episode.action = given = np.minimum(np.maximum(given, -self._high), self._high)
+        ego = episode.log.ego[episode.iteration]
+        episode.advance(command_of(given, ego) if self._is_command else _trajectory(given, ego))
+        infraction, is_over = episode.infraction, episode.is_over
+        info: dict[str, Any] = {"terms": episode.terms, "infraction": infraction}
+        if is_over:
+            info["scores"] = episode.scores
+            info["error"] = episode.error
+        reward = float(self._reward(episode)) + (self._penalty if infraction else 0.0)
+        terminated = self._terminate and infraction != ""
+        return self._observer.look(episode), reward, terminated, is_over, info
+
+    def render(self) -> np.ndarray | None:
+        """(256, 256, 3) uint8: 128 m around the ego, which drives to the right."""
+        return picture_of(self.episode) if self.render_mode == "rgb_array" else None
+
+
+def _trajectory(action: NDArray[np.float32], ego: FloatArray) -> Trajectory:
+    """The plan that (10, 3) poses in the frame of the rear axle stand for."""
+    poses = np.concatenate([ego[None, :3], from_frame(action.astype(np.float64), ego[:3])])
+    return Trajectory.from_poses(SPACING * np.arange(POSES + 1), poses)

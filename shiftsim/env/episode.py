@@ -1,0 +1,150 @@
+"""One episode: a scenario on its way, what was driven of it, and how the last step was."""
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+
+from shiftsim.env.terms import Terms, look_back, make_course, terms_of
+from shiftsim.errors import PlannerError, ShiftsimError, one_of
+from shiftsim.metrics import SHORT_NAMES, compute_metrics
+from shiftsim.metrics.comfort import MIN_SAMPLES, filters_of
+from shiftsim.sim.loop import Rollout, Setting
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Command, Trajectory
+
+NOMINAL_ITERATIONS = 150  # of an episode of 15 s, as CaRL's rewards have them
+SURVIVAL = 0.6  # share of the reward `survival` that is paid for not failing
+
+
+class _Driver:
+    """Stands where a planner stands: whoever acts does so through the environment."""
+
+    name = "policy"
+    scene: SceneInfo
+
+    def reset(self, scene: SceneInfo) -> None:
+        self.scene = scene
+
+    def plan(self, observation: Observation) -> Trajectory | Command:
+        raise PlannerError("a policy acts through the environment, it is not asked")
+
+
+class Episode:
+    """What an observation or a reward is made from.
+
+    Attributes:
+        scenario: The scenario, its recorded future included.
+        scene: What a planner would be told of it.
+        log: The rollout; its arrays have a row per iteration, filled up to the present one.
+        terms: How the last step was.
+        course: The same as the kernels see it.
+        action: (…) the last action within its bounds, zeros at the beginning.
+        error: Why there are no scores; empty otherwise.
+    """
+
+    error = ""
+
+    def __init__(self, scenario: Scenario, setting: Setting, action: np.ndarray) -> None:
+        driver = _Driver()
+        self._rollout = Rollout(scenario, driver, setting)
+        self.scenario, self.scene = scenario, driver.scene
+        self.log = self._rollout.log()
+        self.action = action
+        self._steps = np.diff(self.log.time_us / 1e6)
+        self.course = make_course(self.log, scenario.map)
+        self.terms: Terms = terms_of(self.course)
+
+    @property
+    def iteration(self) -> int:
+        """The present iteration."""
+        return self._rollout.iteration
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the scenario is at its end: its last sample is there."""
+        return self._rollout.iteration + 1 == self._rollout.num_samples
+
+    @property
+    def infraction(self) -> str:
+        """`off_road`, `collision`, or empty: what the last step did wrong."""
+        return "off_road" if self.terms.off_road else "collision" if self.terms.collision else ""
+
+    def observe(self) -> Observation:
+        """What a planner would see now."""
+        return self._rollout.observe()
+
+    def advance(self, plan: Trajectory | Command) -> None:
+        """Drive one step."""
+        self._rollout.advance(plan)
+        row = self._rollout.iteration
+        # as the comfort metrics do it on the whole rollout
+        step = float(np.add.reduce(self._steps[:row]) / row)
+        look_back(self.course, row, filters_of(max(row + 1, MIN_SAMPLES)), step, step**2)
+        self.terms = terms_of(self.course)
+
+    @cached_property
+    def scores(self) -> dict[str, float]:
+        """The closed-loop score `cls` and the scores it is made of, at the end of the scenario.
+
+        Empty where they cannot be computed; `error` then says why.
+        """
+        try:
+            result = compute_metrics(self.log, self.scenario.map)
+        except ShiftsimError as error:  # a task of a run would fail; training goes on
+            self.error = str(error)
+            return {}
+        found = {name: result.scores[name] for name in SHORT_NAMES if name != "score"}
+        return {"cls": result.score, **{n: float(v) for n, v in found.items() if v is not None}}
+
+
+Reward = Callable[[Episode], float]
+
+
+def regular(episode: Episode) -> float:
+    """CaRL's simple reward: progress, less what was done wrong on the way; 100 in all."""
+    t = episode.terms
+    if episode.infraction:
+        return 0.0
+    return 100.0 * t.progress * _factor(t)
+
+
+def nuplan(episode: Episode) -> float:
+    """CaRL's reward with the weights of nuPlan's score."""
+    t = episode.terms
+    if episode.infraction:
+        return 0.0
+    steady = 5.0 * (t.ttc == 1.0) + 4.0 * t.speed + 2.0 * (t.comfort == 1.0)
+    total = (5.0 * t.progress + steady / NOMINAL_ITERATIONS) / 16.0
+    return 100.0 * t.on_route * t.lane * total
+
+
+def survival(episode: Episode) -> float:
+    """CaRL's reward that also pays for every step without an infraction."""
+    t = episode.terms
+    if episode.infraction:
+        return 0.0
+    paid = SURVIVAL / NOMINAL_ITERATIONS
+    return 100.0 * ((1.0 - SURVIVAL) * t.progress * _factor(t) + paid)
+
+
+def score(episode: Episode) -> float:
+    """The closed-loop score at the end of the scenario, else 0, also where there is none."""
+    return episode.scores.get("cls", 0.0) if episode.is_over else 0.0
+
+
+def _factor(t: Terms) -> float:
+    return t.lane * t.speed * t.on_route * t.comfort * t.ttc
+
+
+REWARDS: dict[str, Reward] = {f.__name__: f for f in (regular, nuplan, survival, score)}
+
+
+def reward_of(reward: str | Reward) -> Reward:
+    """The reward of a name, or the function itself.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    return REWARDS[one_of("reward", reward, REWARDS)] if isinstance(reward, str) else reward

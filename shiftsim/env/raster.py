@@ -1,0 +1,92 @@
+"""CaRL's observation, and the picture of an episode, which is made of the same raster."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import Space, spaces
+
+from shiftsim.arrays import BoolArray
+from shiftsim.env.episode import Episode
+from shiftsim.planners.learned.carl import view
+from shiftsim.planners.learned.carl.planner import draw, measure
+from shiftsim.planners.learned.carl.raster import Raster
+from shiftsim.planners.learned.carl.roads import make_roads
+from shiftsim.planners.learned.features import route_blocks
+from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.per_map import PerMap
+from shiftsim.world.state import LightStatus
+
+LARGEST = 1e4  # of a measurement, in its unit; none comes near
+SHAPE = (len(view.CHANNELS), view.SIZE, view.SIZE)
+_COLOURS = {  # red, green, blue by channel; what is drawn first lies below
+    view.DRIVABLE: (216, 216, 220),
+    view.ROUTE: (185, 210, 190),
+    view.BOUNDARIES: (150, 150, 150),
+    view.LIGHTS: (190, 60, 60),
+    view.VEHICLES: (70, 95, 130),
+    view.PEDESTRIANS: (168, 121, 30),
+    view.EGO: (180, 40, 120),
+}
+
+
+_roads = PerMap(make_roads)  # of all environments of a process
+
+
+class Canvas:
+    """Draws an episode as CaRL sees it; the route is drawn as the scenario gives it."""
+
+    def __init__(self, episode: Episode) -> None:
+        scene = episode.scene
+        self._roads = _roads(scene.map)
+        self._scratch = view.make_scratch(self._roads)
+        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
+        self._on_route[route_blocks(scene)] = True
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+
+    def draw(self, episode: Episode) -> Raster:
+        """(9, 256, 256) the present raster."""
+        log, row = episode.log, episode.iteration
+        raster = np.zeros(SHAPE, np.uint8)
+        status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
+        roads, scratch = self._roads, self._scratch
+        draw(raster, roads, scratch, log.ego[row], log.tracks, row, self._on_route, status)
+        return raster
+
+
+class RasterObserver:
+    """CaRL's raster and measurements, and what only its critic sees."""
+
+    space: Space[Any] = spaces.Dict(
+        {
+            "raster": spaces.Box(0, 255, SHAPE, np.uint8),
+            "measurements": spaces.Box(-LARGEST, LARGEST, (10,)),
+            # shares of time and way that are left, comfort and time to collision
+            "value_measurements": spaces.Box(0.0, 1.0, (4,)),
+        }
+    )
+
+    def start(self, episode: Episode) -> None:
+        """Lay out the map."""
+        self._canvas = Canvas(episode)
+
+    def look(self, episode: Episode) -> dict[str, Any]:
+        """The present raster and measurements."""
+        row, terms = episode.iteration, episode.terms
+        action = episode.action if episode.action.shape == (2,) else np.zeros(2, np.float32)
+        measured = measure(episode.log.ego[row], action)
+        left = 1.0 - row / episode.scenario.num_iterations
+        value = [left, 1.0 - terms.completion, terms.comfort, terms.ttc]
+        return {
+            "raster": self._canvas.draw(episode),
+            "measurements": measured,
+            "value_measurements": np.array(value, np.float32),
+        }
+
+
+def picture_of(episode: Episode) -> np.ndarray:
+    """(256, 256, 3) uint8, driving to the right, left is up."""
+    raster = Canvas(episode).draw(episode)[:, ::-1]
+    picture = np.full((view.SIZE, view.SIZE, 3), 245, np.uint8)
+    for channel, colour in _COLOURS.items():
+        picture[raster[channel] > 0] = colour
+    return picture

@@ -1,0 +1,226 @@
+"""A compact observation: the ego, its route, and the tracks and lanes nearest to it.
+
+Everything is in the frame of the ego's box centre, scaled to about one and cut at `LARGEST`: metres
+by 50, m/s by 20, m/s^2 by 5.
+"""
+
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import Space, spaces
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.env.episode import Episode
+from shiftsim.env.terms import Course
+from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
+from shiftsim.planners.learned.features import route_blocks
+from shiftsim.planners.learned.map_features import LightLookup
+from shiftsim.planners.routes.graph import lane_at, lanes_of
+from shiftsim.sim.planner import SceneInfo
+from shiftsim.world.state import (
+    LAST_AGENT_KIND,
+    PACIFICA,
+    AgentKind,
+    LightStatus,
+    center_poses,
+)
+
+METRES, SPEED, ACCEL, LARGEST = 50.0, 20.0, 5.0, 4.0
+ROUTE_POINTS, ROUTE_STEP = 16, 5.0  # m
+TRACKS, LANES = 16, 8
+LANE_POINTS, LANE_STEP = 6, 5.0  # m
+REACH = 50.0  # m, lanes farther away are left out
+_VEHICLE, _RED, _LAST_AGENT = int(AgentKind.VEHICLE), int(LightStatus.RED), int(LAST_AGENT_KIND)
+_TO_CENTER = PACIFICA.rear_axle_to_center
+
+Values = NDArray[np.float32]
+
+
+class Seen(NamedTuple):
+    """The parts of one observation, or of several of them."""
+
+    ego: Values  # (9,) vx, ax, ay, steering angle and rate, yaw rate and acceleration, last action
+    route: Values  # (16, 2) points of the route's lanes from the ego on, 5 m apart
+    # (16, 11) the nearest first: 1, x, y, cosine and sine of the heading, vx, vy, length, width,
+    # whether it is a pedestrian or bicycle, whether it is a static object; zeros where none
+    tracks: Values
+    # (8, 16) the nearest first: 1, whether it is on the route, speed limit or 0, whether its light
+    # is red, six points of the centre line from the ego on, 5 m apart; zeros where there is none
+    lanes: Values
+
+
+SHAPES = ((9,), (ROUTE_POINTS, 2), (TRACKS, 11), (LANES, 4 + 2 * LANE_POINTS))
+SIZE = sum(prod(shape) for shape in SHAPES)
+
+
+def parts_of(values: Values) -> Seen:
+    """The parts of observations (…, 345), as views."""
+    parts, start, lead = [], 0, values.shape[:-1]
+    for shape in SHAPES:
+        stop = start + prod(shape)
+        parts.append(values[..., start:stop].reshape(lead + shape))
+        start = stop
+    return Seen(*parts)
+
+
+class Route(NamedTuple):
+    """The line along the route, and scratch for what is nearest to the ego."""
+
+    xy: FloatArray  # (V, 2) vertices [m]
+    arc: FloatArray  # (V,) arc length at each of them [m]
+    nearest: FloatArray  # (16,) scratch: distances
+    indices: IntArray  # (16,) scratch: of what
+
+
+class VectorObserver:
+    """The compact observation: the parts of `Seen`, one after the other."""
+
+    space: Space[Any] = spaces.Box(-LARGEST, LARGEST, (SIZE,))
+
+    def start(self, episode: Episode) -> None:
+        """Find the route's lanes."""
+        scene, center = episode.scene, center_poses(episode.log.ego[0, :3])
+        line = route_line(scene, route_blocks(scene), center)
+        arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
+        self._route = Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+
+    def look(self, episode: Episode) -> Values:
+        """The present observation."""
+        row = episode.iteration
+        status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
+        values = np.zeros(SIZE, np.float32)
+        seen = parts_of(values)
+        _look(episode.course, self._route, row, status, seen)
+        if episode.action.shape == (2,):
+            seen.ego[7:] = episode.action
+        return values
+
+
+def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:
+    """(V, 2) a line along the lanes of the route from the ego on, V >= 2 [m].
+
+    It goes on in the lane of the next block that begins nearest to its end.
+    """
+    road, size = scene.map, scene.vehicle
+    lanes = lanes_of(road, blocks)
+    if not lanes:
+        ahead = 1e3 * np.array([np.cos(center[2]), np.sin(center[2])])
+        return np.stack([center[:2], center[:2] + ahead])
+    chain = [lane_at(road, np.array(lanes), center, size.length, size.width)]
+    for block in blocks[blocks.index(int(road.block_of[chain[0]])) + 1 :]:
+        end, there = road.baselines.at(chain[-1])[-1], road.block_edges.at(block).tolist()
+        away = {lane: np.hypot(*(road.baselines.at(lane)[0] - end)) for lane in there}
+        chain += [min(away, key=away.__getitem__)] if away else []
+    return np.concatenate([road.baselines.at(lane) for lane in chain])
+
+
+@lean_kernel
+def _look(course: Course, route: Route, row: int, status: IntArray, seen: Seen) -> None:
+    """Write one observation into zeros."""
+    ego = course.ego[row]
+    cos, sin = np.cos(ego[2]), np.sin(ego[2])
+    x, y = ego[0] + _TO_CENTER * cos, ego[1] + _TO_CENTER * sin
+    seen.ego[0] = _cut(ego[3] / SPEED)
+    seen.ego[1], seen.ego[2] = _cut(ego[5] / ACCEL), _cut(ego[6] / ACCEL)
+    for index in range(4):
+        seen.ego[3 + index] = _cut(ego[7 + index])
+    last = len(route.arc)
+    start = project_on_polyline(route.xy, route.arc, 0, last, x, y)
+    for point in range(ROUTE_POINTS):
+        px, py = point_on_polyline(route.xy, route.arc, 0, last, start + point * ROUTE_STEP)
+        _place(px - x, py - y, cos, sin, METRES, seen.route[point])
+    _look_at_tracks(course, route, row, x, y, cos, sin, seen.tracks)
+    _look_at_lanes(course, route, status, x, y, cos, sin, seen.lanes)
+
+
+@lean_kernel
+def _look_at_tracks(
+    course: Course, route: Route, row: int, x: float, y: float, cos: float, sin: float, out: Values
+) -> None:
+    count = 0
+    for track in range(len(course.kinds)):
+        if course.valid[row, track]:
+            dx, dy = course.poses[row, track, 0] - x, course.poses[row, track, 1] - y
+            count = _keep(route, count, len(out), np.hypot(dx, dy), track)
+    for place in range(count):
+        track, line = route.indices[place], out[place]
+        pose, size = course.poses[row, track], course.sizes[row, track]
+        line[0] = 1.0
+        _place(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
+        _place(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
+        if course.kinds[track] <= _LAST_AGENT:
+            velocity = course.velocities[row, track]
+            _place(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
+            line[9] = 0.0 if course.kinds[track] == _VEHICLE else 1.0
+        else:
+            line[10] = 1.0
+        line[7], line[8] = _cut(size[0] / METRES), _cut(size[1] / METRES)
+
+
+@lean_kernel
+def _look_at_lanes(
+    course: Course,
+    route: Route,
+    status: IntArray,
+    x: float,
+    y: float,
+    cos: float,
+    sin: float,
+    out: Values,
+) -> None:
+    bounds, lines, count = course.edges.bounds, course.baselines, 0
+    for edge in range(len(bounds)):
+        dx = max(bounds[edge, 0] - x, 0.0, x - bounds[edge, 2])
+        dy = max(bounds[edge, 1] - y, 0.0, y - bounds[edge, 3])
+        limit = REACH if count < len(out) else route.nearest[count - 1]
+        if dx * dx + dy * dy < limit * limit:
+            first, stop = lines.ptr[edge], lines.ptr[edge + 1]
+            along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
+            px, py = point_on_polyline(lines.xy, lines.arc, first, stop, along)
+            distance = np.hypot(px - x, py - y)
+            if distance < REACH:
+                count = _keep(route, count, len(out), distance, edge)
+    for place in range(count):
+        edge, line = route.indices[place], out[place]
+        limit = course.limits[edge]
+        line[0] = 1.0
+        line[1] = 1.0 if course.edge_on_route[edge] else 0.0
+        line[2] = 0.0 if np.isnan(limit) else _cut(limit / SPEED)
+        line[3] = 1.0 if status[edge] == _RED else 0.0
+        first, stop = lines.ptr[edge], lines.ptr[edge + 1]
+        along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
+        for point in range(LANE_POINTS):
+            ahead = along + point * LANE_STEP
+            px, py = point_on_polyline(lines.xy, lines.arc, first, stop, ahead)
+            _place(px - x, py - y, cos, sin, METRES, line[4 + 2 * point : 6 + 2 * point])
+
+
+@lean_kernel
+def _keep(route: Route, count: int, most: int, distance: float, index: int) -> int:
+    """Sort something into the nearest ones; how many there are then."""
+    nearest, indices = route.nearest, route.indices
+    if count == most:
+        if not distance < nearest[most - 1]:
+            return count
+        count -= 1
+    place = count
+    while place > 0 and nearest[place - 1] > distance:
+        nearest[place], indices[place] = nearest[place - 1], indices[place - 1]
+        place -= 1
+    nearest[place], indices[place] = distance, index
+    return count + 1
+
+
+@lean_kernel
+def _place(dx: float, dy: float, cos: float, sin: float, unit: float, out: Values) -> None:
+    """Write a vector of the map frame in that of the ego, in a unit."""
+    out[0] = _cut((cos * dx + sin * dy) / unit)
+    out[1] = _cut((cos * dy - sin * dx) / unit)
+
+
+@lean_kernel
+def _cut(value: float) -> float:
+    return min(max(value, -LARGEST), LARGEST)
