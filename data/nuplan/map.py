@@ -243,6 +243,8 @@ def _known(fid: str | None) -> list[str]:
 def _find(baselines: dict[str, FloatArray], fid: str, owner: str) -> FloatArray:
     if fid not in baselines:
         raise DataError(f"{owner} {fid!r} has no baseline", hint=REPAIR)
+    if len(baselines[fid]) < 2:
+        raise DataError(f"baseline of {owner} {fid!r} has fewer than two vertices", hint=REPAIR)
     return baselines[fid]
 
 
