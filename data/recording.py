@@ -93,7 +93,7 @@ def scenario(
     rows = slice(window.first_row - offset, window.last_row - offset)
     start = window.first_row - ego.first_row - offset
     count = window.last_row - window.first_row
-    out = Scenario(
+    return Scenario(
         token=window.token,
         scenario_type=window.scenario_type,
         log_name=recording.log_name.partition("@")[0],
@@ -110,8 +110,6 @@ def scenario(
         mapping=window.mapping,
         is_short=window.is_short,
     )
-    freeze(out)
-    return out
 
 
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
@@ -146,15 +144,6 @@ def listed_lights(lights: TrafficLights) -> TrafficLights:
     kept = seen[np.argsort(listed.argmax(axis=0)[seen], kind="stable")]
     names = tuple(lights.connector_ids[i] for i in kept.tolist())
     return TrafficLights(names, np.ascontiguousarray(lights.status[:, kept]))
-
-
-def freeze(scene: Scenario) -> None:
-    """Make the arrays of a scenario read-only."""
-    tracks, goal = scene.tracks, scene.mission_goal
-    arrays = [scene.time_us, scene.ego, scene.iteration_rows, scene.traffic_lights.status]
-    arrays += [tracks.valid, tracks.poses, tracks.velocities, tracks.sizes, tracks.kinds]
-    for array in arrays if goal is None else [*arrays, goal]:
-        array.flags.writeable = False
 
 
 def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:

@@ -21,7 +21,7 @@ from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_o
 from shiftsim.files import import_named
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
-from shiftsim.sim.planner import BatchPlanner, Planner
+from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
 
 # planners of another interface: prefix -> module with install() and factory(class)
 _ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
@@ -188,6 +188,8 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     name = planner_name(source)
     if isinstance(source, str):
         fingerprint = planner_fingerprint(source, arguments)
+    elif hasattr(source, "identify"):
+        fingerprint = source.identify()
     else:
         fingerprint = _object_fingerprint(source, arguments)
     found = RunPlanner(name, source, arguments, fingerprint)
@@ -202,7 +204,10 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
         ) from error
     _require_methods(name, planner)
     close_planner(planner)
-    return replace(found, in_batches=isinstance(planner, BatchPlanner))
+    if not hasattr(source, "identify") and sees_recording(planner):
+        fingerprint = {**fingerprint, "sees_recording": True}
+    in_batches = isinstance(planner, BatchPlanner)
+    return replace(found, fingerprint=fingerprint, in_batches=in_batches)
 
 
 def planner_name(source: Any) -> str:

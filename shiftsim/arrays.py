@@ -28,6 +28,25 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
+
+class _Door:
+    """What a sealed array has for a base: its one attribute cannot be looked into."""
+
+    __slots__ = ("__array_struct__",)
+    __array_struct__: object
+
+
+def sealed(array: Any) -> Any:
+    """The same memory as an array that cannot be written, nor be made writable.
+
+    Its `base` leads to no array.
+    """
+    view, door = array.view(), _Door()
+    view.flags.writeable = False
+    door.__array_struct__ = view.__array_struct__  # holds the memory
+    return np.asarray(door)
+
+
 CACHE = PACKAGE.parent / ".numba-cache"  # in a checkout
 _USES_CACHE = "NUMBA_CACHE_DIR" not in os.environ and (CACHE.parent / "pyproject.toml").is_file()
 _COMPILED = re.compile(rb"kernel|^[A-Z][A-Z0-9_, ]* = ", re.MULTILINE)  # constants are, too

@@ -179,3 +179,10 @@ def join_tracks(parts: list[Tracks]) -> Tracks:
         np.concatenate([part.kinds for part in parts]),
         sum((part.tokens for part in parts), ()),
     )
+
+
+def with_velocities(scenario, columns, velocities):
+    """A scenario in which some of the tracks have other velocities [m/s]."""
+    every = scenario.tracks.velocities.copy()
+    every[:, columns] = velocities
+    return replace(scenario, tracks=replace(scenario.tracks, velocities=every))

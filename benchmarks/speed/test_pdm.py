@@ -5,7 +5,7 @@ Run with `pytest benchmarks/speed/test_pdm.py -s`. Targets on one core: 6 ms wit
 
 import pytest
 
-from shiftsim.planners.contract import frozen_inputs
+from shiftsim.planners.contract import recorded_inputs
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 
@@ -21,7 +21,7 @@ def scenario():
 @pytest.fixture
 def ready(scenario):
     """A planner that has planned once, and an observation."""
-    scene, observations = frozen_inputs(scenario)
+    scene, observations = recorded_inputs(scenario)
     planner = load_planner("pdm-closed")
     planner.reset(scene)
     planner.plan(observations[0])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shiftsim.planners.contract import frozen_inputs
+from shiftsim.planners.contract import recorded_inputs
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.plan_check import validate_plan
 from shiftsim.world.state import TrafficLights
@@ -24,15 +24,15 @@ def scenario():
 
 @pytest.mark.parametrize("name", ["constant-velocity", "simple", "log-future", "idm"])
 def test_plan(measure, scenario, name):
-    scene, observations = frozen_inputs(scenario)
     planner = load_planner(name)
+    scene, observations = recorded_inputs(scenario, planner)
     planner.reset(scene)
     planner.plan(observations[0])
     measure(planner.plan, observations[0], calls=10)
 
 
 def test_idm_at_red_lights(measure, scenario):
-    scene, observations = frozen_inputs(scenario)
+    scene, observations = recorded_inputs(scenario)
     ids = scene.map.edges.ids
     lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8))
     planner = load_planner("idm")
@@ -41,7 +41,7 @@ def test_idm_at_red_lights(measure, scenario):
 
 
 def test_validate_plan(measure, scenario):
-    scene, observations = frozen_inputs(scenario)
+    scene, observations = recorded_inputs(scenario)
     planner = load_planner("constant-velocity")
     planner.reset(scene)
     plan = planner.plan(observations[0])

@@ -126,7 +126,12 @@ def handing_over(result: TaskResult, count: int) -> float:
 
 def ending(folder: Path, result: TaskResult, count: int) -> float:
     """CPU time of finishing a run with so many results [s]."""
-    manifest = {"format": FORMAT_VERSION, "state": "finished"}
+    determining: dict[str, object] = {"store": "", "traffic": "", "controller": "", "planners": {}}
+    manifest = {
+        **{"format": FORMAT_VERSION, "state": "finished", "split": "", "store": "", "counts": {}},
+        "config": {"planners": []},
+        "determining": determining | {"thresholds": {"name": ""}},
+    }
     writer = RunWriter(folder, manifest)
     tasks = [result.task._replace(token=f"{number:016x}") for number in range(count)]
     for task in tasks:

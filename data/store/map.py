@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from shiftsim.arrays import sealed
 from shiftsim.data.store.plausible import require_sound
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
@@ -24,7 +25,7 @@ _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its u
 }
 _UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
 _NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
-_WIDTHS = {"xy": 2, "bounds": 4}  # columns of the arrays that have two axes
+_WIDTHS = {"xy": (2,), "bounds": (4,)}  # columns of the arrays that have two axes
 _WHOLE = ("xy", "arc", "bounds", "grid")  # float parts; all others hold integers
 
 
@@ -108,16 +109,14 @@ def _items(column: pa.ChunkedArray) -> Any:
     values = column.chunk(0).flatten()
     if pa.types.is_string(values.type):
         return tuple(values.to_pylist())
-    array = values.to_numpy(zero_copy_only=False)
-    array.flags.writeable = False
-    return array
+    return values.to_numpy(zero_copy_only=False)
 
 
 def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
     parts: dict[str, Any] = {}
     for name, kind in _groups().items():
         flat = {
-            part: items[column].reshape(-1, _WIDTHS[part]) if part in _WIDTHS else items[column]
+            part: sealed(items[column].reshape(-1, *_WIDTHS.get(part, ())))
             for part, column in _columns(name, kind).items()
         }
         parts[name] = kind(**flat)

@@ -13,6 +13,7 @@ class LogFuture:
     """Plans the recorded states of the coming 8 s, whatever the simulated ego does."""
 
     name = "log-future"
+    sees_recording = True
     _scenario: Scenario | None = None
     _previous: Trajectory | None = None
 

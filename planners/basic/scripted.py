@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.arrays import sealed
 from shiftsim.errors import ConfigError, DataError, PlannerError
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import AX, AY, NUM_STATE, STEERING, VX, VY, YAW_RATE, Trajectory
@@ -46,7 +47,7 @@ class Scripted:
         """
         known = {
             script: sequence
-            for place in (scene.expert.log_name, scene.token)
+            for place in (scene.log_name, scene.token)
             for script, sequence in self._scripts.get(place, {}).items()
         }
         wanted = self._script or (next(iter(known)) if len(known) == 1 else "")
@@ -55,7 +56,7 @@ class Scripted:
             asked = f"script {wanted!r}" if wanted else "single script"
             raise ConfigError(
                 f"{self._file} has no {asked} for scenario {scene.token!r} "
-                f"(log {scene.expert.log_name!r})",
+                f"(log {scene.log_name!r})",
                 hint=f"scripts of this scenario: {names}; choose with --planner-arg name=…",
             )
         self._sequence = known[wanted]
@@ -77,7 +78,7 @@ class Scripted:
                 hint="its time stamps must be those of the log",
             )
         rows = slice(first, first + SAMPLES)
-        return Trajectory(times[rows], self._sequence.states[rows])
+        return Trajectory(times[rows].copy(), self._sequence.states[rows].copy())
 
 
 def _read(path: Path) -> dict[str, dict[str, Trajectory]]:
@@ -98,7 +99,7 @@ def _read(path: Path) -> dict[str, dict[str, Trajectory]]:
         rows = rows[np.argsort(times[rows], kind="stable")]
         if (np.diff(times[rows]) <= 0).any():
             raise DataError(f"{path}: scene {scene!r}, script {script!r}: a time occurs twice")
-        out.setdefault(scene, {})[script] = Trajectory(times[rows], states[rows])
+        out.setdefault(scene, {})[script] = Trajectory(sealed(times[rows]), sealed(states[rows]))
     return out
 
 

@@ -15,7 +15,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from functools import cache, wraps
 from importlib import import_module
@@ -51,6 +51,23 @@ def say(text: str = "") -> None:
 def say_json(value: Any) -> None:
     """A value as JSON; what JSON does not know becomes text."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+
+
+@contextmanager
+def output_kept() -> Iterator[None]:
+    """What planners print within goes to the standard error: the output is the command's own.
+
+    That holds for worker processes that begin within, and for what is no Python, as well.
+    """
+    sys.stdout.flush()
+    before = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
 
 
 def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:

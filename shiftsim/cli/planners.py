@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, plural, say, say_json, show
+from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -74,10 +74,13 @@ def check_one_planner(
     for text in planner_arg or ():
         _, name, value = parse_argument(text, (planner,))
         arguments[name] = value
-    load_planner(planner, arguments)
     scenes = open_named_store(store)
     scenario = scenes.read(token or scenes.tokens[0])
-    findings = check_planner(partial(load_planner, planner, arguments), scenario)
+    others = (scenes.read(name) for name in scenes.tokens if name != scenario.token)
+    with output_kept():
+        load_planner(planner, arguments)
+        make = partial(load_planner, planner, arguments)
+        findings = check_planner(make, scenario, next(others, None))
     errors = [finding for finding in findings if finding.severity == "error"]
     if as_json:
         say_json([asdict(finding) for finding in findings])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import Progress
@@ -59,14 +59,16 @@ def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> Non
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
 
-    prepared = prepare(config)
+    with output_kept():
+        prepared = prepare(config)
     if not as_json:
         _announce(prepared)
     if dry_run:
         say("dry run: everything checked, nothing simulated")
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
-    with interruptible(prepared.folder, [*words, "--resume"], quiet=quiet or as_json) as show:
+    again = [*words, "--resume"]
+    with output_kept(), interruptible(prepared.folder, again, quiet=quiet or as_json) as show:
         finished = execute(prepared, on_progress=show, argv=sys.argv)
     leave_with(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
 

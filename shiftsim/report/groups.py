@@ -137,6 +137,13 @@ def made_up_note(runs: Iterable[Run]) -> str:
     return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
 
 
+def recording_note(run: Run) -> str:
+    """Which planners of a run were given the recording, the future included."""
+    planners = run.manifest["determining"]["planners"].items()
+    names = [n for n, found in planners if isinstance(found, dict) and found.get("sees_recording")]
+    return f"given the recorded future: {', '.join(sorted(names))}" if names else ""
+
+
 def token_digest(tokens: Iterable[str]) -> str:
     """SHA-256 of a set of tokens, as lists of nuPlan scenarios are identified."""
     return hashlib.sha256("\n".join(sorted(tokens)).encode()).hexdigest()

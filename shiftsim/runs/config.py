@@ -105,6 +105,8 @@ class RunConfig:
     )
     device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
     batch_size: int = _setting(1, "Scenarios per forward pass of a learned planner. [1]", least=1)
+    isolate: bool = _setting(False, "Every planner in a process of its own.")
+    planner_python: str = _setting("", "Interpreter for isolated planners of your own.")
     strict: bool = _setting(False, "Fail where a planner falls back.")
     out: str = _setting("", "Run folder. [runs/<id>]")
     workers: int = _setting(0, "Worker processes. [auto]", least=0, parse=parse_workers)

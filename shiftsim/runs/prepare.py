@@ -16,7 +16,14 @@ from shiftsim import __version__
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.planners.registry import RunPlanner, run_planner, takes_argument
+from shiftsim.planners.isolated import Isolated
+from shiftsim.planners.registry import (
+    PLANNERS,
+    RunPlanner,
+    planner_name,
+    run_planner,
+    takes_argument,
+)
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
@@ -132,16 +139,36 @@ def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
         if name in checkpoints:
             arguments["checkpoint"] = checkpoints[name]
-        if takes_argument(source, "device"):
+        if _is_known(config, source) and takes_argument(source, "device"):
             arguments.setdefault("device", config.device)
+        if config.isolate or config.planner_python:
+            source = _isolated(config, source, arguments)
         entries.append(run_planner(source, arguments))
     return entries
+
+
+def _is_known(config: RunConfig, source: Any) -> bool:
+    """Whether the code of a planner may be looked at in this process."""
+    return source in PLANNERS if config.isolate or config.planner_python else True
+
+
+def _isolated(config: RunConfig, source: Any, arguments: dict[str, Value]) -> Isolated:
+    if not isinstance(source, str):
+        raise ConfigError(
+            f"planner {planner_name(source)!r} cannot be isolated: it is an object of this process",
+            hint="put its class into a module, and give its name as package.module:Class",
+        )
+    return Isolated(source, arguments, "" if source in PLANNERS else config.planner_python)
 
 
 def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
     """Checkpoint by planner."""
     named = zip(config.planners, sources, strict=True)
-    takers = [name for name, source in named if takes_argument(source, "checkpoint")]
+    takers = [
+        name
+        for name, source in named
+        if _is_known(config, source) and takes_argument(source, "checkpoint")
+    ]
     out: dict[str, str] = {}
     for text in config.checkpoints:
         name, equals, path = text.partition("=")
@@ -228,7 +255,8 @@ def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int)
             "needs it",
             hint="put its class into a module of its own, beside the main script",
         )
-    memory = max([_MEMORY_OF_NETWORK for entry in entries if entry.in_batches], default=0.0)
+    large = (entry.in_batches or isinstance(entry.source, Isolated) for entry in entries)
+    memory = _MEMORY_OF_NETWORK if any(large) else 0.0
     workers = config.workers or (default_workers(memory) if memory else default_workers())
     return 1 if stuck else max(1, min(workers, num_batches))
 

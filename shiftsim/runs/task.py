@@ -2,7 +2,7 @@
 
 This runs in a worker, on one batch of tasks after the other: a batch is one task, or several of a
 planner that answers for all of them with one forward pass. It holds what is worth keeping between
-them: the open store, one instance per planner, and the last scenario.
+them: the open store, what copies of each planner are made from, and the last scenario.
 """
 
 import traceback
@@ -19,14 +19,15 @@ import pyarrow as pa
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
-from shiftsim.planners.registry import RunPlanner, close_planner
+from shiftsim.planners.original import Original
+from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
-from shiftsim.sim.planner import BatchPlanner, Planner
+from shiftsim.sim.planner import Planner
 from shiftsim.world.scenario import Scenario
 
 T = TypeVar("T")
@@ -94,7 +95,7 @@ class TaskRunner:
     store: str  # folder or URL of the scenario store
     planners: Mapping[str, RunPlanner]  # the planners, by name
     noises: Mapping[str, NoiseModel]  # the noise models, by name
-    _made: dict[str, Planner] = field(default_factory=dict, init=False)
+    _originals: dict[str, Original] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self._scenarios = Scenarios(self.store)
@@ -108,15 +109,18 @@ class TaskRunner:
     def _alone(self, task: Task) -> TaskResult:
         watch = Stopwatch()
         result = attempt(task, partial(self._drive, task, watch))
-        if result.status != OK:
-            self._forget(task.planner)
         return replace(result, seconds=watch.seconds)
 
     def _drive(self, task: Task, watch: Stopwatch) -> TaskResult:
         with watch("read_seconds"):
             scenario = self._scenarios.read(task.token)
         with watch("simulate_seconds"):
-            log = simulate(scenario, self._planner(task), self._setting(task))
+            planner = self._planner(task)
+            try:
+                log = simulate(scenario, planner, self._setting(task))
+            finally:
+                if planner is not None:
+                    self._originals[task.planner].release(planner)
         return self._scored(task, scenario, log, watch)
 
     def _together(self, batch: Batch) -> list[TaskResult]:
@@ -130,7 +134,6 @@ class TaskRunner:
             logs = simulate_together(list(rollouts.values()))
         except (Exception, SystemExit):
             # the shared pass itself failed: too little memory for all of them?
-            self._forget(batch.planner)
             return [self._alone(task) for task in batch.tasks]
         share = (perf_counter() - began) / max(1, len(logs))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
@@ -171,24 +174,19 @@ class TaskRunner:
         )
 
     def _planner(self, task: Task) -> Planner | None:
-        """The planner of a task: made once, or a fork of it that has nothing of other tasks."""
+        """The planner of a task, which has nothing of other tasks."""
         if self.config.controller == "log-playback":
             return None
-        planner = self._made.get(task.planner)
-        if planner is None:
-            planner = self._made[task.planner] = self.planners[task.planner].make()
-        return planner.fork() if isinstance(planner, BatchPlanner) else planner
-
-    def _forget(self, name: str) -> None:
-        """After a failure a planner may be in any state: the next task gets a new one."""
-        if not isinstance(self._made.get(name), BatchPlanner):
-            self._made.pop(name, None)
+        name = task.planner
+        if name not in self._originals:
+            self._originals[name] = Original(self.planners[name].make)
+        return self._originals[name].copy()
 
     def close(self) -> None:
         """Let the planners release what they hold."""
-        for planner in self._made.values():
-            close_planner(planner)
-        self._made.clear()
+        for original in self._originals.values():
+            original.close()
+        self._originals.clear()
 
 
 def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:

@@ -5,6 +5,7 @@ ego moves to i + 1, and the traffic, which still sees the ego of i. The planner 
 times; its last answer is never executed, and the state at T - 1 is neither reached nor stored.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -12,19 +13,18 @@ from typing import Any, cast
 
 import numpy as np
 
-from shiftsim.errors import ConfigError, DataError, PlannerError, one_of
+from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.plan_check import validate_plan
+from shiftsim.sim.plan_check import SHORT, find_fault, is_short, plain
 from shiftsim.sim.planner import (
-    HISTORY_SAMPLES,
     BatchPlanner,
-    History,
     Observation,
     Planner,
+    Sight,
     past_rows,
     scene_info,
 )
@@ -95,6 +95,7 @@ class Rollout:
         # rows: the past samples, then the iterations; the ego is filled up to the present, the
         # tracks from the log until the traffic rewrites them
         self._time_us = scenario.time_us[rows]
+        self._clock: list[int] = self._time_us.tolist()
         self._ego = np.full((len(rows), NUM_STATE), np.nan)
         self._ego[: start + 1] = scenario.ego[rows[: start + 1]]
         self._tracks = scenario.tracks.rows(rows)
@@ -102,6 +103,7 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         self._traffic.start(scenario, self._tracks, start)
+        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights, start)
         self._noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
@@ -110,7 +112,7 @@ class Rollout:
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
-            planner.reset(scene_info(scenario, setting.seed))
+            planner.reset(scene_info(scenario, setting.seed, planner))
 
     @property
     def done(self) -> bool:
@@ -119,11 +121,7 @@ class Rollout:
 
     def observe(self) -> Observation:
         """What the planner sees now."""
-        row = self._start + self.iteration
-        span = slice(max(0, row + 1 - HISTORY_SAMPLES), row + 1)
-        history = History(self._time_us[span], self._ego[span], self._tracks.rows(span))
-        lights = self._lights.rows(slice(row, row + 1))
-        return Observation(self.iteration, int(self._time_us[row]), history, lights)
+        return self._sight.at(self.iteration, self._start + self.iteration)
 
     def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
@@ -132,7 +130,7 @@ class Rollout:
         """
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
-        if plan is not None:
+        if self.planner is not None:
             plan = self._checked(plan)
         if iteration + 1 < self.num_samples:
             # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
@@ -143,7 +141,7 @@ class Rollout:
     def _move_ego(self, plan: Trajectory | Command | None) -> None:
         """Write the next state of the ego, and note the command."""
         iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._time_us[row], self._time_us[row + 1]
+        now_us, next_us = self._clock[row], self._clock[row + 1]
         state, after = self._ego[row], self._ego[row + 1]
         noise, command = self._noise[iteration], self._commands[iteration]
         controller = self.setting.controller
@@ -158,30 +156,34 @@ class Rollout:
             command[:] = plan.acceleration, plan.steering_rate
             command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
         elif isinstance(plan, Trajectory) and controller == "perfect":
-            follow_perfectly(plan, int(next_us), after)
+            follow_perfectly(plan, next_us, after)
         elif isinstance(plan, Trajectory):
             times, states = plan.time_us, plan.states
             status = track_and_step(
                 now_us, next_us, state, times, states, noise[0], noise[1], after, command
             )
-            raise_for_status(status, int(now_us), times)
+            raise_for_status(status, now_us, times)
 
-    def _checked(self, plan: Trajectory | Command) -> Trajectory | Command:
+    def _checked(self, plan: Any) -> Trajectory | Command:
         """The plan in log time; its first second and whether it is a fallback are noted."""
-        now_us, next_us = self._times[self.iteration : self.iteration + 2].tolist()
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._clock[row], self._clock[row + 1]
         if reason := getattr(self.planner, "degraded", ""):
             if self.setting.strict:
                 raise PlannerError(
-                    f"the planner fell back at iteration {self.iteration}: {reason}",
+                    f"the planner fell back at iteration {iteration}: {reason}",
                     hint="without --strict it continues, and the step is counted as degraded",
                 )
-            self._degraded[self.iteration] = True
-        if not isinstance(plan, Trajectory):
-            validate_plan(plan, now_us, next_us)
-            return plan
-        plan = plan.starting_at(now_us)
-        validate_plan(plan, now_us, next_us)
-        sample_poses(plan.time_us, plan.states, now_us, self._plans[self.iteration])
+            self._degraded[iteration] = True
+        fault = find_fault(plan, now_us, next_us)
+        if fault is not None:
+            raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
+        if isinstance(plan, Trajectory):
+            if iteration == 0 and self.setting.controller == "lqr" and is_short(plan):
+                warnings.warn(f"{type(self.planner).__name__}: {SHORT}", stacklevel=2)
+            time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
+            plan = Trajectory(time_us, plain(plan.states))
+            sample_poses(plan.time_us, plan.states, now_us, self._plans[iteration])
         return plan
 
     def log(self) -> SimulationLog:

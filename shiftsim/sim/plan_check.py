@@ -9,14 +9,22 @@ from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
 
 MIN_SPAN_US = 200_000  # us, three poses at 0.1 s: the tracker cannot be built with fewer
+LOOK_AHEAD_US = 1_000_000  # us, what the tracker reads of a plan
+MAX_SPAN_US = 3_600_000_000  # us; the tracker samples all of a plan
+LARGEST = 1e9  # m, rad, m/s, … of either sign; more is a mistake, and squares of it overflow
+SHORT = (
+    "plans reach less than 1 s ahead: the tracker looks 1 s ahead, and takes the end for the rest"
+)
 
-_GOOD, _NOT_INCREASING, _NOT_FINITE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT = range(6)
+_GOOD, _NOT_INCREASING, _TOO_LARGE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT, _TOO_LONG = range(7)
+_INT64, _FLOAT64 = np.dtype(np.int64), np.dtype(np.float64)
 
 
 class Fault(NamedTuple):
     """What is wrong with a plan."""
 
-    # name of the rule: `type`, `shapes`, `times`, `finite`, `covers the next step` or `three poses`
+    # name of the rule: `type`, `shapes`, `times`, `finite`, `length`, `covers the next step` or
+    # `three poses`
     check: str
     message: str  # what is wrong, with the offending value
     hint: str  # what to do about it
@@ -44,7 +52,7 @@ def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
             "return shiftsim.Trajectory.from_poses(times, poses) or a shiftsim.Command",
         )
     times, states = plan.time_us, plan.states
-    if not (_is_array(times, 1, np.int64) and _is_array(states, 2, np.float64)) or (
+    if not (_is_array(times, 1, _INT64) and _is_array(states, 2, _FLOAT64)) or (
         states.shape != (len(times), NUM_STATE)
     ):
         return Fault(
@@ -55,30 +63,36 @@ def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
         )
     if plan.relative:
         now_us, next_us = 0, next_us - now_us
-    code, row, column = _check(_plain(times), _plain(states), now_us, next_us)
+    code, row, column = _check(plain(times), plain(states), now_us, next_us)
     return None if code == _GOOD else _explain(code, row, column, plan, now_us, next_us)
 
 
+def is_short(plan: object) -> bool:
+    """Whether a plan that can be executed ends before what the tracker reads does."""
+    return isinstance(plan, Trajectory) and bool(plan.time_us[-1] - plan.time_us[0] < LOOK_AHEAD_US)
+
+
 def _command_fault(command: Command) -> Fault | None:
-    try:
-        finite = bool(np.isfinite(command.acceleration) and np.isfinite(command.steering_rate))
-    except (TypeError, ValueError):
-        finite = False
-    if finite:
-        return None
-    return Fault(
-        "finite",
-        f"the command is acceleration {command.acceleration!r}, "
-        f"steering rate {command.steering_rate!r}; both must be finite numbers",
-        "return floats in m/s^2 and rad/s",
-    )
+    for name in ("acceleration", "steering_rate"):
+        value = getattr(command, name)
+        try:
+            good = abs(float(value)) <= LARGEST
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            return Fault(
+                "finite",
+                f"the command has {name} {value!r}, not a finite number up to {LARGEST:g}",
+                "return floats in m/s^2 and rad/s",
+            )
+    return None
 
 
-def _is_array(value: object, ndim: int, dtype: type) -> bool:
+def _is_array(value: object, ndim: int, dtype: np.dtype[Any]) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == ndim and value.dtype == dtype
 
 
-def _plain(array: Any) -> Any:
+def plain(array: Any) -> Any:
     """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
     return array if array.flags.carray else array.copy()
 
@@ -98,10 +112,12 @@ def _check(
             return _NOT_INCREASING, row, 0
     for row in range(len(states)):
         for column in range(states.shape[1]):
-            if not np.isfinite(states[row, column]):
-                return _NOT_FINITE, row, column
-    if len(time_us) < 2 or time_us[-1] - time_us[0] < MIN_SPAN_US:
+            if not abs(states[row, column]) <= LARGEST:  # NaN is not, either
+                return _TOO_LARGE, row, column
+    if len(time_us) < 2 or float(time_us[-1]) - float(time_us[0]) < MIN_SPAN_US:
         return _TOO_SHORT, 0, 0
+    if float(time_us[-1]) - float(time_us[0]) > MAX_SPAN_US:  # a difference of integers wraps
+        return _TOO_LONG, 0, 0
     if time_us[0] > now_us:
         return _STARTS_LATE, 0, 0
     if time_us[-1] < next_us:
@@ -120,11 +136,18 @@ def _explain(
             f"({times[row - 1]} us)",
             "times must increase strictly",
         )
-    if code == _NOT_FINITE:
+    if code == _TOO_LARGE:
         return Fault(
             "finite",
             f"{STATE_COLUMNS[column]} of state {row} is {plan.states[row, column]}",
-            "every value of every state must be finite",
+            f"every value of every state must be a finite number up to {LARGEST:g}",
+        )
+    if code == _TOO_LONG:
+        return Fault(
+            "length",
+            f"time {len(times) - 1} of the plan is {times[-1]} us, more than an hour after time 0 "
+            f"({times[0]} us)",
+            "times of from_poses are seconds, time_us are microseconds",
         )
     if code == _TOO_SHORT:
         span = (times[-1] - times[0]) * 1e-6 if len(times) else 0.0

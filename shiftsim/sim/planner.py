@@ -5,11 +5,11 @@ A planner is any object with `reset(scene)` and `plan(observation)`; nothing nee
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, sealed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -36,20 +36,25 @@ class SceneInfo:
         route: Route roadblock ids from start to goal.
         goal: (3,) goal x [m], y [m], heading [rad], or None.
         dt: Nominal time between iterations [s].
-        vehicle: Dimensions of the ego.
+        times: (T,) time stamps of the iterations [us].
         token: Id of the scenario.
-        expert: The whole recorded scenario. Only oracles (log-future) may look at it.
+        log_name: Recording it was cut from.
+        vehicle: Dimensions of the ego.
         seed: Seed of the task; what a planner samples is keyed with it and the token.
+        expert: The whole recording, future included; None unless the planner declares with
+            `sees_recording = True` that it looks at it.
     """
 
     map: VectorMap
     route: tuple[str, ...]
     goal: FloatArray | None
     dt: float
+    times: IntArray
     token: str
-    expert: Scenario
+    log_name: str
     vehicle: VehicleParameters = PACIFICA
     seed: int = 0
+    expert: Scenario | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +102,9 @@ class Observation:
 class Planner(Protocol):
     """What the simulator asks of a planner. Subclassing is not required.
 
-    Optional are `close()`, `name`, and `degraded`: a text that says why the plan just returned is a
-    fallback, empty when it is not. Such steps are counted, or fail a strict run.
+    Optional are `close()`, `name`, `sees_recording` (True where it must be given the recording),
+    and `degraded`: a text that says why the plan just returned is a fallback, empty when it is not.
+    Such steps are counted, or fail a strict run.
     """
 
     def reset(self, scene: SceneInfo) -> None:
@@ -124,16 +130,27 @@ class BatchPlanner(Planner, Protocol):
         """
 
 
-def scene_info(scenario: Scenario, seed: int = 0) -> SceneInfo:
-    """What a planner is told before the first step; `seed` is that of the task."""
+def sees_recording(planner: object) -> bool:
+    """Whether a planner, or a class of planners, declares that it looks at the recording."""
+    return getattr(planner, "sees_recording", False) is True
+
+
+def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> SceneInfo:
+    """What a planner is told before the first step; `seed` is that of the task.
+
+    The recording is there for a planner that declares it only.
+    """
+    times = scenario.iteration_times
     return SceneInfo(
         map=scenario.map,
         route=scenario.route,
         goal=scenario.mission_goal,
-        dt=float(np.diff(scenario.iteration_times).mean() * 1e-6),
+        dt=float(np.diff(times).mean() * 1e-6),
+        times=sealed(times),
         token=scenario.token,
-        expert=scenario,
+        log_name=scenario.log_name,
         seed=seed,
+        expert=scenario if sees_recording(planner) else None,
     )
 
 
@@ -159,9 +176,67 @@ def observe_log(
     rows = past_rows(scenario, iteration, samples)
     now = int(scenario.iteration_rows[iteration])
     history = History(
-        scenario.time_us[rows],
-        scenario.ego[rows] if ego is None else np.atleast_2d(ego),
-        scenario.tracks.rows(rows) if tracks is None else tracks,
+        sealed(scenario.time_us[rows]),
+        sealed(scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)),
+        (scenario.tracks.rows(rows) if tracks is None else tracks).sealed(),
     )
-    lights = scenario.traffic_lights.rows(slice(now, now + 1))
+    lights = scenario.traffic_lights.rows(np.array([now])).sealed()
     return Observation(iteration, int(scenario.time_us[now]), history, lights)
+
+
+class Sight:
+    """What a planner is shown of a rollout, in arrays that cannot be written.
+
+    Of the tracks these are copies, made row by row as the rollout gets there: nothing leads from
+    them to what is simulated, nor to what is recorded of later rows.
+    """
+
+    def __init__(
+        self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights, row: int
+    ) -> None:
+        """Arrays of a rollout, whose rows before `row` may be seen at once."""
+        self._times = time_us.tolist()
+        self._time_us, self._ego = memoryview(sealed(time_us)), memoryview(sealed(ego))
+        self._kinds, self._tokens = sealed(tracks.kinds), tracks.tokens
+        self._rows: list[tuple[memoryview, memoryview, int]] = []
+        views = []
+        for array in (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes):
+            copy = np.zeros_like(array)  # what memory held before may be of this recording
+            copy[:row] = array[:row]
+            views.append(memoryview(sealed(copy)))
+            self._rows.append((_bytes_of(array), _bytes_of(copy), array.nbytes // len(array)))
+        self._tracks = tuple(views)
+        self._connectors, self._status = lights.connector_ids, lights.status.tobytes()
+        self._listed, self._lights = b"?", TrafficLights.empty(1)
+        self._end = row  # rows before it have been copied
+
+    def at(self, iteration: int, row: int) -> Observation:
+        """What a planner sees at an iteration, which is a row of the arrays."""
+        first, self._end = self._end, row + 1
+        for source, copy, size in self._rows:
+            fresh = slice(first * size, (row + 1) * size)
+            copy[fresh] = source[fresh]
+        past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
+        valid, poses, velocities, sizes = self._tracks
+        tracks = Tracks(
+            _array(valid[past]),
+            _array(poses[past]),
+            _array(velocities[past]),
+            _array(sizes[past]),
+            self._kinds,
+            self._tokens,
+        )
+        history = History(_array(self._time_us[past]), _array(self._ego[past]), tracks)
+        count = len(self._connectors)
+        listed = self._status[row * count : (row + 1) * count]
+        if listed != self._listed:
+            status: Any = np.ndarray((1, count), np.int8, listed)
+            self._listed, self._lights = listed, TrafficLights(self._connectors, status)
+        return Observation(iteration, self._times[row], history, self._lights)
+
+
+_array: Any = np.asarray  # of a memoryview: `base` is that view, and ends where the array ends
+
+
+def _bytes_of(array: Any) -> memoryview:
+    return memoryview(array.reshape(-1).view(np.uint8))

@@ -24,7 +24,8 @@ def verify_idm_world(path: Path, report: Report) -> None:
         world, name = read_fields(path, report, "idm_world"), path.stem
         world.note("label", "world")
         scenario, expected = _make_scenario(world), world.each("expected")[0]
-        tracks, traffic = scenario.tracks, IdmTraffic()
+        tracks = scenario.tracks.rows(np.arange(scenario.num_iterations))  # a copy, to be driven
+        traffic = IdmTraffic()
         traffic.start(scenario, tracks, 0)
         order = order_observed(tracks.kinds, tracks.valid[0]).tolist()
         columns = ["token", *NUMBERS, "route_edge_ids"]

@@ -1,6 +1,7 @@
 """Flat geometry of a map layer: polygons with holes, a grid over them, polylines, ragged lists.
 
-Kernels take the NamedTuples of this file as they are. Point queries cost one grid look-up and a few
+Kernels take the NamedTuples of this file as they are. Arrays are read-only: maps never change, and
+kernels see one type of array for all of them. Point queries cost one grid look-up and a few
 exact point-in-polygon tests; results come in the order of the layer, as nuPlan's tables do.
 """
 
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel, sealed
 from shiftsim.errors import MapError
 from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.geometry.rings import (
@@ -72,19 +73,13 @@ class Polygons(NamedTuple):
     cell_items: IntArray  # polygon indices, ascending within a cell
 
 
-def _frozen(array: Any) -> Any:
-    """The array, read-only: maps never change, and kernels see one type of array for all maps."""
-    array.flags.writeable = False
-    return array
-
-
 def make_lists(rows: Iterable[Sequence[int]]) -> Lists:
     """Ragged lists from Python lists."""
     kept = [np.asarray(row, np.int64) for row in rows]
     ptr = np.zeros(len(kept) + 1, np.int64)
     np.cumsum([len(row) for row in kept], out=ptr[1:])
     items = np.concatenate(kept) if kept else np.zeros(0, np.int64)
-    return Lists(_frozen(ptr), _frozen(items))
+    return Lists(sealed(ptr), sealed(items))
 
 
 def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
@@ -93,7 +88,7 @@ def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
     np.cumsum([len(line) for line in lines], out=ptr[1:])
     parts = [np.asarray(line, np.float64).reshape(-1, 2) for line in lines]
     xy = np.ascontiguousarray(np.concatenate(parts)) if parts else np.zeros((0, 2))
-    return Polylines(_frozen(xy), _frozen(ptr), _frozen(arc_lengths(xy, ptr)))
+    return Polylines(sealed(xy), sealed(ptr), sealed(arc_lengths(xy, ptr)))
 
 
 def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
@@ -127,7 +122,7 @@ def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Po
     cell_ptr, cell_items = _fill_cells(first, last, shape)
     grid = np.array([low[0], low[1], cell])
     arrays = (xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)
-    return Polygons(*(_frozen(array) for array in arrays))
+    return Polygons(*(sealed(array) for array in arrays))
 
 
 def _open_ring(ring: FloatArray) -> FloatArray:

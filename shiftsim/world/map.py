@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, sealed
 from shiftsim.errors import MapError, one_of
 from shiftsim.world.layers import (
     Layer,
@@ -77,7 +77,7 @@ class VectorMap:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+                object.__setattr__(self, item.name, sealed(value))
 
     def edge(self, edge_id: str) -> int:
         """Index of a lane or lane connector.

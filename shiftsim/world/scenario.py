@@ -7,7 +7,7 @@ and learned targets that look into the recorded future.
 
 from dataclasses import dataclass
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, sealed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
 
@@ -49,6 +49,13 @@ class Scenario:
     mission_goal: FloatArray | None
     mapping: tuple[float, float, float]
     is_short: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("time_us", "ego", "iteration_rows", "mission_goal"):
+            if (array := getattr(self, name)) is not None:
+                object.__setattr__(self, name, sealed(array))
+        object.__setattr__(self, "tracks", self.tracks.sealed())
+        object.__setattr__(self, "traffic_lights", self.traffic_lights.sealed())
 
     @property
     def num_iterations(self) -> int:

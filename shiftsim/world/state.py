@@ -4,13 +4,13 @@ Everything is an array with one row per time; the few objects here name the colu
 the rear axle, a track's pose is the centre of its box.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, sealed
 
 # Columns of an ego state row. Velocities and accelerations are in the body frame at the rear axle.
 X, Y, HEADING = 0, 1, 2  # m, m, rad
@@ -135,6 +135,12 @@ class Tracks:
             tuple(self.tokens[i] for i in where),
         )
 
+    def sealed(self) -> "Tracks":
+        """The same tracks in arrays that cannot be written."""
+        arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)
+        valid, poses, velocities, sizes, kinds = map(sealed, arrays)
+        return Tracks(valid, poses, velocities, sizes, kinds, self.tokens)
+
     @staticmethod
     def empty(num_rows: int) -> "Tracks":
         """No tracks at all, over `num_rows` rows."""
@@ -158,6 +164,10 @@ class TrafficLights:
     def rows(self, index: slice | IntArray) -> "TrafficLights":
         """The same connectors over other rows."""
         return TrafficLights(self.connector_ids, self.status[index])
+
+    def sealed(self) -> "TrafficLights":
+        """The same lights in an array that cannot be written."""
+        return TrafficLights(self.connector_ids, sealed(self.status))
 
     def at(self, row: int) -> dict[str, LightStatus]:
         """Status by connector id, of the connectors listed in one row."""
@@ -276,9 +286,7 @@ class Trajectory:
 
     def starting_at(self, now_us: int) -> "Trajectory":
         """The same plan with log time stamps."""
-        return (
-            replace(self, time_us=self.time_us + now_us, relative=False) if self.relative else self
-        )
+        return Trajectory(self.time_us + now_us, self.states) if self.relative else self
 
 
 def center_poses(rear_poses: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:

@@ -5,8 +5,14 @@ import pytest
 from scipy.signal import savgol_filter
 
 from shiftsim.errors import DataError
-from shiftsim.metrics.comfort import BOUNDED_SIGNALS, comfort_signals, within_bounds
-from shiftsim.metrics.result import DEEPPLAN, NUPLAN
+from shiftsim.metrics.comfort import (
+    BOUNDED_SIGNALS,
+    ComfortSignals,
+    comfort_signals,
+    judge,
+    within_bounds,
+)
+from shiftsim.metrics.result import DEEPPLAN, NUPLAN, Violation
 from shiftsim.world.state import AX, AY, HEADING, NUM_STATE, YAW_ACCEL, YAW_RATE
 
 
@@ -71,3 +77,75 @@ def test_time_stamps_must_increase() -> None:
     stamps[4] = stamps[3]
     with pytest.raises(DataError, match="at sample 4"):
         comfort_signals(stamps, np.zeros((10, NUM_STATE)))
+
+
+def constant_signals(count: int = 10, **changed: np.ndarray) -> ComfortSignals:
+    return ComfortSignals(**{name: np.zeros(count) for name in ComfortSignals._fields} | changed)
+
+
+BOUNDS = {
+    "ego_jerk": (-8.37, 8.37),
+    "ego_lat_acceleration": (-4.89, 4.89),
+    "ego_lon_acceleration": (-4.05, 2.40),
+    "ego_lon_jerk": (-4.13, 4.13),
+    "ego_yaw_acceleration": (-1.93, 1.93),
+    "ego_yaw_rate": (-0.95, 0.95),
+}
+
+
+@pytest.mark.parametrize("metric", BOUNDS)
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_signal_must_stay_strictly_within_both_bounds(metric: str, side: int) -> None:
+    bound = BOUNDS[metric][side]
+    for value, broken in ((bound, True), (np.nextafter(bound, 0.0), False)):
+        values = np.zeros(10)
+        values[[4, 6]] = value, 0.1 * bound
+        signals = constant_signals(**{BOUNDED_SIGNALS[metric]: values})
+        parts, comfortable = judge(signals, times(10), NUPLAN)
+        row = {part.row.metric: part.row for part in parts}[metric]
+        violation = Violation(4, 400_000, None, value) if broken else None
+        assert (row.value, row.threshold, row.violation) == (value, bound, violation)
+        assert comfortable.row.violation == violation
+        assert comfortable.row.score == comfortable.statistics[0].value == float(not broken)
+        assert comfortable.row.value == float(broken)
+        assert within_bounds(signals, NUPLAN).count(False) == broken
+
+
+def test_the_earliest_of_all_violations_is_that_of_comfort() -> None:
+    late, early = np.zeros(10), np.zeros(10)
+    late[7:], early[2] = 9.0, -9.0
+    signals = constant_signals(mag_jerk=late, lon_jerk=early, yaw_rate=late)
+    _, comfortable = judge(signals, times(10), NUPLAN)
+    assert comfortable.row.violation == Violation(2, 200_000, None, -9.0)
+    assert comfortable.row.value == 3.0
+
+
+def test_the_value_of_a_signal_is_the_one_nearest_to_a_bound() -> None:
+    values = np.array([0.0, 2.0, -3.0, 1.0])
+    parts, _ = judge(constant_signals(4, lon_accel=values), times(4), NUPLAN)
+    part = parts[2]
+    assert (part.row.value, part.row.threshold) == (2.0, 2.40)
+    assert [s.value for s in part.statistics] == [2.0, -3.0, 0.0, 2.0, 1.0]
+    assert [s.kind for s in part.statistics] == ["MAX", "MIN", "MEAN", "P90", "BOOLEAN"]
+    assert part.series is not None
+    np.testing.assert_array_equal(part.series.values, values)
+
+
+RANKS = [(4, 3), (5, 4), (10, 8), (15, 12), (20, 17), (25, 22), (35, 30), (150, 134)]
+
+
+@pytest.mark.parametrize(("count", "rank"), RANKS)
+def test_the_ninetieth_percentile_is_the_observation_of_an_even_rank_on_ties(
+    count: int, rank: int, rng: np.random.Generator
+) -> None:
+    values = rng.permutation(np.arange(count)) / 1000.0
+    parts, _ = judge(constant_signals(count, yaw_rate=values), times(count), NUPLAN)
+    assert parts[5].statistics[3].value == rank / 1000.0
+
+
+def test_the_step_of_the_signals_is_the_mean_of_the_time_stamps() -> None:
+    heading = 0.05 * np.arange(20)
+    signals = comfort_signals(times(20) // 2, states_with(HEADING, heading))
+    np.testing.assert_allclose(signals.yaw_rate, 1.0, rtol=0, atol=1e-8)
+    curved = comfort_signals(times(20) // 2, states_with(HEADING, heading**2))
+    np.testing.assert_allclose(curved.yaw_accel, 2.0, rtol=0, atol=1e-7)

@@ -9,7 +9,7 @@ from rollouts import boxes, rollout, states_of, straight_poses
 from worlds import straight_road
 
 from shiftsim.errors import ConfigError, DataError, MapError
-from shiftsim.metrics import MetricRow, compute_metrics, judge, measure
+from shiftsim.metrics import MetricRow, compute_metrics, judge, load_metric, measure
 from shiftsim.world.build import BlockSpec, EdgeSpec, build_map
 
 LOG = rollout(states_of(straight_poses(20), 10.0))
@@ -98,6 +98,12 @@ def test_an_own_metric_can_be_named_by_module_and_attribute() -> None:
 def test_an_own_metric_that_cannot_be_loaded_is_named(spec: str) -> None:
     with pytest.raises(ConfigError, match=spec):
         compute_metrics(LOG, straight_road(), own=[spec])
+
+
+@pytest.mark.parametrize("spec", ["rollouts", "rollouts:", ":with_count", ""])
+def test_an_own_metric_needs_a_module_and_an_attribute(spec: str) -> None:
+    with pytest.raises(ConfigError, match="is not of the form module:attribute"):
+        load_metric(spec)
 
 
 def test_an_own_metric_cannot_take_an_official_name() -> None:

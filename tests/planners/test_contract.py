@@ -79,6 +79,18 @@ class TwoPoses(Straight):
         return Trajectory(plan.time_us[:2], plan.states[:2], relative=True)
 
 
+class TooLong(Straight):
+    def plan(self, observation):
+        plan = super().plan(observation)
+        return Trajectory(plan.time_us * 1_000_000, plan.states, relative=True)
+
+
+class Short(Straight):
+    def plan(self, observation):
+        plan = super().plan(observation)
+        return Trajectory(plan.time_us[:6], plan.states[:6], relative=True)
+
+
 class EgoFrame(Straight):
     def plan(self, observation):
         return self.poses(0.0, 0.0, 0.0, observation.ego.speed)
@@ -149,7 +161,9 @@ BROKEN = [
     (Random, "error", "deterministic", "differ at iteration 0"),
     (KeepsState, "error", "survives reset", "differs at iteration 0"),
     (WritesEgo, "error", "inputs untouched", "read-only"),
-    (ForcesWrites, "error", "inputs untouched", "not what they were"),
+    (ForcesWrites, "error", "inputs untouched", "cannot set WRITEABLE flag"),
+    (TooLong, "error", "length", "more than an hour after time 0"),
+    (Short, "warning", "length", "less than 1 s ahead"),
     (HoldsALambda, "error", "pickles", "cannot be sent to a worker"),
     (BadCommand, "error", "finite", "acceleration inf"),
 ]

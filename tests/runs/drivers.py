@@ -2,6 +2,7 @@
 
 import os
 import time
+import typing
 from pathlib import Path
 
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
@@ -124,3 +125,57 @@ class Together(LearnedPlanner):
 
     def decode(self, output, observation):
         return self.inner.plan(observation)
+
+
+class Remembers(ConstantVelocity):
+    """Plans differently after every scenario that it has driven, and says so."""
+
+    def __init__(self):
+        print("made")
+        self.driven = []
+
+    def reset(self, scene):
+        print("reset")
+        os.write(1, b"as a library writes\n")
+        self.driven.append(scene.token)
+
+    def plan(self, observation):
+        plan = super().plan(observation)
+        plan.states[:, 1] += 0.1 * len(self.driven)
+        return plan
+
+
+class RemembersInItsClass(ConstantVelocity):
+    """Plans by how many scenarios were driven in this process: no copy helps, one alone is fine."""
+
+    driven: typing.ClassVar = set()
+
+    def reset(self, scene):
+        self.driven.add(scene.token)
+
+    def plan(self, observation):
+        plan = super().plan(observation)
+        plan.states[:, 1] += 0.1 * len(self.driven)
+        return plan
+
+
+class Odd(ConstantVelocity):
+    """Does something odd at iteration 3, something else in every scenario."""
+
+    def __init__(self, odd):
+        self.odd = odd
+
+    def reset(self, scene):
+        self.what = self.odd.get(scene.token, "")
+
+    def plan(self, observation):
+        if observation.iteration == 3:
+            if self.what == "exits":
+                os._exit(7)
+            if self.what == "raises":
+                raise KeyError("lane")
+            if self.what == "leaves":
+                raise SystemExit(3)
+            if self.what == "none":
+                return None
+        return super().plan(observation)

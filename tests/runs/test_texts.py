@@ -42,13 +42,13 @@ class Numbered(RuntimeError):
 class Raising(ConstantVelocity):
     """Raises what it was given in one scenario."""
 
-    def __init__(self, error):
-        self.error = error
+    def __init__(self, name):
+        self.error = name
 
     def reset(self, scene):
         super().reset(scene)
         if scene.token == "0001cafe":
-            raise self.error
+            raise ERRORS[self.error][0]
 
 
 ERRORS = {
@@ -65,16 +65,16 @@ ERRORS = {
 
 @pytest.mark.parametrize("name", ERRORS)
 def test_an_error_of_any_text_fails_its_task_and_nothing_else(toy, tmp_path, name):
-    error, text = ERRORS[name]
+    _, text = ERRORS[name]
     settings = {"store": str(toy), "workers": 1, "out": str(tmp_path / "run")}
-    run = shiftsim.run(Raising(error), **settings)
+    run = shiftsim.run(Raising(name), **settings)
     assert run.manifest["counts"] | {"missing": 0} == run.manifest["counts"]
     assert (run.manifest["counts"]["ok"], run.manifest["counts"]["failed"]) == (3, 1)
     (row,) = (row for row in run.tasks.to_pylist() if row["status"] == "failed")
     assert row["error"].startswith(text)
     assert len(row["error"]) < 200_000
     assert isinstance(row["hint"], str)
-    again = shiftsim.run(Raising(error), **settings, retry_failed=True)
+    again = shiftsim.run(Raising(name), **settings, retry_failed=True)
     assert again.scores.equals(run.scores)
 
 

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario
 
-from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError
+from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
-from shiftsim.sim.loop import simulate
+from shiftsim.sim import loop
+from shiftsim.sim.dynamics.bicycle import command_and_step
+from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
-from shiftsim.world.state import VX, Command, Trajectory, X
+from shiftsim.world.state import NUM_STATE, VX, Command, Trajectory, X
 
 
 class Recorder:
@@ -146,3 +148,135 @@ def test_a_plan_that_ends_before_the_next_step_is_refused():
 def test_registered_planners_drive(rng):
     log = simulate(cruise_scenario(), ConstantVelocity())
     np.testing.assert_allclose(log.ego[:, VX], 8.0, atol=1e-6)
+
+
+class Watcher:
+    """Traffic that keeps what it was told, and moves nobody."""
+
+    def start(self, scenario, tracks, row):
+        self.first, self.told = row, []
+
+    def step(self, iteration, ego, tracks, row):
+        self.told.append((iteration, ego.copy(), row))
+
+
+def test_the_traffic_sees_the_ego_of_the_iteration_that_ends_and_writes_the_next():
+    watcher = Watcher()
+    log = simulate(cruise_scenario(iterations=8), Recorder(), traffic=watcher)
+    assert watcher.first == 21
+    assert [iteration for iteration, _, _ in watcher.told] == list(range(6))
+    assert [row for _, _, row in watcher.told] == list(range(22, 28))
+    np.testing.assert_array_equal([ego for _, ego, _ in watcher.told], log.ego[:-1])
+
+
+def uneven(accel, steering, num_steps, dt):
+    """Noise that differs in every step and channel."""
+    return np.arange(2.0 * num_steps).reshape(num_steps, 2) * [0.1, 0.01]
+
+
+@pytest.mark.parametrize("planner", [Recorder, Pusher])
+def test_each_channel_of_the_noise_of_a_step_acts_on_its_own_command(planner):
+    model = NoiseModel("custom", function=uneven)
+    log = simulate(cruise_scenario(iterations=8), planner(), noise=model)
+    np.testing.assert_array_equal(log.noise, uneven(None, None, 7, 0.1))
+    for step in range(6):
+        after = np.empty(NUM_STATE)
+        now, then = log.time_us[step : step + 2]
+        command_and_step(now, then, log.ego[step], log.commands[step], *log.noise[step], after)
+        np.testing.assert_array_equal(log.ego[step + 1], after)
+
+
+def test_the_first_second_of_every_plan_is_kept_in_the_map_frame():
+    log = simulate(cruise_scenario(iterations=8), Recorder())
+    assert log.plans.shape == (7, 11, 3)
+    ahead = log.ego[:, None, X] + 0.8 * np.arange(11)
+    np.testing.assert_allclose(log.plans[..., 0], ahead, rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(log.plans[..., 1:], 0.0)
+
+
+def test_a_planner_may_watch_a_log_playback():
+    scenario, planner = cruise_scenario(iterations=8), Recorder()
+    log = simulate(scenario, planner, controller="log-playback")
+    np.testing.assert_array_equal(log.ego, scenario.expert[:-1])
+    assert len(planner.seen) == 7
+    assert np.isfinite(log.plans).all()
+    assert np.isnan(log.commands).all()
+
+
+@pytest.mark.parametrize("controller", ["lqr", "perfect"])
+def test_only_a_log_playback_goes_without_a_planner(controller):
+    with pytest.raises(ConfigError, match=f"'{controller}' needs a planner"):
+        simulate(cruise_scenario(), None, controller=controller)
+
+
+def test_perfect_tracking_refuses_commands():
+    with pytest.raises(ConfigError, match="returns a trajectory, not a command"):
+        simulate(cruise_scenario(), Pusher(), controller="perfect")
+
+
+def test_three_iterations_are_enough():
+    assert len(simulate(cruise_scenario(iterations=3), Recorder()).time_us) == 2
+
+
+class Makeshift(Recorder):
+    """Falls back at some iterations."""
+
+    degraded = ""
+
+    def plan(self, observation):
+        self.degraded = "no way" if observation.iteration in (2, 5) else ""
+        return super().plan(observation)
+
+
+def test_makeshift_plans_are_counted_and_refused_where_that_is_asked():
+    log = simulate(cruise_scenario(iterations=8), Makeshift())
+    assert np.flatnonzero(log.degraded).tolist() == [2, 5]
+    with pytest.raises(PlannerError, match="fell back at iteration 2: no way"):
+        simulate(cruise_scenario(iterations=8), Makeshift(), strict=True)
+
+
+class Clock:
+    """Every look at it takes three seconds."""
+
+    now = 0.0
+
+    def __call__(self):
+        self.now += 3.0
+        return self.now
+
+
+class Group(Recorder):
+    """Plans for several scenarios at once."""
+
+    def plan_batch(self, planners, observations):
+        return [p.plan(o) for p, o in zip(planners, observations, strict=True)]
+
+
+def test_the_time_that_a_plan_took_is_that_of_the_clock(monkeypatch):
+    monkeypatch.setattr(loop, "perf_counter", Clock())
+    log = simulate(cruise_scenario(iterations=5), Recorder())
+    np.testing.assert_array_equal(log.planning_seconds, 3.0)
+    rollouts = [Rollout(cruise_scenario(iterations=n), Group()) for n in (5, 7)]
+    first, second = simulate_together(rollouts)
+    np.testing.assert_array_equal(first.planning_seconds, 1.5)
+    np.testing.assert_array_equal(second.planning_seconds, [1.5] * 4 + [3.0] * 2)
+    unplanned = simulate(cruise_scenario(iterations=5), None, controller="log-playback")
+    np.testing.assert_array_equal(unplanned.planning_seconds, 0.0)
+
+
+def test_by_default_nothing_disturbs_the_ego():
+    assert (DEFAULT.noise, DEFAULT.seed, DEFAULT.strict) == ("none", 0, False)
+    planner = Recorder()
+    assert not simulate(cruise_scenario(iterations=4), planner).noise.any()
+    assert planner.scene.seed == 0
+
+
+@pytest.mark.parametrize("history_rows", [0, 7, 60])
+def test_the_past_of_the_ego_is_that_of_the_recording(history_rows):
+    scenario, planner = cruise_scenario(history_rows=history_rows, iterations=6), Recorder()
+    simulate(scenario, planner)
+    row = scenario.iteration_rows[0]
+    past = np.arange(row % 2, row + 1, 2)[-22:]
+    first = planner.seen[0].history
+    np.testing.assert_array_equal(first.ego, scenario.ego[past])
+    np.testing.assert_array_equal(first.time_us, scenario.time_us[past])

@@ -72,7 +72,7 @@ class PlanTF(LearnedPlanner[Features, Plans]):
     def features(self, observation: Observation) -> Features:
         """What the network reads."""
         history = observation.history
-        rear_axle = history.ego[-1, :3]
+        rear_axle = history.ego[-1, :3].copy()
         center = center_poses(rear_axle)
         route = self._corrector.at(rear_axle) if self._corrector else ()
         if route is not self._route:

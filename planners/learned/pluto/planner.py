@@ -88,7 +88,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
         road, history = scene.map, observation.history
-        ego, center = history.ego[-1], observation.ego.center
+        ego, center = history.ego[-1].copy(), observation.ego.center
         if self.route is None:
             known = self._blocks
             blocks = RouteCorrector(road, known, START_HALF_SIDE).at(ego[:3]) if known else ()
@@ -136,7 +136,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         self.choice = choice = self._choose(output, observation)
         if not choice.braked:
             return _plan(choice.poses[choice.best, 1:], observation)
-        ego, fault_time = history.ego[-1], choice.scores.fault_times[choice.best]
+        ego, fault_time = history.ego[-1].copy(), choice.scores.fault_times[choice.best]
         states = brake(choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle)
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
@@ -144,7 +144,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         scene, sight = self._scene, self.sight
         assert scene is not None
         assert sight is not None
-        ego, tracks = observation.history.ego[-1], observation.history.tracks
+        ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         poses, learned = proposals.best_proposals(output, ego[:3])
         seen, rows = sight.agents, sight.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)

@@ -48,7 +48,7 @@ class Loop:
         # recorded ego states, columns of `state.STATE_COLUMNS`: all, and those up to iteration 0
         self.ego = file.take("ego/current", -1, state.NUM_STATE)
         self.past = file.take("ego/initial_history", HISTORY_SAMPLES, state.NUM_STATE)
-        planner.reset(scene_info(self.scenario))
+        planner.reset(scene_info(self.scenario, planner=planner))
 
     @property
     def where(self) -> str:

@@ -148,7 +148,7 @@ def _plan_again(where: str, planner: Planner, seen: Seen, rows: Source) -> None:
     recorded, last = rows["iteration"], len(seen.ego) - 1
     due = sorted({*range(0, last + 1, EVERY), last})
     rows.report.compare("plan iterations", where, due, sorted(set(recorded.tolist())))
-    planner.reset(scene_info(seen.scenario))
+    planner.reset(scene_info(seen.scenario, planner=planner))
     name = rows["planner"][0]
     for iteration in sorted({0, *recorded.tolist()}):
         plan = planner.plan(seen.at(iteration))

@@ -74,7 +74,7 @@ def _compare_calls(
 ) -> PdmClosed:
     """Compare every call; the planner after the last one."""
     planner, road = PdmClosed(), seen.scenario.map
-    planner.reset(scene_info(seen.scenario))
+    planner.reset(scene_info(seen.scenario, planner=planner))
     count, per_call = len(seen.ego), proposals.num_rows // len(seen.ego)
     calls, numbers = np.arange(count), np.arange(per_call)
     times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)

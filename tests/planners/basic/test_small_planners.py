@@ -5,7 +5,7 @@ import pytest
 from worlds import cruise_scenario
 
 from shiftsim.errors import ConfigError, DataError, PlannerError
-from shiftsim.planners.contract import check_planner, frozen_inputs
+from shiftsim.planners.contract import check_planner, recorded_inputs
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AX, VX, VY, Command
@@ -15,7 +15,7 @@ T0 = 1_600_000_000_000_000 + 60 * 50_000  # iteration 0 of the toy scenario [us]
 
 def plan_at(name, scenario, iteration=0, ego=None, arguments=None):
     planner = load_planner(name, arguments)
-    planner.reset(scene_info(scenario))
+    planner.reset(scene_info(scenario, planner=planner))
     state = scenario.expert[iteration] if ego is None else ego
     return planner.plan(observe_log(scenario, iteration, ego=state, samples=1))
 
@@ -42,13 +42,13 @@ def test_log_future_leaves_out_what_was_not_recorded():
 def test_log_future_repeats_its_last_plan_where_the_recording_ends():
     scenario = cruise_scenario(iterations=11, future_rows=4)
     planner = load_planner("log-future")
-    planner.reset(scene_info(scenario))
+    planner.reset(scene_info(scenario, planner=planner))
     last = [
         planner.plan(observe_log(scenario, i, ego=scenario.expert[i], samples=1)) for i in range(10)
     ]
     assert len(last[7].time_us) == 2  # iteration 7 is row 74, the last row is 84
     assert last[9] is last[7]
-    planner.reset(scene_info(scenario))
+    planner.reset(scene_info(scenario, planner=planner))
     with pytest.raises(PlannerError, match=r"no recorded state 0\.5 s after iteration 9"):
         planner.plan(observe_log(scenario, 9, ego=scenario.expert[9], samples=1))
 
@@ -153,7 +153,7 @@ def test_a_planner_that_returns_commands_obeys_the_contract():
 
 
 def test_inputs_of_the_contract_check_cannot_be_written():
-    scene, observations = frozen_inputs(cruise_scenario())
+    scene, observations = recorded_inputs(cruise_scenario())
     assert len(observations[0].history.time_us) == 22
     with pytest.raises(ValueError, match="read-only"):
         observations[3].history.ego[0, 0] = 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import cruise_scenario, standing_tracks, straight_road
+from worlds import cruise_scenario, standing_tracks, straight_road, with_velocities
 
 from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.planners.learned.carl import view as carl_view
@@ -73,7 +73,8 @@ def test_the_ego_is_drawn_about_its_centre_with_its_speed(planner):
 def test_objects_have_the_channel_and_value_of_their_kind(planner):
     poses = [[30.0, 10.0, 0.0], [30.0, 20.0, 0.0], [30.0, 30.0, 0.0], [30.0, 40.0, 0.0]]
     scenario = scenario_with(poses, [VEHICLE, BICYCLE, PEDESTRIAN, CONE], speed=0.0)
-    scenario.tracks.velocities[:, 2] = (3.0, 4.0)  # more than the highest speed of a pedestrian
+    # more than the highest speed of a pedestrian
+    scenario = with_velocities(scenario, 2, (3.0, 4.0))
     picture, _, _ = look(planner, scenario, ego=scenario.expert[0])
     column = EGO_COLUMN + round(2 * (30.0 - 10.0 - 1.461))
     values = [
@@ -93,7 +94,7 @@ def test_an_object_counts_when_its_centre_is_in_the_picture(planner):
 def test_static_objects_are_drawn_over_pedestrians(planner):
     poses = [[30.0, 10.0, 0.0], [30.0, 10.0, 0.0]]
     scenario = scenario_with(poses, [CONE, PEDESTRIAN])
-    scenario.tracks.velocities[:, 1] = (4.0, 0.0)
+    scenario = with_velocities(scenario, 1, (4.0, 0.0))
     picture, _, _ = look(planner, scenario)
     assert set(np.unique(picture[carl_view.PEDESTRIANS]).tolist()) == {0, 127}
 

@@ -7,7 +7,14 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import cruise_scenario, moved, moved_poses, standing_tracks, straight_road
+from worlds import (
+    cruise_scenario,
+    moved,
+    moved_poses,
+    standing_tracks,
+    straight_road,
+    with_velocities,
+)
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.polylines import HIT, make_path
@@ -122,7 +129,7 @@ def test_turning_the_whole_world_turns_the_plan(seed, angle):
     rng = np.random.default_rng(seed)
     poses = np.column_stack([rng.uniform(30, 60, 3), rng.uniform(-3, 6, 3), rng.uniform(-3, 3, 3)])
     scenario = scenario_with(poses, [VEHICLE, PEDESTRIAN, CONE])
-    scenario.tracks.velocities[:, :2] = rng.uniform(-3.0, 3.0, (2, 2))
+    scenario = with_velocities(scenario, slice(2), rng.uniform(-3.0, 3.0, (2, 2)))
     shift = np.array([512.0, -2048.0])
 
     _, step = one_step(scenario)

@@ -4,13 +4,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
-from shiftsim.sim.dynamics.perfect import follow_perfectly, interpolate, sample_poses
+from shiftsim.sim.dynamics.perfect import (
+    follow_perfectly,
+    interpolate,
+    sample_poses,
+    segment_end,
+    unwrap_correction,
+)
 from shiftsim.world.state import (
     HEADING,
     NUM_STATE,
     STEERING,
     STEERING_RATE,
     VX,
+    VY,
     YAW_ACCEL,
     YAW_RATE,
     Trajectory,
@@ -42,6 +49,42 @@ def test_states_are_interpolated_over_unwrapped_headings(seed, count, share):
     expected[STEERING + 1 :] = [0.0] * (NUM_STATE - STEERING - 1)
     np.testing.assert_allclose(out, expected, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(plain, out, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("turns", [-1.5, -1.0, -0.6, -0.5, 0.0, 0.4, 0.5, 0.6, 1.0, 1.5, 2.5])
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_headings_are_unwrapped_as_numpy_does(before, turns):
+    after = before + 2.0 * np.pi * turns
+
+    correction = unwrap_correction(before, after)
+
+    expected = np.unwrap([before, after])[1] - after
+    assert correction == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 20))
+def test_the_segment_of_a_time_is_that_of_a_search(seed, count):
+    time_us = np.cumsum(np.random.default_rng(seed).integers(1, 5, count))
+
+    for query in range(int(time_us[0]) - 2, int(time_us[-1]) + 3):
+        expected = np.clip(np.searchsorted(time_us, query), 1, count - 1)
+        assert segment_end(time_us, query) == expected
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_the_ends_of_a_trajectory_are_covered(at):
+    time_us, states = two_states()
+    states[:] = np.arange(2)[:, None]
+    out = np.empty(NUM_STATE)
+
+    assert interpolate(time_us, states, int(time_us[at]), out)
+    np.testing.assert_array_equal(out[: STEERING + 1], at)
+
+
+def test_a_single_state_covers_nothing():
+    time_us, states = two_states()
+
+    assert not interpolate(time_us[:1], states[:1], 0, np.empty(NUM_STATE))
 
 
 def test_a_heading_that_crosses_half_a_turn_goes_the_short_way():
@@ -100,6 +143,19 @@ def test_perfect_tracking_refuses_fifty_metres_per_second():
 
     with pytest.raises(PlannerError, match="50 m/s"):
         follow_perfectly(Trajectory(time_us, states), 100_000, np.empty(NUM_STATE))
+
+
+@pytest.mark.parametrize(("sideways", "refused"), [(40.0, True), (39.99, False)])
+def test_the_speed_of_perfect_tracking_is_that_in_any_direction(sideways, refused):
+    time_us, states = two_states()
+    states[:, VX], states[:, VY] = -30.0, sideways
+    plan = Trajectory(time_us, states)
+
+    if refused:
+        with pytest.raises(PlannerError, match="speed 50 m/s at 100000 us"):
+            follow_perfectly(plan, 100_000, np.empty(NUM_STATE))
+    else:
+        follow_perfectly(plan, 100_000, np.empty(NUM_STATE))
 
 
 def test_perfect_tracking_needs_a_plan_to_the_next_iteration():

@@ -100,7 +100,9 @@ def test_bicycles_late_vehicles_and_those_off_the_road_vanish() -> None:
         [(40.0, 0.0, 0.0), (60.0, 9.0, 0.0), (80.0, 0.0, 0.0), (100.0, 0.0, 0.0)],
         [VEHICLE, VEHICLE, VEHICLE, BICYCLE],
     )
-    scenario.tracks.valid[: scenario.iteration_rows[5], 2] = False
+    valid = scenario.tracks.valid.copy()
+    valid[: scenario.iteration_rows[5], 2] = False
+    scenario = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
 
     tracks = drive(scenario, steps=20)
 

@@ -1,5 +1,7 @@
 """Traffic models of one's own, and mixtures of policies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import cruise_scenario, standing_tracks
@@ -46,8 +48,10 @@ def test_constant_velocity_moves_agents_straight_on(scenario: Scenario) -> None:
 
 def test_constant_velocity_keeps_who_leaves_and_takes_in_who_comes(scenario: Scenario) -> None:
     rows = scenario.iteration_rows
-    scenario.tracks.valid[rows[10] :, 0] = False
-    scenario.tracks.valid[: rows[10], 1] = False
+    valid = scenario.tracks.valid.copy()
+    valid[rows[10] :, 0] = False
+    valid[: rows[10], 1] = False
+    scenario = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
 
     tracks = drive(scenario, ConstantVelocity())
 

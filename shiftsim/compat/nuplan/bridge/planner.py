@@ -13,8 +13,11 @@ from nuplan.planning.simulation.planner.abstract_planner import PlannerInitializ
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
 from shiftsim.errors import ConfigError, PlannerError
+from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import Trajectory
+
+_maps = PerMap(BridgeMap)
 
 
 class NuplanPlanner:
@@ -27,7 +30,6 @@ class NuplanPlanner:
         self.name = str(self._planner.name())
         self.report: Any = None  # what the planner reported of the scenario before
         self._scene: SceneInfo | None = None
-        self._map: BridgeMap | None = None
         self._history: HistoryKeeper | None = None
 
     def _make(self) -> Any:
@@ -50,11 +52,9 @@ class NuplanPlanner:
                 hint="shiftsim has tracks, no sensor data: observation_type() must be "
                 "DetectionsTracks",
             )
-        if self._map is None or self._map.source is not scene.map:
-            self._map = BridgeMap(scene.map)
         self._scene, self._history = scene, HistoryKeeper(scene)
         goal: Any = None if scene.goal is None else StateSE2(*scene.goal.tolist())
-        self._planner.initialize(PlannerInitialization(list(scene.route), goal, self._map))
+        self._planner.initialize(PlannerInitialization(list(scene.route), goal, _maps(scene.map)))
 
     def plan(self, observation: Observation) -> Trajectory:
         """The planner's trajectory.
@@ -65,7 +65,7 @@ class NuplanPlanner:
         if self._scene is None or self._history is None:
             raise PlannerError(f"planner {self.name!r}: plan() was called before reset()")
         found = self._planner.compute_trajectory(self._history.planner_input(observation))
-        times = self._scene.expert.iteration_times
+        times = self._scene.times
         following = min(observation.iteration + 1, len(times) - 1)
         now_us, next_us = int(observation.time_us), int(times[following])
         return to_trajectory(found, now_us, next_us, self.name)

@@ -97,7 +97,8 @@ class HistoryKeeper:
 
     def __init__(self, scene: SceneInfo) -> None:
         self._vehicle = vehicle_parameters(scene.vehicle)
-        self._interval = ROW_SECONDS * scene.expert.row_step
+        step = float(np.median(np.diff(scene.times))) * 1e-6
+        self._interval = ROW_SECONDS * round(step / ROW_SECONDS)
         self._buffer: Any = None
         self._iteration = -1
 

@@ -1,0 +1,159 @@
+"""A planner in a process of its own: only arrays and plain values cross, never code.
+
+The child runs `stub.py`, in our interpreter with everything of ours, or in another one that needs
+NumPy alone. What it computes is the same, and so are the scores.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from shiftsim.errors import PlannerError
+from shiftsim.planners import stub
+from shiftsim.planners.original import Original
+from shiftsim.planners.registry import load_planner, planner_fingerprint
+from shiftsim.sim import planner as interface
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world import layers, state
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Command, Trajectory
+
+_GIVEN = (
+    *(interface.SceneInfo, interface.Observation, interface.History, Scenario, VectorMap),
+    *(layers.Layer, layers.Polygons, layers.Polylines, layers.Lists),
+    *(state.Tracks, state.TrafficLights, state.VehicleParameters),
+)
+_PATIENCE = 5.0  # s, for a planner to release what it holds
+_RETURNED = {kind.__name__: kind for kind in (Trajectory, Command)}
+
+
+class Isolated:
+    """Drives with a planner that lives in a child process."""
+
+    shares_nothing = True  # every scenario gets a planner of its own there
+
+    def __init__(self, spec: str, arguments: Mapping[str, Any], python: str = "") -> None:
+        """The planner `spec` (see `load_planner`) in the interpreter `python`, or in ours.
+
+        The process begins when it is needed.
+        """
+        self.name, self.degraded = spec, ""
+        self._given = (spec, dict(arguments), python)
+        self._process: Any = None
+        self._map: VectorMap | None = None
+        self._about: Any = None
+
+    def __reduce__(self) -> Any:
+        return Isolated, self._given
+
+    def identify(self) -> dict[str, Any]:
+        """The fingerprint of the planner; it is made once to see that it works.
+
+        Raises:
+            PlannerError: It cannot be made.
+        """
+        self.close()
+        found, declares = self._started()
+        self.close()
+        return {**found, "sees_recording": True} if declares else dict(found)
+
+    @property
+    def sees_recording(self) -> bool:
+        """Whether the planner declares that it looks at the recording."""
+        return bool(self._started()[1])
+
+    def _started(self) -> Any:
+        """What the child says of its planner; it is started where there is none."""
+        if self._process is not None and self._process.poll() is None:
+            return self._about
+        self.close()
+        self._map = None
+        spec, arguments, python = self._given
+        words = [python or sys.executable, stub.__file__, str(os.getpid())]
+        pipe = subprocess.PIPE
+        try:
+            self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, process_group=0)
+        except OSError as error:
+            raise PlannerError(
+                f"planner {spec!r}: {words[0]!r} cannot be started ({error.strerror})",
+                hint="--planner-python takes the path of a Python interpreter",
+            ) from error
+        plain = {name: str(v) if isinstance(v, Path) else v for name, v in arguments.items()}
+        path = [] if python else [*filter(None, sys.path), os.getcwd()]
+        self._about = self._ask("make", {"spec": spec, "arguments": plain, "path": path})
+        return self._about
+
+    def reset(self, scene: SceneInfo) -> None:
+        """Send the scene; its map only where it is another one than before.
+
+        Raises:
+            PlannerError: The planner failed, or its process ended.
+        """
+        self._started()
+        if self._map is not scene.map:
+            self._ask("map", scene.map)
+            self._map = scene.map
+        nothing: Any = None
+        expert = None if scene.expert is None else replace(scene.expert, map=nothing)
+        self._ask("reset", replace(scene, map=nothing, expert=expert))
+
+    def plan(self, observation: Observation) -> Trajectory | Command:
+        """What the planner in the child returns.
+
+        Raises:
+            PlannerError: The planner failed, or its process ended.
+        """
+        plan: Trajectory | Command
+        plan, self.degraded = self._ask("plan", observation)
+        return plan
+
+    def _ask(self, verb: str, value: object) -> Any:
+        try:
+            stub.write(self._process.stdin, (verb, value))
+            state, answer = stub.read(self._process.stdout, _RETURNED)
+        except (OSError, EOFError, ValueError) as error:
+            self._process.kill()
+            code = self._process.wait()
+            end = f"by signal {-code}" if code < 0 else f"with code {code}"
+            raise PlannerError(
+                f"the process of planner {self.name!r} ended {end}",
+                hint="what it wrote to the standard error may say why",
+            ) from error
+        if state == "failed":
+            text, hint, trace = answer
+            failure = PlannerError(text, hint)
+            failure.add_note(f"in the process of planner {self.name!r}:\n{trace}")
+            raise failure
+        return answer
+
+    def close(self) -> None:
+        """End the process, once its planner has released what it holds."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with suppress(OSError):  # of what is still to be written
+            process.stdin.close()
+        try:
+            process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+    def __del__(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+
+
+def at_home(hello: Mapping[str, Any]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """In the child: what makes planners, the classes of what they are given, and a fingerprint."""
+    spec, arguments = hello["spec"], hello["arguments"]
+    original = Original(lambda: load_planner(spec, arguments))
+    classes = {kind.__name__: kind for kind in _GIVEN}
+    return original.copy, classes, planner_fingerprint(spec, arguments)
