@@ -173,6 +173,7 @@ def look_back(course: Course, row: int, filters: Filters, step: float, square: f
     out[_LANE], out[_SPEED] = 1.0, 1.0
     if lane >= 0:
         out[_LANE] = _lane_term(course, lane, x, y)
+        # nuPlan rule 364: on connectors their own limit
         if speed > course.limits[lane]:  # not where it is NaN
             out[_SPEED] = max(0.0, 1.0 - (speed - course.limits[lane]) / MAX_OVERSPEED)
     out[_COLLISION] = _find_contacts(course, row) and speed >= STOPPED_SPEED
@@ -277,6 +278,7 @@ def _is_contact_ahead(course: Course, row: int, speed: float) -> bool:
     """Whether the ego meets a track within the horizon when everybody goes straight on."""
     ego, other = course.boxes[0], course.boxes[1]
     for track in range(len(course.touched)):
+        # nuPlan rule 363: also those behind and beside the ego
         if course.touched[track] or not course.valid[row, track]:
             continue
         pose, size = course.poses[row, track], course.sizes[row, track]

@@ -193,6 +193,14 @@ def test_time_to_collision_looks_less_than_a_second_ahead_and_is_not_forgotten()
     assert {e.terms.ttc for e in replay(beside)} == {1.0}
 
 
+def test_time_to_collision_counts_who_comes_from_behind():
+    tracks = approaching()
+    tracks.velocities[:] = 100.0 / (ROWS - 1) * 20.0, 0.0  # 3.8 m/s
+    terms = [e.terms for e in replay(cruise_scenario(speed=0.01, tracks=tracks))]
+    first = [t.ttc for t in terms].index(0.5)
+    assert not any(t.collision for t in terms[: first + 5])
+
+
 def test_comfort_is_the_share_of_checks_that_hold_so_far(rng):
     commands = np.column_stack([rng.normal(0, 8.0, 149), rng.normal(0, 0.6, 149)])
     commands[:40] = 0.0
