@@ -130,7 +130,7 @@ def ending(folder: Path, result: TaskResult, count: int) -> float:
     manifest = {
         **{"format": FORMAT_VERSION, "state": "finished", "split": "", "store": "", "counts": {}},
         "config": {"planners": []},
-        "determining": determining | {"thresholds": {"name": ""}},
+        "determining": determining | {"metric_version": "", "thresholds": {"name": ""}},
     }
     writer = RunWriter(folder, manifest)
     tasks = [result.task._replace(token=f"{number:016x}") for number in range(count)]

@@ -96,7 +96,8 @@ _RANGES = {  # by column
 _MANIFEST = {  # what is read of it, and its type
     **dict.fromkeys(("state", "split", "store"), str),
     **dict.fromkeys(("config", "counts", "determining", "determining.planners"), dict),
-    **dict.fromkeys((f"determining.{name}" for name in ("store", "traffic", "controller")), str),
+    **dict.fromkeys(("determining.store", "determining.traffic", "determining.controller"), str),
+    "determining.metric_version": str,
     "config.planners": list,
     "determining.thresholds.name": str,
 }

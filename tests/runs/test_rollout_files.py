@@ -32,6 +32,7 @@ MANIFEST = {
     **{"split": "s", "store": "s", "config": {"planners": []}, "counts": {}},
     "determining": {
         **{"store": "", "planners": {}, "traffic": "", "controller": ""},
+        "metric_version": "",
         "thresholds": {"name": ""},
     },
 }
