@@ -81,6 +81,13 @@ def compute_metrics(
     Raises:
         DataError: The rollout is too short or not finite.
         MapError: The map is such that nuPlan's own code stops.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        result = shiftsim.score(shiftsim.simulate(scenario, "idm"), scenario.map)
+        print(result.score, result.scores)
+        ```
     """
     result = judge(measure(log, road), thresholds)
     return add_metrics(result, log, road, own) if own else result

@@ -62,6 +62,13 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
 
     `planner` is one, or a class or function without arguments that makes one. With `other` it must
     not matter whether that scenario was driven before. The run time is always among the findings.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        for found in shiftsim.check_planner(shiftsim.load_planner("idm"), scenario):
+            print(found.severity, found.message)
+        ```
     """
     findings: list[Finding] = []
     is_made = isinstance(planner, type) or not hasattr(planner, "plan")

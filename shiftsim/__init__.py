@@ -5,14 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from shiftsim.api import Run as Run
+    from shiftsim.api import load_planner as load_planner
     from shiftsim.api import open_run as open_run
+    from shiftsim.api import open_store as open_store
     from shiftsim.api import run as run
+    from shiftsim.api import simulate as simulate
     from shiftsim.errors import ShiftsimError as ShiftsimError
     from shiftsim.metrics import compute_metrics as score  # noqa: F401
     from shiftsim.planners.contract import check_planner as check_planner
-    from shiftsim.runs.scenarios import open_named_store as open_store  # noqa: F401
     from shiftsim.sim.log import SimulationLog as SimulationLog
-    from shiftsim.sim.loop import simulate as simulate
     from shiftsim.sim.noise import NoiseModel as NoiseModel
     from shiftsim.sim.planner import Observation as Observation
     from shiftsim.sim.planner import Planner as Planner
@@ -40,12 +41,13 @@ _PUBLIC = {
     "Tracks": "shiftsim.world.state:Tracks",
     "Trajectory": "shiftsim.world.state:Trajectory",
     "check_planner": "shiftsim.planners.contract:check_planner",
+    "load_planner": "shiftsim.api:load_planner",
     "open_run": "shiftsim.api:open_run",
-    "open_store": "shiftsim.runs.scenarios:open_named_store",
+    "open_store": "shiftsim.api:open_store",
     "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
     "show": "shiftsim.view.page:show",
-    "simulate": "shiftsim.sim.loop:simulate",
+    "simulate": "shiftsim.api:simulate",
 }
 
 __all__ = list(_PUBLIC)

@@ -1,53 +1,299 @@
 """What `import shiftsim` offers that joins layers which may not import one another.
 
-The other public names are where they are defined; `shiftsim/__init__.py` lists all of them.
+The other public names are where they are defined; `shiftsim/__init__.py` lists all of them. What a
+notebook shows of scenarios, maps and logs is registered here: these know nothing of pictures.
 """
 
 import html
-from typing import Any
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
 
-from shiftsim.report.scores import score_table, worst_rollouts
-from shiftsim.runs import execute, results
-from shiftsim.runs.scenarios import open_run_store
-from shiftsim.view.build import Gallery
-from shiftsim.view.page import Page
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.planners import registry
+from shiftsim.runs import results
+from shiftsim.runs.scenarios import open_named_store, open_run_store
+from shiftsim.sim import loop
+from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.planner import Planner
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import speeds
+
+
+class Explanation(str):
+    """Text; printed as it is by a notebook or a console."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
 
 
 class Run(results.Run):
-    """A finished run on disk, with its tables and pictures."""
+    """A finished run on disk, with its tables and pictures.
+
+    Example:
+        ```python
+        run = shiftsim.run("constant-velocity", split="demo-mini", limit=2, out="two")
+        print(run.table())
+        token = run.worst(1)[0]["token"]
+        print(run.explain(token))
+        run.plot(token, at=5.0).savefig("scene.png")
+        ```
+    """
 
     def table(self, *, allow_partial: bool = False) -> str:
         """The score table as text."""
+        from shiftsim.report.scores import score_table
+
         return score_table([self], allow_partial=allow_partial)
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
         """The rollouts with the lowest scores: key, `cls` and `reason`."""
+        from shiftsim.report.scores import worst_rollouts
+
         return worst_rollouts(self, count)
 
-    def view(self, token: str) -> Page:
-        """The replay of one scenario: a page that notebooks show, and that has `.save(path)`.
+    def explain(
+        self,
+        token: str,
+        *,
+        planner: str | None = None,
+        noise: str | None = None,
+        seed: int | None = None,
+    ) -> Explanation:
+        """Why rollouts of one scenario have their scores, or why tasks failed, in words.
+
+        Raises:
+            ConfigError: There is no such task; the token may be an unambiguous beginning of one.
+        """
+        from shiftsim.report.explain import explain_lines, select_tasks
+
+        tasks = select_tasks(self, token, planner=planner, noise=noise, seed=seed)
+        return Explanation("\n\n".join("\n".join(explain_lines(task)) for task in tasks))
+
+    def plot(self, token: str, *, at: float = 0.0) -> Any:
+        """The driven paths of one scenario `at` seconds from the start, as a matplotlib figure.
+
+        Raises:
+            ConfigError: There is no stored rollout of it, or no such time.
+            DataError: The store of the run is not there.
+            MissingExtraError: matplotlib is missing.
+        """
+        from shiftsim.view.still import still
+
+        gallery = self._gallery()
+        found = gallery.find(token)
+        scenario = gallery.store.read(found)
+        return still(scenario, gallery.shown(found, scenario), at=at)
+
+    def view(self, token: str) -> Any:
+        """The replay of one scenario: a `Page`, which notebooks show and `.save(path)` writes.
 
         Raises:
             ConfigError: There is no stored rollout of it.
             DataError: The store of the run is not there.
         """
-        gallery = Gallery([self], open_run_store(self))
+        gallery = self._gallery()
         return gallery.page(gallery.find(token))
 
+    def _gallery(self) -> Any:
+        from shiftsim.view.build import Gallery
+
+        return Gallery([self], open_run_store(self))
+
     def __repr__(self) -> str:
-        return f"Run({str(self.path)!r})\n{self.table()}"
+        counts = self.manifest["counts"]
+        return f"<Run {self.path}: {counts['ok']} of {counts['expected']} tasks finished>"
 
     def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(self.table())}</pre>"
+        return _preformatted(self.table(allow_partial=True))
 
 
-def run(planner: Any, **settings: Any) -> Run:
-    """As `shiftsim.runs.execute.run`, which describes the arguments."""
-    done = execute.run(planner, **settings)
+class RunSettings(TypedDict, total=False):
+    """The settings of `run` beyond its own arguments; `RunConfig` describes them."""
+
+    store: str
+    split: str
+    limit: int
+    all_scenarios: bool
+    traffic: str
+    controller: str
+    thresholds: str
+    planner_args: dict[str, dict[str, Any]]
+    metrics: Sequence[str]
+    checkpoints: Sequence[str]
+    device: str
+    batch_size: int
+    isolate: bool
+    planner_python: str
+    strict: bool
+    out: str
+    workers: int
+    timeout: float
+    resume: bool
+    retry_failed: bool
+    shard: str
+    executor: str
+    scheduler: str
+    save_rollouts: str
+    bundle: bool
+    allow_partial: bool
+
+
+def run(
+    planner: Any,
+    *,
+    noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
+    seeds: int | Iterable[int] = 0,
+    on_progress: Any = None,
+    **settings: Unpack[RunSettings],
+) -> Run:
+    """Simulate and score planners on scenarios, as `shiftsim run` does.
+
+    Args:
+        planner: A name, `package.module:Class`, a class or an instance, or a list of those.
+            Classes and instances of the main script run in this process.
+        noise: Name or model, or a list of them.
+        seeds: Seeds of the noise.
+        on_progress: Called with a `Progress` after every task.
+        settings: The other settings of a run, as in a configuration file.
+
+    Returns:
+        The finished run; print `.table()`.
+
+    Raises:
+        ShiftsimError: A setting is wrong, or something it names is missing.
+
+    Example:
+        ```python
+        run = shiftsim.run(["idm", "log-future"], noise="ou-high", split="demo-mini", limit=2)
+        ```
+    """
+    from shiftsim.runs import execute
+
+    watch = {"on_progress": on_progress} if on_progress else {}
+    done = execute.run(planner, noise=noise, seeds=seeds, **watch, **settings)
     return Run(done.path, done.manifest)
 
 
-def open_run(path: str) -> Run:
-    """As `shiftsim.runs.results.open_run`."""
+def open_run(path: str | Path) -> Run:
+    """A run folder.
+
+    Raises:
+        ConfigError: There is no such folder.
+        DataError: It is not a run folder, one of another format, or the run is not finished.
+
+    Example:
+        ```python
+        run = shiftsim.open_run("two")
+        ```
+    """
     found = results.open_run(path)
     return Run(found.path, found.manifest)
+
+
+def load_planner(name: str, **arguments: Any) -> Planner:
+    """A new planner: a registered name, or `package.module:Class`, with constructor arguments.
+
+    Raises:
+        ConfigError: The name, the module, the class or an argument is wrong.
+        CheckpointError: A learned planner has no checkpoint, or the wrong one.
+        MissingExtraError: A learned planner needs PyTorch.
+
+    Example:
+        ```python
+        planner = shiftsim.load_planner("idm", headway=2.0)
+        ```
+    """
+    return registry.load_planner(name, arguments)
+
+
+def simulate(
+    scenario: Scenario,
+    planner: Planner | str | None,
+    setting: loop.Setting = loop.DEFAULT,
+    **changes: Any,
+) -> SimulationLog:
+    """Drive one scenario in closed loop; as `shiftsim.sim.loop.simulate`, or by a planner's name.
+
+    Args:
+        scenario: The scenario.
+        planner: A planner or the name of one; None only with `log-playback`, which needs none.
+        setting: How it is driven.
+        changes: Fields of `Setting` that differ from it: `noise`, `seed`, `traffic`, `controller`,
+            `strict`.
+
+    Returns:
+        The rollout, K = T - 1 samples.
+
+    Raises:
+        ConfigError: A setting or the planner is unknown.
+        DataError: The scenario has fewer than three iterations.
+        PlannerError: The planner returned something that cannot be executed.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        log = shiftsim.simulate(scenario, "idm", noise="ou-high")
+        ```
+    """
+    driver = load_planner(planner) if isinstance(planner, str) else planner
+    return loop.simulate(scenario, driver, setting, **changes)
+
+
+def open_store(name: str | Path) -> ScenarioStore:
+    """A store by name, path or URL; the demo store is made when it is not there yet.
+
+    Raises:
+        DataError: It is not there, or damaged.
+
+    Example:
+        ```python
+        store = shiftsim.open_store("demo")
+        scenario = store["03b23c"]  # a token, or its beginning
+        print(len(store), store.cities, scenario)
+        ```
+    """
+    return open_named_store(str(name))
+
+
+def _preformatted(text: str) -> str:
+    return f"<pre>{html.escape(text)}</pre>"
+
+
+def _picture_of(thing: Scenario | VectorMap) -> str:
+    """A scenario or a map as a picture; as text where matplotlib is missing."""
+    from shiftsim.errors import MissingExtraError
+    from shiftsim.view.still import overview, svg_of
+
+    try:
+        return f"{_preformatted(repr(thing))}{svg_of(overview(thing))}"
+    except MissingExtraError:
+        return _preformatted(repr(thing))
+
+
+def _table_of(log: SimulationLog) -> str:
+    """What can be said of a rollout without its map."""
+    driven = speeds(log.ego)
+    rows = {
+        "scenario": log.token,
+        "samples": len(log.ego),
+        "duration": f"{(log.time_us[-1] - log.time_us[0]) * 1e-6:.1f} s",
+        "speed": f"{driven.mean():.1f} m/s on average, {driven.max():.1f} m/s at most",
+        "tracks": log.tracks.num_tracks,
+        "noise": "yes" if log.noise.any() else "none",
+        "planning": f"{log.planning_seconds.mean() * 1e3:.2f} ms per step",
+    }
+    cells = (f"<tr><th>{name}</th><td>{html.escape(str(v))}</td></tr>" for name, v in rows.items())
+    return f"<table>{''.join(cells)}</table>"
+
+
+for _kind, _shown in (
+    (Scenario, _picture_of),
+    (VectorMap, _picture_of),
+    (SimulationLog, _table_of),
+):
+    setattr(_kind, "_repr_html_", _shown)  # noqa: B010

@@ -11,16 +11,28 @@ class ShiftsimError(Exception):
     """Base of all errors that a user can cause or repair.
 
     Attributes:
-        hint: One line that says what to do, shown below the message on the command line.
+        message: What is wrong, and where.
+        hint: One line that says what to do, may be empty; `str()` has both.
+
+    Example:
+        ```python
+        try:
+            shiftsim.run("idmm")
+        except shiftsim.ShiftsimError as error:
+            print(error.message, error.hint)
+        ```
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        super().__init__(_in_one_line(message))
-        self.hint = hint
+        self.message, self.hint = _in_one_line(message), hint
+        super().__init__(self.message)
+
+    def __str__(self) -> str:
+        return f"{self.message}\nhint: {self.hint}" if self.hint else self.message
 
     def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
         """Keep the hint when the error travels between processes."""
-        return type(self), (str(self), self.hint)
+        return type(self), (self.message, self.hint)
 
 
 def _in_one_line(message: str) -> str:
@@ -90,6 +102,26 @@ def one_of(what: str, value: str, choices: Iterable[str]) -> str:
     near = nearest(value, valid)
     hint = f"did you mean {near!r}? " if near else ""
     raise ConfigError(f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}")
+
+
+def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:
+    """The choice that is the text, or the only one that begins with it.
+
+    Raises:
+        ConfigError: There is none, or there are several; the hint names some.
+    """
+    valid = sorted(choices)
+    if text in valid:
+        return text
+    found = [choice for choice in valid if choice.startswith(text)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        such = f"such as {', '.join(found[:4])}"
+        raise ConfigError(f"{len(found)} {what}s of {where} begin with {text!r}", such)
+    near = nearest(text, valid) or next(iter(valid), "")
+    hint = f"did you mean {near!r}?" if near else f"{where} is empty"
+    raise ConfigError(f"{where} has no {what} {text!r}", hint)
 
 
 def nearest(value: str, choices: Iterable[str]) -> str:

@@ -20,7 +20,7 @@ from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.plausible import require_plausible, require_rows
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
-from shiftsim.errors import DataError
+from shiftsim.errors import DataError, beginning
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import STORE, require
 from shiftsim.world.scenario import Scenario
@@ -76,8 +76,19 @@ class ScenarioStore:
                 values = flat.flatten() if pa.types.is_list(field.type) else flat
                 require(STORE, field.name, values.to_numpy(zero_copy_only=False), where)
 
+    def __repr__(self) -> str:
+        return f"<ScenarioStore {self.path.name}: {len(self)} scenarios in {len(self.cities)} maps>"
+
     def __len__(self) -> int:
         return len(self.tokens)
+
+    def __getitem__(self, token: str) -> Scenario:
+        """The scenario of a token, or of an unambiguous beginning of one, as `read` gives it.
+
+        Raises:
+            ConfigError: There is no such scenario, or there are several.
+        """
+        return self.read(beginning(f"store {self.path.name!r}", "scenario", token, self.tokens))
 
     def __contains__(self, token: object) -> bool:
         return token in self._row_of

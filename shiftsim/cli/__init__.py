@@ -306,7 +306,9 @@ def _run(words: list[str], debug: bool) -> int:
     except ShiftsimError as error:
         if debug:
             raise
-        return _complain(str(error), error.hint, _DATA if isinstance(error, DataError) else _USAGE)
+        return _complain(
+            error.message, error.hint, _DATA if isinstance(error, DataError) else _USAGE
+        )
     except OSError as error:
         if debug:
             raise

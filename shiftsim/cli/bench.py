@@ -128,5 +128,5 @@ def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
     try:
         return figures(groups, allow_partial=allow_partial)
     except MissingExtraError as error:
-        say(f" no pictures: {error}; {error.hint}")
+        say(f" no pictures: {error.message}; {error.hint}")
         return []

@@ -200,7 +200,7 @@ def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
     try:
         return make_config(values | flags)
     except ConfigError as error:
-        raise ConfigError(f"{path or 'convert dsc3d'}: {error}", error.hint) from error
+        raise ConfigError(f"{path or 'convert dsc3d'}: {error.message}", error.hint) from error
 
 
 def _show_dsc3d(report: "ConversionReport") -> None:

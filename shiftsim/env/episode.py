@@ -93,7 +93,7 @@ class Episode:
         try:
             result = compute_metrics(self.log, self.scenario.map)
         except ShiftsimError as error:  # a task of a run would fail; training goes on
-            self.error = str(error)
+            self.error = error.message
             return {}
         found = {name: result.scores[name] for name in SHORT_NAMES if name != "score"}
         return {"cls": result.score, **{n: float(v) for n, v in found.items() if v is not None}}

@@ -35,7 +35,7 @@ def _statistics(run: Run, data: DataSet) -> StoreStats | str:
         held = set(store.tokens)
         return store_stats(store, [token for token in data.tokens if token in held])
     except DataError as error:
-        return str(error)
+        return error.message
 
 
 def data_statistics(found: Mapping[str, StoreStats | str]) -> Table | None:

@@ -5,7 +5,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.errors import ConfigError, nearest
+from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -42,7 +42,9 @@ def select_tasks(
     Raises:
         ConfigError: There is no such task, or several scenarios begin like that.
     """
-    full = _find_token(run, token)
+    full = beginning(
+        f"run {run.path.name!r}", "scenario", token, set(run.tasks["token"].to_pylist())
+    )
     wanted = {"planner": planner, "noise": noise, "seed": seed}
     rows = [
         row
@@ -105,24 +107,6 @@ def _partner(row: dict[str, Any]) -> str:
 
 def _key(row: dict[str, Any]) -> Task:
     return Task(*(row[name] for name in Task._fields))
-
-
-def _find_token(run: Run, token: str) -> str:
-    tokens = sorted(set(run.tasks["token"].to_pylist()))
-    if token in tokens:
-        return token
-    found = [known for known in tokens if known.startswith(token)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise ConfigError(
-            f"{len(found)} scenarios begin with {token!r}", hint=f"such as {', '.join(found[:4])}"
-        )
-    near = nearest(token, tokens) or next(iter(tokens), "")
-    raise ConfigError(
-        f"run {run.path.name!r} has no scenario {token!r}",
-        hint=f"did you mean {near!r}?" if near else "the run is empty",
-    )
 
 
 def explain_lines(task: dict[str, Any]) -> list[str]:

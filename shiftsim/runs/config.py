@@ -207,7 +207,7 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
             raise ConfigError("no planner", hint="name one, for example --planner idm")
         return RunConfig(**plain)
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}", hint=error.hint) from error
+        raise ConfigError(f"{where}: {error.message}", hint=error.hint) from error
 
 
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:

@@ -202,7 +202,7 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
         return TaskResult(
             task,
             FAILED,
-            error=kind + readable(error),
+            error=kind + readable(getattr(error, "message", error) if is_ours else error),
             hint=readable(getattr(error, "hint", "")) if is_ours else "",
             traceback=readable(traceback.format_exc()),
         )

@@ -33,6 +33,12 @@ class SimulationLog:
             (P = 11 at 0.1 s); NaN where a command was returned.
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
+
+    Example:
+        ```python
+        log = shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], "idm")
+        print(log.ego[-1, :2], log.commands[:, 0].min())
+        ```
     """
 
     token: str
@@ -48,6 +54,13 @@ class SimulationLog:
     plans: FloatArray
     planning_seconds: FloatArray
     degraded: BoolArray
+
+    def __repr__(self) -> str:
+        gone = np.hypot(*np.diff(self.ego[:, :2], axis=0).T).sum()
+        return (
+            f"<SimulationLog of {self.token}: {len(self.ego)} samples, {gone:.1f} m, "
+            f"{self.tracks.num_tracks} tracks>"
+        )
 
 
 def as_recorded(scenario: Scenario) -> SimulationLog:

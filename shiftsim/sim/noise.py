@@ -54,6 +54,13 @@ class NoiseModel:
         theta: Rate of return to zero of `ou` [1/s].
         function: The model of kind "custom".
         name: As in tables and on the command line; derived from the parameters when empty.
+
+    Example:
+        ```python
+        rough = shiftsim.NoiseModel("ou", sigma_accel=1.0, sigma_rate=0.2, name="rough")
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        log = shiftsim.simulate(scenario, "idm", noise=rough, seed=3)
+        ```
     """
 
     kind: str = "none"

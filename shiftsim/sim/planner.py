@@ -43,6 +43,12 @@ class SceneInfo:
         seed: Seed of the task; what a planner samples is keyed with it and the token.
         expert: The whole recording, future included; None unless the planner declares with
             `sees_recording = True` that it looks at it.
+
+    Example:
+        ```python
+        def reset(self, scene: shiftsim.SceneInfo):
+            self.lanes = [scene.map.blocks.index[name] for name in scene.route]
+        ```
     """
 
     map: VectorMap
@@ -56,6 +62,12 @@ class SceneInfo:
     seed: int = 0
     expert: Scenario | None = None
 
+    def __repr__(self) -> str:
+        return (
+            f"<SceneInfo {self.token}: map {self.map.name}, route of {len(self.route)} roadblocks, "
+            f"{len(self.times)} iterations of {self.dt:.1f} s>"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class History:
@@ -64,6 +76,9 @@ class History:
     time_us: IntArray  # (H,) time stamps [us]
     ego: FloatArray  # (H, 11) ego states, columns of `state.STATE_COLUMNS`
     tracks: Tracks  # tracks over the same H samples
+
+    def __repr__(self) -> str:
+        return f"<History: {len(self.ego)} samples, {self.tracks.num_tracks} tracks>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +90,23 @@ class Observation:
         time_us: Its log time stamp [us].
         history: The last samples, the present one included.
         lights: Traffic lights of this iteration (one row).
+
+    Example:
+        ```python
+        def plan(self, observation: shiftsim.Observation):
+            x, y, heading = observation.ego.pose
+            near = observation.tracks.poses[0, observation.tracks.valid[0]]
+            past = observation.history.ego[:, :3]
+        ```
     """
 
     iteration: int
     time_us: int
     history: History
     lights: TrafficLights
+
+    def __repr__(self) -> str:
+        return f"<Observation: iteration {self.iteration}, {self.ego!r}, {self.history!r}>"
 
     @property
     def ego(self) -> EgoState:
@@ -105,6 +131,19 @@ class Planner(Protocol):
     Optional are `close()`, `name`, `sees_recording` (True where it must be given the recording),
     and `degraded`: a text that says why the plan just returned is a fallback, empty when it is not.
     Such steps are counted, or fail a strict run.
+
+    Example:
+        ```python
+        class Coast:
+            def reset(self, scene):
+                pass
+
+            def plan(self, observation):
+                return shiftsim.Command(acceleration=-0.5, steering_rate=0.0)
+
+
+        print(shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], Coast()))
+        ```
     """
 
     def reset(self, scene: SceneInfo) -> None:

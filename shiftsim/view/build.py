@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from shiftsim.errors import ConfigError, DataError, nearest
+from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
@@ -90,16 +90,7 @@ class Gallery:
         Raises:
             ConfigError: There is none, or there are several.
         """
-        if text in self._tokens:
-            return text
-        found = [token for token in self._tokens if token.startswith(text)]
-        if len(found) == 1:
-            return found[0]
-        near = nearest(text, self._tokens)
-        raise ConfigError(
-            f"{len(found) or 'no'} scenarios with stored rollouts begin with {text!r}",
-            hint=f"did you mean {near!r}?" if near else f"such as {self.tokens[:3]}",
-        )
+        return beginning("the stored rollouts", "scenario", text, self._tokens)
 
     def tasks(self, token: str) -> list[Task]:
         """The rollouts that the page of a scenario shows.

@@ -26,6 +26,9 @@ class Page(str):
 
     __slots__ = ()
 
+    def __repr__(self) -> str:
+        return f"<Page: {len(self) / 1000:.0f} kB of HTML; .save(path) writes it>"
+
     def save(self, path: str | Path) -> Path:
         """Write the page to a file."""
         file = Path(path)
@@ -45,6 +48,13 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
 
     Raises:
         ValueError: There are no rollouts, or more than six.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        logs = {name: shiftsim.simulate(scenario, name) for name in ("idm", "log-future")}
+        shiftsim.show(scenario, **logs).save("replay.html")
+        ```
     """
     shown = [
         Shown(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)

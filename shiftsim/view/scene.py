@@ -17,6 +17,7 @@ from shiftsim.report.palette import planner_styles
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, PACIFICA, Tracks, speeds
 
@@ -76,7 +77,7 @@ def scene_fields(replay: Replay) -> Fields:
     Tracks are left out when every rollout carries its own.
     """
     origin = replay.origin
-    layers = map_lines(replay.scenario, replay.box)
+    layers = map_lines(replay.scenario.map, replay.scenario.route, replay.box)
     layers["lights"] = _light_lines(replay.scenario)
     fields: Fields = {}
     for name, lines in layers.items():
@@ -214,9 +215,10 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
 
 
-def map_lines(scenario: Scenario, box: FloatArray) -> dict[str, list[FloatArray]]:
+def map_lines(
+    road: VectorMap, route: Sequence[str], box: FloatArray
+) -> dict[str, list[FloatArray]]:
     """Rings (for even-odd filling) and lines of the map inside the box, by layer."""
-    road = scenario.map
     areas = {
         "drivable": road.drivable_areas,
         "walkway": road.walkways,
@@ -224,9 +226,9 @@ def map_lines(scenario: Scenario, box: FloatArray) -> dict[str, list[FloatArray]
         "stop": road.stop_polygons,
     }
     near = {name: (layer, indices_near(layer, box)) for name, layer in areas.items()}
-    blocks = {road.blocks.index[name] for name in scenario.route if name in road.blocks.index}
-    route = [block for block in indices_near(road.blocks, box) if block in blocks]
-    near["route"] = (road.blocks, route)
+    blocks = {road.blocks.index[name] for name in route if name in road.blocks.index}
+    on_route = [block for block in indices_near(road.blocks, box) if block in blocks]
+    near["route"] = (road.blocks, on_route)
     out = {
         name: _rings([layer.shape(index) for index in found], box)
         for name, (layer, found) in near.items()

@@ -1,18 +1,21 @@
 """Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
 
 from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.report.palette import new_figure, planner_styles, save_picture
-from shiftsim.view.scene import Replay, Shown, map_lines
+from shiftsim.sim.log import SimulationLog, as_recorded
+from shiftsim.view.scene import Shown, map_lines
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, AgentKind, Tracks, center_poses
+from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
 STILLS = (".pdf", ".png", ".svg")
 FILMS = (".mp4", ".gif")
@@ -41,29 +44,77 @@ def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: f
         ConfigError: The ending or the time is none of those possible.
         MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
     """
-    times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
     if path.suffix.lower() not in STILLS + FILMS:
         raise ConfigError(
             f"{str(path)!r} ends in {path.suffix!r}",
             hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
         )
-    if not 0.0 <= at <= times[-1] + 1e-9:
-        raise ConfigError(f"time {at} s is not within 0 … {times[-1]:.1f} s", hint="--at SECONDS")
-    figure, axes = _canvas(Replay(scenario, shown))
+    row = _sample_at(shown[0].log.time_us, at)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() in FILMS:
-        _film(path, figure, axes, shown)
-        return
-    row = int(np.argmin(np.abs(times - at)))
+        _film(path, *_driven(scenario, shown), shown)
+    else:
+        save_picture(_still(scenario, shown, row), path)
+
+
+def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
+    """A matplotlib figure of the moment `at` seconds from the start.
+
+    Raises:
+        ConfigError: There is no such time.
+        MissingExtraError: matplotlib is missing.
+    """
+    return _still(scenario, shown, _sample_at(shown[0].log.time_us, at))
+
+
+def overview(thing: Scenario | VectorMap) -> Any:
+    """A matplotlib figure of a scenario at its first iteration, or of a whole map.
+
+    Raises:
+        MissingExtraError: matplotlib is missing.
+    """
+    if isinstance(thing, VectorMap):
+        bounds = thing.edges.polygons.bounds
+        corners = np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
+        return _canvas(thing, (), corners)[0]
+    log = as_recorded(thing)
+    figure, axes = _driven(thing, ())
+    _recorded(axes, log, 0)
+    _draw_ego(axes, log, 0, _LOG)
+    _legend(axes)
+    _heading(axes, thing, 0.0)
+    return figure
+
+
+def svg_of(figure: Any) -> str:
+    """A figure as the text of an SVG element."""
+    out = StringIO()
+    figure.savefig(out, format="svg", metadata={"Date": None})
+    return out.getvalue().partition("<svg")[1] + out.getvalue().partition("<svg")[2]
+
+
+def _sample_at(time_us: IntArray, at: float) -> int:
+    times = (time_us - time_us[0]) * 1e-6
+    if not 0.0 <= at <= times[-1] + 1e-9:
+        raise ConfigError(f"time {at} s is not within 0 … {times[-1]:.1f} s", hint="--at SECONDS")
+    return int(np.argmin(np.abs(times - at)))
+
+
+def _still(scenario: Scenario, shown: Sequence[Shown], row: int) -> Any:
+    figure, axes = _driven(scenario, shown)
     _moment(axes, shown, row)
-    _heading(axes, scenario, float(times[row]))
-    save_picture(figure, path)
+    time_us = shown[0].log.time_us
+    _heading(axes, scenario, float(time_us[row] - time_us[0]) * 1e-6)
+    return figure
 
 
-def _canvas(replay: Replay) -> tuple[Any, Any]:
-    """Axes with the map, as large as the driven paths need."""
-    paths = [replay.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in replay.shown)]
-    points = np.concatenate(paths)
+def _driven(scenario: Scenario, shown: Sequence[Shown]) -> tuple[Any, Any]:
+    paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
+    return _canvas(scenario.map, scenario.route, np.concatenate(paths))
+
+
+def _canvas(road: VectorMap, route: Sequence[str], points: FloatArray) -> tuple[Any, Any]:
+    """Axes with the map, as large as the points (N, 2) need."""
     low, high = points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     half = np.maximum(half, half.max() * 0.5)  # never a mere strip
@@ -74,7 +125,7 @@ def _canvas(replay: Replay) -> tuple[Any, Any]:
         width, height = 7.0 * width / height, 7.0
     figure = new_figure(figsize=(max(width, 4.0), height + 0.9))
     axes = figure.subplots()
-    _draw_map(axes, map_lines(replay.scenario, extent))
+    _draw_map(axes, map_lines(road, route, extent))
     axes.set_xlim(extent[0], extent[2])
     axes.set_ylim(extent[1], extent[3])
     axes.set_aspect("equal")
@@ -114,10 +165,7 @@ def _heading(axes: Any, scenario: Scenario, time: float) -> None:
 def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
     """Everything that moves at one sample; returns what was drawn."""
     styles = planner_styles(item.planner for item in shown)
-    drawn = _draw_agents(axes, shown[0].log.tracks, row)
-    expert = shown[0].log.expert_ego
-    dotted = {"color": _LOG, "linewidth": 1, "linestyle": ":", "zorder": 4}
-    drawn += axes.plot(expert[:, 0], expert[:, 1], label="recorded driver", **dotted)
+    drawn = _recorded(axes, shown[0].log, row)
     for item in shown:
         style, ego = styles[item.planner], item.log.ego
         clean = item.noise == "none"
@@ -125,15 +173,26 @@ def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
         line = {"color": style.colour, "linewidth": 1.8, "linestyle": "-" if clean else (0, (5, 3))}
         mark = {"marker": style.marker, "markevery": (min(10, len(ego) - 1), 30)}
         drawn += axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=label, **line, **mark, **_MARKER)
-        pose, size = center_poses(ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
-        drawn += _draw_boxes(axes, pose, np.array(size), style.colour, zorder=7)
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
-    axes.legend(fontsize=8, frameon=False, **place)
+        drawn += _draw_ego(axes, item.log, row, style.colour)
+    _legend(axes)
     return drawn
 
 
-def _draw_agents(axes: Any, tracks: Tracks, row: int) -> list[Any]:
-    drawn: list[Any] = []
+def _legend(axes: Any) -> None:
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
+    axes.legend(fontsize=8, frameon=False, **place)
+
+
+def _draw_ego(axes: Any, log: SimulationLog, row: int, colour: str) -> list[Any]:
+    pose, size = center_poses(log.ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
+    return _draw_boxes(axes, pose, np.array(size), colour, zorder=7)
+
+
+def _recorded(axes: Any, log: SimulationLog, row: int) -> list[Any]:
+    """The others at one sample, and the recorded path of the ego."""
+    tracks, expert = log.tracks, log.expert_ego
+    dotted = {"color": _LOG, "linewidth": 1, "linestyle": ":", "zorder": 4}
+    drawn: list[Any] = axes.plot(expert[:, 0], expert[:, 1], label="recorded driver", **dotted)
     for kind in np.unique(tracks.kinds):
         there = tracks.valid[row] & (tracks.kinds == kind)
         colour = _AGENTS.get(AgentKind(int(kind)), _OTHER)

@@ -310,6 +310,9 @@ class Layer:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def __repr__(self) -> str:
+        return f"<Layer: {len(self)} objects>"
+
     def rings(self, index: int) -> list[FloatArray]:
         """Rings (V, 2) of one polygon, shell first, not closed [m]."""
         flat = self.polygons

@@ -79,6 +79,13 @@ class VectorMap:
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, item.name, sealed(value))
 
+    def __repr__(self) -> str:
+        connectors = len(self.edges) - self.num_lanes
+        return (
+            f"<VectorMap {self.name}: {self.num_lanes} lanes, {connectors} connectors, "
+            f"{len(self.crosswalks)} crosswalks>"
+        )
+
     def edge(self, edge_id: str) -> int:
         """Index of a lane or lane connector.
 

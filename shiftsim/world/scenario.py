@@ -32,6 +32,12 @@ class Scenario:
         mission_goal: (3,) goal x [m], y [m], heading [rad], or None.
         mapping: Duration [s], offset [s] and subsample ratio the scenario was cut with.
         is_short: Whether the log ended before the duration did.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        print(scenario.num_iterations, scenario.expert[:, :2], scenario.route)
+        ```
     """
 
     token: str
@@ -56,6 +62,13 @@ class Scenario:
                 object.__setattr__(self, name, sealed(array))
         object.__setattr__(self, "tracks", self.tracks.sealed())
         object.__setattr__(self, "traffic_lights", self.traffic_lights.sealed())
+
+    def __repr__(self) -> str:
+        times = self.iteration_times
+        return (
+            f"<Scenario {self.token}: {self.scenario_type} in {self.city}, "
+            f"{(times[-1] - times[0]) * 1e-6:.1f} s, {self.tracks.num_tracks} tracks>"
+        )
 
     @property
     def num_iterations(self) -> int:

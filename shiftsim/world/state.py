@@ -95,6 +95,13 @@ class Tracks:
         kinds: (N,) AgentKind codes.
         tokens: N stable ids, unique within the scenario. Order of tracks: as in the first row of
             the span, then by first appearance.
+
+    Example:
+        ```python
+        tracks = shiftsim.open_store("demo")["03b23c"].tracks
+        there = tracks.valid[0]
+        print(tracks, tracks.poses[0, there, :2], tracks.kinds[there])
+        ```
     """
 
     valid: BoolArray
@@ -106,6 +113,14 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.valid)
+
+    def __repr__(self) -> str:
+        codes, counts = np.unique(self.kinds, return_counts=True)
+        kinds = ", ".join(
+            f"{count} {AgentKind(code).name.lower()}"
+            for code, count in zip(codes.tolist(), counts.tolist(), strict=True)
+        )
+        return f"<Tracks: {len(self)} rows of {self.num_tracks} tracks{kinds and f' ({kinds})'}>"
 
     @property
     def num_tracks(self) -> int:
@@ -161,6 +176,9 @@ class TrafficLights:
     connector_ids: tuple[str, ...]  # C lane connector ids
     status: np.ndarray  # (T, C) LightStatus codes, int8; `ABSENT` where the connector is not listed
 
+    def __repr__(self) -> str:
+        return f"<TrafficLights: {len(self.status)} rows of {len(self.connector_ids)} connectors>"
+
     def rows(self, index: slice | IntArray) -> "TrafficLights":
         """The same connectors over other rows."""
         return TrafficLights(self.connector_ids, self.status[index])
@@ -190,10 +208,24 @@ class EgoState:
     Attributes:
         time_us: Time stamp [us].
         values: (11,) the columns named by `STATE_COLUMNS`, at the rear axle.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["03b23c"]
+        state = shiftsim.EgoState(0, scenario.ego[0])
+        print(state.pose, state.speed, state.steering_angle)
+        ```
     """
 
     time_us: int
     values: FloatArray
+
+    def __repr__(self) -> str:
+        x, y, heading = self.pose
+        return (
+            f"<EgoState: x {x:.2f} m, y {y:.2f} m, heading {heading:.3f} rad, "
+            f"{self.speed:.2f} m/s, at {self.time_us} us>"
+        )
 
     @property
     def pose(self) -> FloatArray:
@@ -233,6 +265,11 @@ class Command:
     Attributes:
         acceleration: Commanded longitudinal acceleration [m/s^2].
         steering_rate: Commanded rate of the steering angle [rad/s].
+
+    Example:
+        ```python
+        gentle_brake = shiftsim.Command(acceleration=-1.0, steering_rate=0.0)
+        ```
     """
 
     acceleration: float
@@ -249,11 +286,23 @@ class Trajectory:
         states: (H, 11) the columns of `STATE_COLUMNS`, rear axle. The LQR tracker reads the poses
             only; perfect tracking also reads velocities, accelerations and the steering angle.
         relative: Whether `time_us` counts from the moment of planning.
+
+    Example:
+        ```python
+        times = [0.1 * i for i in range(11)]
+        straight = [(5.0 * t, 0.0, 0.0) for t in times]  # in the frame of the map
+        plan = shiftsim.Trajectory.from_poses(times, straight)
+        ```
     """
 
     time_us: IntArray
     states: FloatArray
     relative: bool = False
+
+    def __repr__(self) -> str:
+        seconds = (self.time_us - (0 if self.relative else self.time_us[:1])) * 1e-6
+        span = f" over {seconds[-1]:.1f} s" if len(seconds) else ""
+        return f"<Trajectory: {len(seconds)} states{span}>"
 
     @staticmethod
     def from_poses(times: ArrayLike, poses: ArrayLike) -> "Trajectory":

@@ -1,6 +1,7 @@
 """Every block of every page runs as it stands; links, flags and tables of columns are right."""
 
 import importlib.util
+import inspect
 import itertools
 import json
 import os
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ from doc_pages import (
     table_below,
 )
 
+import shiftsim
 from shiftsim.benchmarks import load_track
 from shiftsim.data.deepplan.states import resample
 from shiftsim.data.deepplan.windows import find_runs
@@ -46,6 +49,7 @@ from shiftsim.runs.results import TABLES
 DOCS = REPOSITORY / "docs"
 BLOCKS = [block for page in PAGES for block in read_blocks(page)]
 MOST_NOT_RUN = 10
+EXAMPLE = re.compile(r"Example:\n +```python\n(.*?)\n +```", re.S)
 NEEDS = {  # of extras and of the dependency group `docs`
     "learned_planners": ("torch", "safetensors"),
     "training": ("gymnasium",),
@@ -148,6 +152,14 @@ def test_every_block_runs_as_it_stands(page: Path, desk: Path) -> None:
     for block in read_blocks(page):
         if not block.reason and (block.kind in (*RUN, *SHOWN) or block.file):
             session.do(block)
+
+
+@pytest.mark.thorough
+def test_the_example_of_every_public_name_runs(desk: Path) -> None:
+    for name in ("run", "Run", *shiftsim.__all__):  # `Run` writes what `open_run` reads
+        found = EXAMPLE.search(inspect.getdoc(getattr(shiftsim, name)) or "")
+        assert found, name
+        exec(dedent(found[1]), {"shiftsim": shiftsim})
 
 
 def test_tracks_and_a_map_become_scores_in_fifty_lines() -> None:

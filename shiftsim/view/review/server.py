@@ -131,7 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
             with self.server.turn:
                 answer = request(self.server.service)
         except ShiftsimError as error:
-            self._refuse(HTTPStatus.BAD_REQUEST, f"{error} {error.hint}".strip())
+            self._refuse(HTTPStatus.BAD_REQUEST, f"{error.message} {error.hint}".strip())
         except OSError as error:
             self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"not kept: {error.strerror or error}")
         else:
