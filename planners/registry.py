@@ -12,13 +12,13 @@ import logging
 import pickle
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
-from shiftsim.files import import_named
+from shiftsim.files import import_named, place_of
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
 from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
@@ -26,17 +26,6 @@ from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
 # planners of another interface: prefix -> module with install() and factory(class)
 _ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
 _WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
-# what constructors of users' planners are likely to raise
-_CANNOT_MAKE = (
-    TypeError,
-    ValueError,
-    AttributeError,
-    LookupError,
-    RuntimeError,
-    OSError,
-    ImportError,
-    SystemExit,
-)
 _NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedError, RuntimeError)
 
 
@@ -45,7 +34,8 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
 
     Args:
         spec: Registered name, or `package.module:Class` of a custom planner, which may lie in the
-            current directory; with `nuplan:` before it where it is written for nuPlan.
+            current directory, or `file.py:Class`; with `nuplan:` before it where it is written for
+            nuPlan.
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
     A learned planner without a `checkpoint` takes its published file from the folder of
@@ -57,9 +47,24 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
         MissingExtraError: A learned planner needs PyTorch.
     """
     factory = planner_factory(spec)
-    planner = factory(**_bind(spec, factory, arguments or {}))
+    values = _bind(spec, factory, arguments or {})
+    planner = _made(spec, lambda: factory(**values))
     _require_methods(spec, planner)
     return cast(Planner, planner)
+
+
+def _made(name: str, make: Callable[[], Any]) -> Any:
+    try:
+        return make()
+    except ShiftsimError:
+        raise
+    except (Exception, SystemExit) as error:  # of users' code
+        where = place_of(error)
+        raise ConfigError(
+            f"planner {name!r} cannot be made: {type(error).__name__}: {readable(error)}"
+            f"{where and f' ({where})'}",
+            hint="check its constructor, and its arguments with --planner-arg key=value",
+        ) from error
 
 
 def planner_factory(spec: str) -> Any:
@@ -82,11 +87,12 @@ def planner_factory(spec: str) -> Any:
     entry = PLANNERS.get(spec)
     if entry is None and ":" not in spec:
         one_of("planner", spec, PLANNERS)
-    module_name, _, attribute = (spec if entry is None else entry.target).partition(":")
-    if not module_name or not attribute.isidentifier():
+    module_name, _, attribute = (spec if entry is None else entry.target).rpartition(":")
+    in_file = module_name.endswith(".py")
+    if not module_name or not attribute.isidentifier() or (":" in module_name and not in_file):
         raise ConfigError(
-            f"planner {spec!r} is not of the form package.module:Class",
-            hint="for example my_package.my_module:MyPlanner",
+            f"planner {spec!r} is not of the form package.module:Class or file.py:Class",
+            hint="for example my_package.my_module:MyPlanner, or ./my_file.py:MyPlanner",
         )
     try:
         module = import_named(module_name)
@@ -193,15 +199,7 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     else:
         fingerprint = _object_fingerprint(source, arguments)
     found = RunPlanner(name, source, arguments, fingerprint)
-    try:
-        planner = found.make()
-    except ShiftsimError:
-        raise
-    except _CANNOT_MAKE as error:
-        raise ConfigError(
-            f"planner {name!r} cannot be made: {type(error).__name__}: {error}",
-            hint="check its arguments with --planner-arg key=value",
-        ) from error
+    planner = _made(name, found.make)
     _require_methods(name, planner)
     close_planner(planner)
     if not hasattr(source, "identify") and sees_recording(planner):

@@ -172,9 +172,10 @@ def _alone(hello: Any) -> Any:
     ours: Any = types.ModuleType("shiftsim")
     ours.Trajectory, ours.Command = Trajectory, Command
     sys.modules["shiftsim"] = ours
-    sys.path.append(os.getcwd())
-    module_name, _, name = hello["spec"].partition(":")
-    module: Any = importlib.import_module(module_name)
+    module_name, _, name = hello["spec"].rpartition(":")
+    folder, file = os.path.split(module_name) if module_name.endswith(".py") else ("", module_name)
+    sys.path.append(os.path.abspath(folder))
+    module: Any = importlib.import_module(file.removesuffix(".py"))
     kind = getattr(module, name)
     with open(module.__file__, "rb") as file:
         digest = hashlib.sha256(file.read()).hexdigest()

@@ -11,6 +11,7 @@ import os
 import re
 import sys
 import tomllib
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -168,21 +169,74 @@ def fresh_python(command: str, *words: str) -> tuple[list[str], dict[str, str]]:
     return [sys.executable, "-P", "-c", command, *words], {**os.environ, "PYTHONPATH": paths}
 
 
-def import_named(module: str) -> ModuleType:
-    """A module by its name; one that the user has named may lie in the current folder.
+_IMPORTING: list[str] = []  # modules of the user that are being imported
 
-    Nothing else is ever imported from there: a stray file is not code.
+
+def import_named(module: str) -> ModuleType:
+    """A module by its name, or by its file, `folder/name.py`.
+
+    One that the user has named may lie in the current folder. Nothing else is ever imported from
+    there: a stray file is not code.
 
     Raises:
-        ImportError: There is none, or it ends the process.
+        ImportError: There is none, it fails, or it ends the process.
+        ConfigError: It starts a run.
     """
-    own = not module.startswith("shiftsim.")
-    if own and (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)
+    name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
+    own = not name.startswith("shiftsim.")
+    if own and str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    _IMPORTING.append(module)
     try:
-        return import_module(module)
+        found = import_module(name)
+    except (ImportError, ConfigError):
+        raise
     except SystemExit as error:  # else the command would end as if all were well
-        raise ImportError(f"it leaves with SystemExit: {error.code}", name=module) from error
+        raise ImportError(f"it leaves with SystemExit: {error.code}", name=name) from error
+    except Exception as error:
+        where = place_of(error)
+        text = f"{type(error).__name__}: {error}{where and f' ({where})'}"
+        raise ImportError(text, name=name) from error
+    finally:
+        _IMPORTING.pop()
+    if module.endswith(".py") and not Path(module).samefile(found.__file__ or ""):
+        raise ImportError(f"{name!r} is the name of {found.__file__}; rename the file", name=name)
+    return found
+
+
+def _module_of(file: Path) -> tuple[str, Path]:
+    """The name of the module in a file, and the folder that it is imported from."""
+    if not file.is_file():
+        raise ImportError(f"there is no file {str(file)!r}")
+    folder, name = file.resolve().parent, file.stem
+    while (folder / "__init__.py").is_file():
+        folder, name = folder.parent, f"{folder.name}.{name}"
+    return name, folder
+
+
+def require_no_import() -> None:
+    """Refuse to start a run from a module that is being imported for one.
+
+    Raises:
+        ConfigError: There is such a module.
+    """
+    if _IMPORTING:
+        raise ConfigError(
+            f"{_IMPORTING[-1]!r} starts a run while it is imported",
+            hint="put what is to run as a script below: if __name__ == '__main__':",
+        )
+
+
+def place_of(error: BaseException) -> str:
+    """File and line of users' code that an error comes from; empty where there is none."""
+    libraries = (str(PACKAGE), os.path.dirname(os.__file__), "<")
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [
+        f"{frame.filename}:{frame.lineno}"
+        for frame in frames
+        if not (frame.filename.startswith(libraries) or "site-packages" in frame.filename)
+    ]
+    return own[-1] if own else ""
 
 
 def load_attribute(what: str, name: str, hint: str) -> Any:
@@ -191,7 +245,7 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
     Raises:
         ConfigError: It cannot be imported.
     """
-    module, _, attribute = name.partition(":")
+    module, _, attribute = name.rpartition(":")
     try:
         return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:

@@ -113,7 +113,7 @@ def test_a_run_explains_and_plots_a_scenario(run, scenario, tmp_path):
     assert scenario.token in text
     assert "CLS" in text
     assert repr(text) == text
-    with pytest.raises(shiftsim.ShiftsimError, match="no task"):
+    with pytest.raises(shiftsim.ShiftsimError, match="no task with planner idm, scenario"):
         run.explain(scenario.token, planner="idm")
     run.plot(scenario.token, at=1.0).savefig(tmp_path / "scene.png")
     assert (tmp_path / "scene.png").stat().st_size > 5000

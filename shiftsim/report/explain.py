@@ -11,6 +11,7 @@ from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
 _COLLISIONS = "no_ego_at_fault_collisions"
+_HAS = ("planners", "noise", "seeds")
 _UNITS = {  # nuPlan's names, shortened
     "meters": "m",
     "seconds": "s",
@@ -53,9 +54,12 @@ def select_tasks(
     ]
     if not rows:
         config = run.manifest["config"]
+        given = ", ".join(
+            f"{n} {v}" for n, v in {**wanted, "scenario": full}.items() if v is not None
+        )
         raise ConfigError(
-            f"run {run.path.name!r} has no task planner={planner} noise={noise} seed={seed}",
-            hint=f"planners {config['planners']}, noise {config['noise']}, seeds {config['seeds']}",
+            f"run {run.path.name!r} has no task with {given}",
+            hint="; ".join(f"{n}: {', '.join(map(str, config[n]))}" for n in _HAS),
         )
     scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}

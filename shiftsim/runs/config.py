@@ -20,20 +20,28 @@ Value: TypeAlias = bool | int | float | str | list[Any]
 
 DEFAULT_STORE = "demo"
 MAX_SEED = 2**63 - 1
+MAX_SEEDS = 10_000  # of one range
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Seeds as given on the command line, such as `0,1,2`.
+    """Seeds as given on the command line, such as `0,1,2` or `0-2`.
 
     Raises:
         ConfigError: They are no integers.
     """
+    seeds: list[int] = []
     try:
-        return [int(word) for word in text.split(",")]
+        for word in text.split(","):
+            first, dash, last = word.partition("-")
+            span = range(int(first), int(last) + 1) if dash and first else [int(word)]
+            if len(span) > MAX_SEEDS:
+                raise ConfigError(f"seeds {text!r} are more than {MAX_SEEDS}")
+            seeds += span
     except ValueError as error:
         raise ConfigError(
-            f"seeds {text!r} are not integers", hint="for example --seeds 0,1,2"
+            f"seeds {text!r} are not integers", hint="for example --seeds 0,1,2 or --seeds 0-2"
         ) from error
+    return seeds
 
 
 def parse_workers(text: str) -> int:
@@ -80,7 +88,9 @@ class RunConfig:
     noise: tuple[str, ...] = _setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
-    seeds: tuple[int, ...] = _setting((0,), "Noise seeds, such as 0,1,2. [0]", parse=parse_seeds)
+    seeds: tuple[int, ...] = _setting(
+        (0,), "Noise seeds, such as 0,1,2 or 0-2. [0]", parse=parse_seeds
+    )
     store: str = _setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
     split: str = _setting("", "Name or file (.toml, .txt). [whole store]")
     limit: int = _setting(0, "Only the first N scenarios.", least=0)

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -28,6 +29,9 @@ _ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
 _EARLIER_JOURNAL = "unfinished.jsonl"
 _MAX_MESSAGE = 600  # characters
+_DIGEST = re.compile("[0-9a-f]{16,64}")
+_NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
+_DIGESTS = ("store", "tokens", "filter", "review", "code")
 # on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
 _BYTES_PER_TASK = 6e3
 _BYTES_PER_ROLLOUT = 70e3
@@ -168,11 +172,27 @@ def difference(manifest: dict[str, Any], determining: dict[str, Any], shard: str
     names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
     if not names:
         return ""
-    old, new = before.get(names[0]), after.get(names[0])
+    first = _in_words(names[0], before.get(names[0]), after.get(names[0]))
+    shown = ", ".join(_NAMES.get(name, name) for name in names)
+    return f"{shown} differ{first and f' ({first})'}"
+
+
+def _in_words(name: str, old: Any, new: Any) -> str:
+    """How one setting differs; empty for digests, which say nothing."""
     if isinstance(old, dict) and isinstance(new, dict):
-        inner = next(n for n in sorted({*old, *new}, key=str) if old.get(n) != new.get(n))
-        old, new = {inner: old.get(inner)}, {inner: new.get(inner)}
-    return f"{', '.join(names)} differ ({names[0]}: {old!r}, not {new!r})"
+        if old.keys() == new.keys():
+            inner = next(key for key in old if old[key] != new[key])
+            return _in_words(f"{name} {inner}", old[inner], new[inner])
+        old, new = list(old), list(new)
+    if any(isinstance(value, str) and _DIGEST.fullmatch(value) for value in (old, new)):
+        return "" if name in _DIGESTS else f"{name} is another"
+    return f"{name}: {_value(old)}, not {_value(new)}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return "none" if value in (None, "", {}) else str(value)
 
 
 def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "") -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from shiftsim import __version__
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.files import require_no_import
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.isolated import Isolated
 from shiftsim.planners.registry import (
@@ -85,6 +86,7 @@ def prepare(
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.
     """
+    require_no_import()
     # `all` stands for the seven of the benchmark
     names = [
         name for given in config.noise for name in (NOISE_NAMES if given == "all" else [given])

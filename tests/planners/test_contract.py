@@ -1,6 +1,8 @@
 """Each broken planner breaks one rule; the check must name that rule, and only that one."""
 
 import re
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +103,20 @@ class Beside(Straight):
         return super().poses(x, y + 3.0, heading, speed)
 
 
+class FailsLater(Straight):
+    def plan(self, observation):
+        if observation.iteration == 30:
+            return super().poses(np.nan, 0.0, 0.0, 1.0)
+        return super().plan(observation)
+
+
+class InDegrees(Straight):
+    def poses(self, x, y, heading, speed):
+        plan = super().poses(x, y, heading, speed)
+        plan.states[5:, 2] = 90.0
+        return plan
+
+
 class Backwards(Straight):
     def poses(self, x, y, heading, speed):
         return super().poses(x, y, heading + np.pi, speed)
@@ -144,11 +160,27 @@ class BadCommand(Straight):
         return Command(float("inf"), 0.0)
 
 
+class Choosy(Straight):
+    def reset(self, scene):
+        self.works = scene.token != "other"
+
+    def poses(self, x, y, heading, speed):
+        return super().poses(x if self.works else np.nan, y, heading, speed)
+
+
+class Slow(Straight):
+    def plan(self, observation):
+        time.sleep(0.11 if observation.iteration % 10 == 5 else 0.0)
+        return super().plan(observation)
+
+
 BROKEN = [
     (NeedsArgument, "error", "constructor", "missing 1 required"),
     (NoReset, "error", "methods", "no method reset"),
     (FailsInReset, "error", "runs", r"reset\(\) failed: RuntimeError: no weights"),
     (FailsInPlan, "error", "runs", "at iteration 0 failed: KeyError: 'lane'"),
+    (FailsLater, "error", "finite", "iteration 30: x of state 0 is nan"),
+    (InDegrees, "warning", "heading", "90.0 rad, more than a full turn"),
     (ReturnsPoses, "error", "type", "returned ndarray"),
     (WrongShape, "error", "shapes", r"float64 \(81, 3\)"),
     (RepeatsATime, "error", "times", "not after time 1"),
@@ -177,6 +209,24 @@ def test_a_broken_rule_is_named_with_a_remedy(planner, severity, check, message)
     assert bad[check].severity == severity
     assert bad[check].hint
     assert re.search(message, bad[check].message), bad
+
+
+def test_an_exception_is_named_with_its_line():
+    (found,) = check_planner(FailsInPlan, cruise_scenario())
+    line = FailsInPlan.plan.__code__.co_firstlineno + 1
+    assert found.message.endswith(f"({__file__}:{line})")
+
+
+def test_a_planner_that_fails_on_another_scenario_only_is_named_with_it():
+    other = replace(cruise_scenario(), token="other")
+    found = [f for f in check_planner(Choosy, cruise_scenario(), other) if f.check == "finite"]
+    assert found[0].message.startswith("scenario other, iteration 0")
+
+
+def test_slow_plans_are_told_with_their_share():
+    (found,) = check_planner(Slow(), cruise_scenario(iterations=31))
+    assert (found.severity, found.check) == ("warning", "run time")
+    assert "10% of the plans take longer than the 100 ms" in found.message
 
 
 def test_a_good_planner_gets_its_run_time_only():

@@ -64,6 +64,44 @@ def test_what_cannot_be_loaded_says_why(own_module, spec, arguments, message):
         load_planner(spec, arguments)
 
 
+def test_a_planner_may_be_named_by_its_file(own_module, tmp_path):
+    for spec in ("./own_planner_module.py:Own", f"{own_module}:Own"):
+        assert load_planner(spec, {"gain": 2}).values == (2, False, None, "a")
+    package = tmp_path / "made" / "inner"
+    package.mkdir(parents=True)
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    (package / "gain.py").write_text("GAIN = 5.0")
+    text = OWN.replace("gain: float = 1.0", "gain: float = GAIN")
+    (package / "mine.py").write_text(f"from .gain import GAIN\n{text}")
+    assert load_planner("made/inner/mine.py:Own").values[0] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import shiftsim\nshiftsim.run('idm')", "starts a run while it is imported"),
+        ("x = 1\nlanes = {}\nlanes['no']", r"KeyError: 'no' \(.*own_planner_module.py:3\)"),
+        ("def f(:", "SyntaxError: invalid syntax"),
+        (OWN.replace("self.values =", "len(gain);"), r"cannot be made: TypeError: .*module.py:6\)"),
+    ],
+)
+def test_a_module_that_fails_is_one_clear_line(own_module, text, message):
+    own_module.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_planner("./own_planner_module.py:Own")
+    assert caught.value.hint
+    assert "\n" not in caught.value.message
+
+
+def test_a_file_with_the_name_of_a_module_must_be_renamed(tmp_path):
+    (tmp_path / "json.py").write_text(OWN)
+    with pytest.raises(ConfigError, match="rename the file"):
+        load_planner(f"{tmp_path / 'json.py'}:Own")
+    with pytest.raises(ConfigError, match="there is no file"):
+        load_planner(f"{tmp_path / 'jason.py'}:Own")
+
+
 def test_texts_become_what_the_constructor_asks_for(own_module):
     texts = {"gain": "2", "loud": "true", "steps": "3", "note": "7"}
     assert load_planner("own_planner_module:Own", texts).values == (2.0, True, 3, "7")

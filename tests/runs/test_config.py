@@ -7,7 +7,7 @@ import pytest
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import read_toml, store_path
-from shiftsim.runs.config import make_config, parse_argument
+from shiftsim.runs.config import make_config, parse_argument, parse_seeds
 
 GOOD = {"planners": ["idm", "my.module:Mine"], "noise": ["ou-high"], "seeds": [0, 2]}
 
@@ -90,3 +90,12 @@ def test_stores_are_found_by_name_or_path(tmp_path, monkeypatch):
 def test_more_than_any_machine_has_is_refused(setting):
     with pytest.raises(ConfigError, match="it must be within"):
         make_config({"planners": ["idm"], **setting})
+
+
+def test_seeds_are_numbers_or_ranges():
+    assert parse_seeds("0,1,2") == [0, 1, 2]
+    assert parse_seeds("0-2,7") == [0, 1, 2, 7]
+    assert parse_seeds("-1") == [-1]  # which a configuration refuses
+    for text in ("a", "1-", "1-b", "", "1,,2", "0-99999999"):
+        with pytest.raises(ConfigError, match="seeds"):
+            parse_seeds(text)

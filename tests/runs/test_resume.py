@@ -132,7 +132,7 @@ def test_an_unfinished_run_is_not_overwritten_by_chance(stopped, toy):
         ({"seeds": [0, 2]}, "seeds"),
         ({"thresholds": "deepplan"}, "thresholds"),
         ({"traffic": "reactive"}, "traffic"),
-        ({"limit": 3}, "tokens"),
+        ({"limit": 3}, "scenarios"),
         ({"planners": ["log-future"]}, "planners"),
         ({"strict": True}, "strict"),
         ({"shard": "1/2"}, "shard"),
