@@ -58,6 +58,7 @@ def plan_bench(
         ShiftsimError: A setting is wrong, or something is missing.
     """
     values = dict(settings)
+    resumes = values.pop("resume", False)
     modes = [values.pop("traffic")] if values.get("traffic") else list(track.traffic)
     if "store" not in values and "split" not in values:
         values |= {"store": DEFAULT_STORE, "split": DEFAULT_SPLIT}
@@ -68,6 +69,11 @@ def plan_bench(
         rules = {"store": store, "split": split, "thresholds": track.reference.thresholds}
         sets[track.reference.name] = values | rules
     folder = Path(out) if out else RUNS / _name(track, sets)
+    if resumes and not (folder / MANIFEST).is_file():
+        raise ConfigError(
+            f"there is no benchmark to go on with at {str(folder)!r}",
+            hint="name its folder with --out, or begin without --resume",
+        )
     _check_folder(folder, track)
     runs = {}
     for name, traffic in product(sets, modes):
@@ -181,6 +187,25 @@ def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra
         return [coverage(track, groups) for track in dict.fromkeys(tracks)]
 
     return runs, own, extra
+
+
+def paired_runs(first: Path, second: Path) -> list[tuple[Run, Run]]:
+    """Two run folders, or the runs of two benchmarks that have the same name.
+
+    Raises:
+        ShiftsimError: A folder is neither, or there is no such pair.
+    """
+    ours, theirs = (open_runs([folder])[0] for folder in (first, second))
+    if len(ours) == len(theirs) == 1:
+        return [(ours[0], theirs[0])]
+    named = {run.path.name: run for run in theirs}
+    pairs = [(run, named[run.path.name]) for run in ours if run.path.name in named]
+    if not pairs:
+        raise ConfigError(
+            f"{str(first)!r} and {str(second)!r} have no run of the same name",
+            hint=f"there are {', '.join(run.path.name for run in ours)}; {', '.join(named)}",
+        )
+    return pairs
 
 
 def _read_manifest(folder: Path) -> dict[str, Any] | None:

@@ -21,7 +21,7 @@ _MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustn
 
 
 _SETTINGS = """planners store split checkpoints planner_args seeds noise traffic controller limit
-device batch_size strict workers timeout executor scheduler retry_failed out save_rollouts
+device batch_size strict workers timeout executor scheduler resume retry_failed out save_rollouts
 allow_partial""".split()
 
 
@@ -32,6 +32,7 @@ allow_partial""".split()
     seeds="Only these, such as 0,1; the result is partial.",
     noise="Only these; the result is partial.",
     traffic="Only this mode; the result is partial.",
+    resume="Only go on with what is there, as the same command does anyway.",
     retry_failed="Do again what failed before.",
 )
 def bench(

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from shiftsim.report.tables import Table
     from shiftsim.runs.results import Run
 
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
+_WORST = 10
+RunFolder = Annotated[
+    Path, typer.Argument(metavar="RUN", help="A run folder, or that of a benchmark.")
+]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders.")]
 
 
@@ -143,7 +146,10 @@ def _say_worst(runs: "Sequence[Run]", count: int) -> None:
 
 def explain(
     source: RunFolder,
-    token: Annotated[str, typer.Argument(help="Scenario token, or its beginning.")],
+    token: Annotated[
+        str | None,
+        typer.Argument(metavar="[TOKEN]", help="Scenario, or its beginning. [the worst ten]"),
+    ] = None,
     planner: Annotated[str | None, typer.Option(help="Only this planner.")] = None,
     noise: Annotated[str | None, typer.Option(help="Only this noise.")] = None,
     seed: Annotated[int | None, typer.Option(help="Only this seed.")] = None,
@@ -151,31 +157,52 @@ def explain(
     debug: Debug = False,
 ) -> None:
     """Why a rollout has its score, or why a task failed."""
-    from shiftsim.report.explain import explain_lines, select_tasks
-    from shiftsim.runs.results import open_run
+    from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.report.explain import explain_lines, explain_tasks
+    from shiftsim.report.scores import worst_rollouts
 
-    run = open_run(source)
-    chosen = select_tasks(run, token, planner=planner, noise=noise, seed=seed)
-    if as_json:
-        say_json(chosen)
+    runs, *_ = open_runs([source])
+    if token is None:
+        if as_json:
+            say_json({run.path.name: worst_rollouts(run, _WORST) for run in runs})
+            return
+        _say_worst(runs, _WORST)
+        say(f"\nwhy: shiftsim explain {source} TOKEN")
         return
-    for number, task in enumerate(chosen):
-        if number:
-            say()
-        for line in explain_lines(task):
-            say(line)
+    chosen = explain_tasks(runs, token, planner=planner, noise=noise, seed=seed)
+    if as_json:
+        tasks = [task for found in chosen.values() for task in found]
+        say_json(tasks)
+        return
+    for name, tasks in chosen.items():
+        if len(runs) > 1:
+            say(f"{name}\n")
+        for task in tasks:
+            for line in (*explain_lines(task), ""):
+                say(line)
 
 
 def diff(
-    first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run folder.")],
+    first: Annotated[
+        Path, typer.Argument(metavar="RUN_A", help="A run folder, or that of a benchmark.")
+    ],
     second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
     limit: Annotated[int, typer.Option(help="Look into the N largest changes.")] = 10,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
+    from shiftsim.benchmarks.bench import paired_runs
     from shiftsim.runs.diff import diff_lines, diff_runs
-    from shiftsim.runs.results import open_run
 
-    found = diff_runs(open_run(first), open_run(second), limit=limit)
-    cli.show(found.to_dict(), diff_lines(found), as_json=as_json)
+    pairs = paired_runs(first, second)
+    found = [diff_runs(one, other, limit=limit) for one, other in pairs]
+    if as_json:
+        values = [pair.to_dict() for pair in found]
+        say_json(values[0] if len(pairs) == 1 else values)
+        return
+    for (run, _), pair in zip(pairs, found, strict=True):
+        if len(pairs) > 1:
+            say(f"\n{run.path.name}")
+        for line in diff_lines(pair):
+            say(line)

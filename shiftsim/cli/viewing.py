@@ -1,16 +1,20 @@
 """Commands that show: view, plot, inspect."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
+from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:
     from shiftsim.view.build import Gallery
 
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
+RunFolder = Annotated[
+    Path, typer.Argument(metavar="RUN", help="A run folder, or that of a benchmark.")
+]
 Others = Annotated[
     list[Path] | None,
     typer.Option("--with", help="Another run on the same store, shown together; repeatable."),
@@ -51,10 +55,10 @@ def view(
     from shiftsim.files import below
     from shiftsim.view.build import page_name, write_site
 
-    gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
+    found = _galleries([run, *(others or ())], planner, noise, seed, store)
     folder = out or below(run, "view")
     if token is not None:
-        token = gallery.find(token)
+        gallery, token = _holding(found, token)
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / page_name(token)
         gallery.page(token).save(page)
@@ -62,12 +66,12 @@ def view(
         with progress_bar(quiet=quiet) as advance:
             count = write_site(
                 folder,
-                [gallery],
+                found,
                 title=f"Replays of {run.name}",
                 limit=limit,
                 on_progress=lambda done, total: advance(done, total, ""),
             )
-        left = len(gallery.tokens) - count
+        left = sum(len(gallery.tokens) for gallery in found) - count
         say(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")
         page = folder / "index.html"
     say(f"written: {page}")
@@ -92,8 +96,8 @@ def plot(
     """The driven paths of several rollouts over the map, as a still or a film."""
     from shiftsim.view.still import save_figure
 
-    gallery = _gallery([run, *(others or ())], planner, noise, seed, store)
-    token = gallery.find(token)
+    found = _galleries([run, *(others or ())], planner, noise, seed, store)
+    gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
     save_figure(out, scenario, gallery.shown(token, scenario), at=at)
     say(f"written: {out}")
@@ -127,21 +131,30 @@ def inspect(
             say()
 
 
-def _gallery(
-    runs: list[Path],
+def _galleries(
+    folders: list[Path],
     planner: list[str] | None,
     noise: list[str] | None,
     seed: list[int] | None,
     store: str | None,
-) -> "Gallery":
-    from shiftsim.runs.results import open_run
+) -> "list[Gallery]":
+    """The rollouts of runs and benchmarks, one gallery for each store."""
+    from shiftsim.benchmarks.bench import open_runs
     from shiftsim.runs.scenarios import open_run_store
-    from shiftsim.view.build import Choice, Gallery
+    from shiftsim.view.build import Choice, galleries
 
-    opened = [open_run(path) for path in runs]
-    found = open_run_store(opened[0], store)
+    runs, *_ = open_runs(folders)
     choice = Choice(tuple(planner or ()), tuple(noise or ()), tuple(seed or ()))
-    return Gallery(opened, found, choice)
+    return galleries(runs, [open_run_store(run, store) for run in runs], choice)
+
+
+def _holding(found: "list[Gallery]", token: str) -> "tuple[Gallery, str]":
+    """The gallery that holds a scenario, and its whole token."""
+    *others, last = found
+    for gallery in others:
+        with suppress(ConfigError):
+            return gallery, gallery.find(token)
+    return last, last.find(token)
 
 
 def _show(address: str) -> None:

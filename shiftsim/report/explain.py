@@ -1,5 +1,6 @@
 """Why a rollout has its score: every metric, its value, threshold and first violation."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import pyarrow as pa
@@ -73,6 +74,25 @@ def select_tasks(
         cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
         out.append({**row, "cls": cls, "why": why(cls, known), "metrics": known})
     return out
+
+
+def explain_tasks(
+    runs: Sequence[Run], token: str, **wanted: Any
+) -> dict[str, list[dict[str, Any]]]:
+    """The tasks of one scenario, as `select_tasks` gives them, by the name of their run.
+
+    Raises:
+        ConfigError: None of the runs has such a task.
+    """
+    found: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        try:
+            found[run.path.name] = select_tasks(run, token, **wanted)
+        except ConfigError as error:
+            refused = error
+    if not found:
+        raise refused
+    return found
 
 
 def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:

@@ -69,6 +69,34 @@ def test_the_same_command_again_keeps_what_is_there(place):
     assert (place / "runs/b/own-nonreactive/scores.parquet").stat().st_mtime_ns == before
 
 
+def test_the_folder_of_a_benchmark_is_shown_explained_plotted_and_compared(place):
+    worst = call(place, "explain", "runs/b")
+    assert worst.returncode == 0, worst.stderr
+    assert "worst of own-nonreactive" in worst.stdout
+    assert "worst of own-reactive" in worst.stdout
+    token = shiftsim.open_run(place / "runs/b/own-reactive").worst(1)[0]["token"]
+    why = call(place, "explain", "runs/b", token, "--noise", "none")
+    assert why.stdout.count(f"{token}  free  constant-velocity none") == 2
+    plotted = call(place, "plot", "runs/b", token, "--out", "both.png")
+    assert plotted.returncode == 0, plotted.stderr
+    assert (place / "both.png").is_file()
+    viewed = call(place, "view", "runs/b", "--no-open", "--out", "pages", "--quiet")
+    assert viewed.returncode == 0, viewed.stderr
+    assert "nonreactive" in (place / "pages/index.html").read_text()
+    same = call(place, "diff", "runs/b", "runs/b")
+    assert same.returncode == 0, same.stderr
+    assert same.stdout.count("own-nonreactive") >= 1
+    assert same.stdout.count("own-reactive") >= 1
+
+
+def test_resume_asks_for_a_benchmark_that_is_there(place):
+    words = ("-n", "none", "-n", "ou-high", "--seeds", "0", "--limit", "2", "--resume", "--out")
+    assert call(place, "bench", "state-drift", *TINY, *words, "runs/b").returncode == 0
+    done = call(place, "bench", "state-drift", *TINY, *words, "runs/absent")
+    assert done.returncode == 1
+    assert "no benchmark to go on with" in done.stderr
+
+
 def test_another_benchmark_does_not_go_into_the_same_folder(place):
     done = call(place, "bench", "semantic-shift", *TINY, "--out", "runs/b")
     assert done.returncode == 1
