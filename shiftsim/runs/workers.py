@@ -19,7 +19,7 @@ from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, wait
 from time import monotonic
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import fresh_python
@@ -30,7 +30,6 @@ R = TypeVar("R")
 MakeFunction = Callable[[], Callable[[T], R]]
 _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a task
 _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
-_TIME_TO_COMPILE = 60.0  # s, on top of the limit of a leading task
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 # one thread per worker: the parallelism is across scenarios
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
@@ -67,7 +66,7 @@ def map_unordered(
         alone: So many leading tasks are done one at a time before the others, so that kernels
             which are not in the disk cache yet are compiled once.
         limit: Time that each piece of a task may take [s]; 0 for any. What a worker has to load,
-            or the first one to compile, does not count.
+            or to compile, does not count.
         pieces: Splits a task that is several in one; when its worker dies, they are done one by
             one, so that only one of them is lost.
         group: What a worker should stay with, as it has read it already; neighbours only.
@@ -81,7 +80,7 @@ def map_unordered(
     if workers <= 1 and not limit:
         yield from _serial(make, tasks)
         return
-    payload = pickle.dumps((sys.path, pickle.dumps(make)))
+    payload = pickle.dumps((sys.path, pickle.dumps(make), limit > 0.0))
     pool = Pool(payload, max(1, workers), limit, pieces, group)
     try:
         yield from pool.run(tasks, alone)
@@ -114,7 +113,7 @@ class _Worker:
         self.task: Any = None
         self.state: Literal["starting", "idle", "busy"] = "starting"
         self.is_new = True
-        self.deadline = inf
+        self.deadline, self.left = inf, inf
         with suppress(OSError):  # a worker that is dead already is noticed when it is waited for
             self.connection.send_bytes(payload)
 
@@ -136,7 +135,14 @@ class _Worker:
             message = self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             raise _DeathError(self.end()) from error
-        self.state, self.deadline = "idle", inf
+        if isinstance(message, _Compiling):  # the clock stands still meanwhile
+            now = monotonic()
+            if message.begins:
+                self.left, self.deadline = self.deadline - now, inf
+            else:
+                self.deadline = now + self.left
+        else:
+            self.state, self.deadline = "idle", inf
         return message
 
     def end(self) -> str:
@@ -151,6 +157,12 @@ class _Worker:
             with suppress(ValueError):
                 return f"worker process killed by {signal.Signals(-code).name}"
         return f"worker process ended with exit code {code}"
+
+
+class _Compiling(NamedTuple):
+    """What a worker says when it begins or ends to compile, if there is a limit of time."""
+
+    begins: bool
 
 
 class _DeathError(Exception):
@@ -168,7 +180,7 @@ class Pool:
         pieces: Callable[[Any], Sequence[Any]] | None = None,
         group: Callable[[Any], object] | None = None,
     ) -> None:
-        """A pool without workers; `payload` holds `sys.path` and the pickled maker."""
+        """A pool without workers; `payload` is what `serve` reads first."""
         self.payload, self.size, self.limit = payload, size, limit
         self.pieces = pieces or (lambda task: (task,))
         self.group = group
@@ -187,7 +199,7 @@ class Pool:
                 ready = [] if self._in("busy") else ready[:1]
             for worker in ready[: len(waiting)]:
                 task = waiting.popleft() if done < alone else self._taken(waiting, worker)
-                worker.give(task, self._seconds(task) + _TIME_TO_COMPILE * (done < alone))
+                worker.give(task, self._seconds(task))
             for outcome in self._heard():
                 done += 1
                 parts = self.pieces(outcome.task) if outcome.death else ()
@@ -251,7 +263,8 @@ class Pool:
                 ) from death
             return None
         self.failed_starts = 0
-        return None if starting else Outcome(worker.task, message)
+        told = starting or isinstance(message, _Compiling)
+        return None if told else Outcome(worker.task, message)
 
     def close(self) -> None:
         """End all workers: idle ones leave by themselves, the others are killed."""
@@ -287,8 +300,10 @@ def serve(parent: int, handle: int) -> None:
         handle = socket.fromshare(sys.stdin.buffer.read()).detach()
     connection: Connection[Any, Any] = Connection(handle)
     try:
-        path, pickled = pickle.loads(connection.recv_bytes())
+        path, pickled, is_timed = pickle.loads(connection.recv_bytes())
         sys.path[:] = path
+        if is_timed:
+            _tell_of_compiling(connection)
         function = pickle.loads(pickled)()
         try:
             connection.send("ready")
@@ -298,6 +313,26 @@ def serve(parent: int, handle: int) -> None:
             _close(function)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent has gone
+
+
+def _tell_of_compiling(connection: "Connection[Any, Any]") -> None:
+    """Say when kernels are compiled, those that they call included."""
+    from numba.core import event
+
+    class Watch(event.Listener):
+        depth = 0
+
+        def on_start(self, event: Any) -> None:
+            self.depth += 1
+            if self.depth == 1:
+                connection.send(_Compiling(True))
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                connection.send(_Compiling(False))
+
+    event.register("numba:compile", Watch())  # type: ignore[no-untyped-call]
 
 
 def _end_with(parent: int) -> None:

@@ -8,6 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 
 import pytest
+from numba.core import event
 
 from shiftsim.errors import ConfigError
 from shiftsim.runs.workers import map_unordered
@@ -125,6 +126,25 @@ def test_a_task_that_takes_too_long_is_ended_and_named(workers):
     assert [outcomes[n].result for n in (1, 2)] == [1, 2]
     assert outcomes[13].is_late
     assert outcomes[13].death == "took longer than 1 s"
+
+
+class Compiles:
+    def __call__(self, task):
+        with event.trigger_event("numba:compile"):
+            with event.trigger_event("numba:compile"):
+                time.sleep(1.0)
+            time.sleep(0.5)
+        time.sleep(60.0 if task == 13 else 0.0)
+        return task
+
+
+@pytest.mark.parametrize("alone", [0, 2])
+def test_the_clock_stands_still_while_kernels_are_compiled(alone, monkeypatch):
+    monkeypatch.setattr("shiftsim.runs.workers._TIME_TO_LOAD", 0.0)
+    tasks = map_unordered(Compiles, [13, 1], workers=1, alone=alone, limit=0.8)
+    outcomes = {o.task: o for o in tasks}
+    assert outcomes[1].result == 1
+    assert outcomes[13].is_late
 
 
 class Both:
