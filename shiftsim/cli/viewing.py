@@ -82,7 +82,12 @@ def view(
 def plot(
     run: RunFolder,
     token: Annotated[str, typer.Argument(metavar="TOKEN", help="A scenario.")],
-    at: Annotated[float, typer.Option(help="Time of a still from the start [s].")] = 0.0,
+    at: Annotated[
+        str, typer.Option(help="Time of a still from the start [s]; several, such as 0,5,10.")
+    ] = "0",
+    grid: Annotated[
+        bool, typer.Option("--grid", help="A row per rollout, a column per time.")
+    ] = False,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg, or a film: .mp4 or .gif.")
     ] = Path("figure.pdf"),
@@ -99,8 +104,17 @@ def plot(
     found = _galleries([run, *(others or ())], planner, noise, seed, store)
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
-    save_figure(out, scenario, gallery.shown(token, scenario), at=at)
+    save_figure(out, scenario, gallery.shown(token, scenario), at=_times(at), in_grid=grid)
     say(f"written: {out}")
+
+
+def _times(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(
+            f"times {text!r} are not numbers", hint="--at 5, or --at 0,5,10"
+        ) from error
 
 
 def inspect(

@@ -1,8 +1,9 @@
 """Why a rollout has its score: every metric, its value, threshold and first violation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -10,9 +11,20 @@ from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.world.state import AgentKind, Tracks
 
 _COLLISIONS = "no_ego_at_fault_collisions"
 _HAS = ("planners", "noise", "seeds")
+REASONS = {
+    "no_ego_at_fault_collisions": "at-fault collision",
+    "drivable_area_compliance": "drivable area",
+    "driving_direction_compliance": "driving direction",
+    "ego_is_making_progress": "no progress",
+    "ego_progress_along_expert_route": "progress",
+    "time_to_collision_within_bound": "time to collision",
+    "speed_limit_compliance": "speed limit",
+    "ego_is_comfortable": "comfort",
+}
 _UNITS = {  # nuPlan's names, shortened
     "meters": "m",
     "seconds": "s",
@@ -165,3 +177,18 @@ def _metric_line(row: dict[str, Any]) -> str:
             value = f"delta-v {value} m/s"
         parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{_partner(row)}")
     return "  ".join(parts).rstrip()
+
+
+def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
+    """A row of `metrics.parquet` with a violation, as "at-fault collision, pedestrian 17, …"."""
+    words, partner = [REASONS.get(row["metric"], row["metric"])], row["partner_token"]
+    if partner in tracks.tokens:
+        kind = AgentKind(int(tracks.kinds[tracks.tokens.index(partner)]))
+        words.append(f"{kind.name.lower().replace('_', ' ')} {partner}")
+    value, unit = row["first_violation_value"], _UNITS.get(row["unit"], row["unit"])
+    if value is not None and np.isfinite(value):
+        if row["metric"] == _COLLISIONS:  # the speed by which it changes is kept here
+            words.append(f"Δv {value:.1f} m/s")
+        elif unit:
+            words.append(f"{value:.3g} {unit}")
+    return ", ".join(words)

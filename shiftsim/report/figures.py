@@ -1,7 +1,7 @@
 """Pictures of a report: robustness curves, scores per city and per metric.
 
-Planners differ in colour, marker and dash, so that they stay apart without colour. Nothing is drawn
-of groups whose score is withheld.
+Planners differ in colour and marker, so that they stay apart without colour; dashes mean noise in
+other pictures, and are not used here. Nothing is drawn of groups whose score is withheld.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,6 @@ from shiftsim.report.tables import Estimate
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
-_DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 2, 2)), (0, (7, 2, 2, 2, 2, 2)))
 _SIZES = {"*": 1.7, "P": 1.2, "X": 1.2, "D": 0.85}  # markers of equal weight to the eye
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
@@ -114,8 +113,9 @@ def _robustness(
                     for group in groups
                     if (group.traffic, group.planner) == (traffic, planner)
                 }
-                style = _line(styles[planner]) | {"linestyle": _DASHES[place % len(_DASHES)]}
-                _curve(axes, planner, found, kind, place - len(planners) / 2, style)
+                _curve(
+                    axes, planner, found, kind, place - len(planners) / 2, _line(styles[planner])
+                )
             axes.set_xticks(range(len(LEVELS)), LEVELS)
             axes.set_title(f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
             _score_axis(axes)

@@ -16,22 +16,13 @@ import pyarrow.compute as pc
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import one_of
 from shiftsim.metrics import MULTIPLIERS
+from shiftsim.report.explain import REASONS
 from shiftsim.report.groups import COLUMNS, Group, made_up_note, read_groups, recording_note
 from shiftsim.report.tables import Cell, Number, Table, text
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
 GROUPINGS = ("scenario_type", "city", "seed")
-_REASONS = {
-    "no_ego_at_fault_collisions": "at-fault collision",
-    "drivable_area_compliance": "drivable area",
-    "driving_direction_compliance": "driving direction",
-    "ego_is_making_progress": "no progress",
-    "ego_progress_along_expert_route": "progress",
-    "time_to_collision_within_bound": "time to collision",
-    "speed_limit_compliance": "speed limit",
-    "ego_is_comfortable": "comfort",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,11 +181,11 @@ def _key(row: dict[str, Any]) -> Task:
 def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None]) -> str:
     """What cost most: the first multiplier below 1, else the lowest of the other metrics."""
     below = [name for name in MULTIPLIERS if (row[name] if row[name] is not None else 1.0) < 1.0]
-    others = [name for name in _REASONS if name not in MULTIPLIERS and row[name] is not None]
+    others = [name for name in REASONS if name not in MULTIPLIERS and row[name] is not None]
     name = below[0] if below else min(others, key=lambda other: row[other], default="")
     if not name or row[name] == 1.0:
         return ""
-    words = _REASONS[name] if below else f"{_REASONS[name]} {row[name]:.2f}"
+    words = REASONS[name] if below else f"{REASONS[name]} {row[name]:.2f}"
     seconds = violated[_key(row), name]
     return words if seconds is None else f"{words} {seconds:.1f} s"
 

@@ -6,7 +6,9 @@ const MIN_SCALE = 0.5;
 const SMALL = 680; // pixels of window height below which only the speed is drawn as a curve
 const CLEAN = [];
 const NOISY = [7, 5];
-const EXPERT = "#6e6e6e";
+const EXPERT = "#1f1f1f";
+const CLOSE = 14; // pixels per metre at least where a violation is looked at
+const TOLD = 2; // s that the words of a violation stay
 
 const byId = (id) => document.getElementById(id);
 const meta = JSON.parse(byId("data-meta").textContent);
@@ -23,6 +25,7 @@ const state = {
   plans: true,
   scale: 6,
   centre: null,
+  told: [], // the words of violations on the canvas
 };
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
 let scene, map, times, strips, panels, highlighted = -1;
@@ -100,11 +103,23 @@ function nextViolation() {
 function jumpTo(violation) {
   pause();
   setFocus(violation.index);
-  const names = tracksOf(violation.index).names;
-  highlighted = violation.partner ? names.indexOf(violation.partner) : -1;
+  highlight(violation);
   state.follow = true;
+  state.scale = Math.max(state.scale, CLOSE);
   syncOptions();
   seek(violation.t);
+}
+
+function highlight(violation) {
+  const names = tracksOf(violation.index).names;
+  highlighted = violation.partner ? names.indexOf(violation.partner) : -1;
+}
+
+// what a link that opens at a violation means: its partner
+function highlightNow() {
+  const now = violations().filter((item) => item.partner && Math.abs(item.t - state.t) < 0.05);
+  const found = now.find((item) => item.index === state.focus) || now[0];
+  if (found) highlight(found);
 }
 
 // ---- what is shown ----
@@ -174,6 +189,7 @@ function egoPose(index, at) {
 function draw() {
   if (!panels) return;
   const at = sampleAt(state.t);
+  state.told = [];
   const ratio = window.devicePixelRatio || 1;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.fillStyle = "#ffffff";
@@ -218,7 +234,39 @@ function drawPanel(panel, members, leading, at) {
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
     drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour);
   }
+  let line = 0;
+  for (const index of order.reverse()) line = tellViolations(panel, index, line);
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
+}
+
+// the words of what has just been violated, below each other, with a line to where it was
+function tellViolations(panel, index, line) {
+  const { violations: all, colour } = meta.rollouts[index];
+  const now = all.filter((item) => state.t >= item.t - 1e-6 && state.t < item.t + TOLD);
+  for (const item of now) {
+    const [x, y] = panel.toScreen(...egoPose(index, sampleAt(item.t)).slice(0, 2));
+    const [left, top] = [panel.left + 10, panel.top + (state.side ? 34 : 10) + 24 * line];
+    context.font = "600 13px system-ui, sans-serif";
+    const width = context.measureText(item.words).width;
+    context.strokeStyle = colour;
+    context.lineWidth = 1.2;
+    context.beginPath();
+    context.moveTo(left + width + 16, top + 10);
+    context.lineTo(x, y);
+    context.moveTo(x - 7, y - 7);
+    context.lineTo(x + 7, y + 7);
+    context.moveTo(x - 7, y + 7);
+    context.lineTo(x + 7, y - 7);
+    context.stroke();
+    context.fillStyle = "rgba(255, 255, 255, 0.92)";
+    context.fillRect(left, top, width + 16, 20);
+    context.strokeRect(left, top, width + 16, 20);
+    context.fillStyle = "#8c0018";
+    context.fillText(item.words, left + 8, top + 15);
+    state.told.push(item.words);
+    line++;
+  }
+  return line;
 }
 
 function captionPanel(panel, rollout, fields, at) {
@@ -336,20 +384,22 @@ function noiseOf(rollout) {
 function scoresOf(rollout) {
   const line = document.createElement("div");
   line.className = "scores";
-  const parts = Object.entries(rollout.scores)
-    .filter(([, value]) => value < 1)
-    .map(([name, value]) => `${name} ${(100 * value).toFixed(0)}`);
-  if (rollout.degraded) parts.push(`${rollout.degraded} degraded steps`);
-  line.textContent = parts.join(" · ");
+  for (const [name, value] of Object.entries(rollout.scores)) {
+    if (value >= 1) continue;
+    const part = document.createElement("abbr");
+    part.textContent = `${name} ${(100 * value).toFixed(0)}`;
+    part.title = meta.metrics[name] || name;
+    line.append(part, " ");
+  }
+  if (rollout.degraded) line.append(`${rollout.degraded} degraded steps`);
   return line;
 }
 
 function violationButton(violation, index) {
   const button = document.createElement("button");
-  button.textContent = `${violation.short} ${violation.t.toFixed(1)} s`;
-  const value = violation.value === null ? "" : `: ${violation.value.toPrecision(3)} ${violation.unit}`;
-  const limit = violation.threshold === null ? "" : ` (bound ${violation.threshold})`;
-  button.title = `${violation.metric}${value}${limit}`;
+  button.textContent = `${violation.t.toFixed(1)} s  ${violation.words}`;
+  const limit = violation.threshold === null ? "" : `, bound ${violation.threshold}`;
+  button.title = `${violation.metric} (${violation.short})${limit}`;
   button.addEventListener("click", (event) => {
     event.stopPropagation();
     jumpTo({ ...violation, index });
@@ -483,6 +533,7 @@ const KEYS = {
   p: () => setOption("plans", !state.plans),
   r: () => setOption("route", !map.layers.route),
   l: () => setOption("lanes", !map.layers.lanes),
+  "?": () => byId("keys").toggleAttribute("open"),
   a: () => setFocus((state.focus + 1) % rollouts.length),
   "+": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
   "=": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
@@ -540,6 +591,8 @@ function connect() {
     if (location.hash.slice(1) !== written) {
       await loadState();
       changed();
+      highlightNow();
+      draw();
     }
   });
 }
@@ -601,6 +654,8 @@ async function start() {
   syncOptions();
   byId("time").value = state.t;
   changed();
+  highlightNow();
+  draw();
   window.firstFrame = performance.now(); // ms since the page was opened
   document.documentElement.dataset.ready = "1";
 }

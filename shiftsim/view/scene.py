@@ -13,6 +13,7 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.report.explain import REASONS, violation_words
 from shiftsim.report.palette import planner_styles
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
@@ -118,6 +119,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
         "type": scenario.scenario_type,
         "city": scenario.city,
         "log": scenario.log_name,
+        "metrics": {SHORT_NAMES[name]: words for name, words in REASONS.items()},
         "vehicle": [PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center],
         "ownTracks": own,
         "tracks": None if own else _track_names(shown[0].log.tracks),
@@ -129,7 +131,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "cls": item.cls,
                 "colour": styles[item.planner].colour,
                 "marker": styles[item.planner].marker,
-                "violations": _violations(item.metrics),
+                "violations": violations(item),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -178,8 +180,8 @@ def _track_names(tracks: Tracks) -> list[str]:
     return [tracks.tokens[i] for i in _used(tracks)]
 
 
-def _violations(metrics: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """First violations of scored metrics, by time."""
+def violations(item: Shown) -> list[dict[str, Any]]:
+    """First violations of scored metrics, by time; `words` say what happened."""
     out = [
         {
             "metric": row["metric"],
@@ -191,14 +193,15 @@ def _violations(metrics: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "unit": row["unit"],
             "partner": row["partner_token"],
             "score": row["score"],
+            "words": violation_words(row, item.log.tracks),
         }
-        for row in metrics
+        for row in item.metrics
         if row["metric"] in SHORT_NAMES
         and row["first_violation_s"] is not None
         and row["score"] is not None
         and row["score"] < 1.0
     ]
-    return sorted(out, key=lambda item: item["t"])
+    return sorted(out, key=lambda found: found["t"])
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:

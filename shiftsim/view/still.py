@@ -1,6 +1,6 @@
 """Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,9 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.report.palette import new_figure, planner_styles, save_picture
+from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
 from shiftsim.sim.log import SimulationLog, as_recorded
-from shiftsim.view.scene import Shown, map_lines
+from shiftsim.view.scene import Shown, map_lines, violations
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, AgentKind, center_poses
@@ -33,15 +33,26 @@ _AGENTS = {
     AgentKind.PEDESTRIAN: "#a8791e",
     AgentKind.BICYCLE: "#8a5f9e",
 }
-_MARKER: dict[str, Any] = {"markersize": 6, "markeredgecolor": "white", "markeredgewidth": 0.5}
-_OTHER, _LOG = "#8f8f8f", "#6e6e6e"
+_MARKER: dict[str, Any] = {"markersize": 5, "markeredgewidth": 1.0}
+_OTHER, _LOG = "#8f8f8f", "#1f1f1f"
+_ALARM = "#b00020"
+_LARGEST = 7.0  # inches, of a single picture
 
 
-def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: float) -> None:
+def save_figure(
+    path: Path,
+    scenario: Scenario,
+    shown: Sequence[Shown],
+    *,
+    at: Sequence[float] = (0.0,),
+    in_grid: bool = False,
+) -> None:
     """A still `at` seconds from the start, or a film of it all, by the ending of the file's name.
 
+    Several times, or `in_grid`, give a figure with a row per rollout and a column per time.
+
     Raises:
-        ConfigError: The ending or the time is none of those possible.
+        ConfigError: The ending or a time is none of those possible.
         MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
     """
     if path.suffix.lower() not in STILLS + FILMS:
@@ -49,12 +60,13 @@ def save_figure(path: Path, scenario: Scenario, shown: Sequence[Shown], *, at: f
             f"{str(path)!r} ends in {path.suffix!r}",
             hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
         )
-    row = _sample_at(shown[0].log.time_us, at)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() in FILMS:
-        _film(path, *_driven(scenario, shown), shown)
+        _film(path, scenario, shown)
+    elif in_grid or len(at) > 1:
+        save_picture(grid(scenario, shown, at=at), path)
     else:
-        save_picture(_still(scenario, shown, row), path)
+        save_picture(still(scenario, shown, at=at[0]), path)
 
 
 def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
@@ -64,7 +76,38 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
         ConfigError: There is no such time.
         MissingExtraError: matplotlib is missing.
     """
-    return _still(scenario, shown, _sample_at(shown[0].log.time_us, at))
+    row = _sample_at(shown[0].log.time_us, at)
+    extent = _extent_of(scenario, shown)
+    figure, axes = _panels(1, 1, extent)
+    _draw_map(axes[0][0], scenario.map, scenario.route, extent)
+    _moment(axes[0][0], shown, row, planner_styles(item.planner for item in shown))
+    _legend(axes[0][0])
+    _scale_bar(axes[0][0], extent)
+    _heading(axes[0][0], scenario, at)
+    return figure
+
+
+def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> Any:
+    """A matplotlib figure with a row per rollout and a column per moment [s from the start].
+
+    Raises:
+        ConfigError: There is no such time.
+        MissingExtraError: matplotlib is missing.
+    """
+    rows = [_sample_at(shown[0].log.time_us, time) for time in at]
+    extent = _extent_of(scenario, shown)
+    figure, panels = _panels(len(shown), len(at), extent)
+    styles = planner_styles(item.planner for item in shown)
+    for item, line in zip(shown, panels, strict=True):
+        for time, row, axes in zip(at, rows, line, strict=True):
+            _draw_map(axes, scenario.map, scenario.route, extent)
+            _moment(axes, [item], row, styles)
+            if item is shown[0]:
+                axes.set_title(f"{time:g} s", fontsize=9)
+        line[0].set_ylabel(_caption(item).replace(", ", "\n", 1), fontsize=8)
+    _scale_bar(panels[-1][0], extent)
+    figure.suptitle(_words(scenario), fontsize=9)
+    return figure
 
 
 def overview(thing: Scenario | VectorMap) -> Any:
@@ -75,13 +118,18 @@ def overview(thing: Scenario | VectorMap) -> Any:
     """
     if isinstance(thing, VectorMap):
         bounds = thing.edges.polygons.bounds
-        corners = np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
-        return _canvas(thing, (), corners)[0]
-    log = as_recorded(thing)
-    figure, axes = _driven(thing, ())
+        extent = _extent(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
+        figure, ((axes,),) = _panels(1, 1, extent)
+        _draw_map(axes, thing, (), extent)
+        _scale_bar(axes, extent)
+        return figure
+    log, extent = as_recorded(thing), _extent(thing.expert[:, :2])
+    figure, ((axes,),) = _panels(1, 1, extent)
+    _draw_map(axes, thing.map, thing.route, extent)
     _recorded(axes, log, 0)
     _draw_ego(axes, log, 0, _LOG)
     _legend(axes)
+    _scale_bar(axes, extent)
     _heading(axes, thing, 0.0)
     return figure
 
@@ -90,7 +138,7 @@ def svg_of(figure: Any) -> str:
     """A figure as the text of an SVG element."""
     out = StringIO()
     figure.savefig(out, format="svg", metadata={"Date": None})
-    return out.getvalue().partition("<svg")[1] + out.getvalue().partition("<svg")[2]
+    return "".join(out.getvalue().partition("<svg")[1:])
 
 
 def _sample_at(time_us: IntArray, at: float) -> int:
@@ -100,46 +148,40 @@ def _sample_at(time_us: IntArray, at: float) -> int:
     return int(np.argmin(np.abs(times - at)))
 
 
-def _still(scenario: Scenario, shown: Sequence[Shown], row: int) -> Any:
-    figure, axes = _driven(scenario, shown)
-    _moment(axes, shown, row)
-    time_us = shown[0].log.time_us
-    _heading(axes, scenario, float(time_us[row] - time_us[0]) * 1e-6)
-    return figure
-
-
-def _driven(scenario: Scenario, shown: Sequence[Shown]) -> tuple[Any, Any]:
+def _extent_of(scenario: Scenario, shown: Sequence[Shown]) -> FloatArray:
     paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
-    return _canvas(scenario.map, scenario.route, np.concatenate(paths))
+    return _extent(np.concatenate(paths))
 
 
-def _canvas(road: VectorMap, route: Sequence[str], points: FloatArray) -> tuple[Any, Any]:
-    """Axes with the map, as large as the points (N, 2) need."""
+def _extent(points: FloatArray) -> FloatArray:
+    """(4,) min x, min y, max x, max y of a picture that shows points (N, 2) [m]."""
     low, high = points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     half = np.maximum(half, half.max() * 0.5)  # never a mere strip
-    extent = np.array([*(middle - half), *(middle + half)])
-    width = 7.0
-    height = width * half[1] / half[0]
-    if height > 7.0:
-        width, height = 7.0 * width / height, 7.0
-    figure = new_figure(figsize=(max(width, 4.0), height + 0.9))
-    axes = figure.subplots()
-    _draw_map(axes, map_lines(road, route, extent))
-    axes.set_xlim(extent[0], extent[2])
-    axes.set_ylim(extent[1], extent[3])
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    _scale_bar(axes, extent)
-    return figure, axes
+    return np.array([*(middle - half), *(middle + half)])
 
 
-def _draw_map(axes: Any, layers: dict[str, list[FloatArray]]) -> None:
+def _panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
+    """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
+    width, height = extent[2] - extent[0], extent[3] - extent[1]
+    size = min(_LARGEST / max(width, height), _LARGEST * 2.0 / (columns * width))
+    figure = new_figure(figsize=(columns * width * size + 0.1, rows * height * size + 0.4))
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.flat:
+        axes.set_xlim(extent[0], extent[2])
+        axes.set_ylim(extent[1], extent[3])
+        axes.set_aspect("equal")
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return figure, panels
+
+
+def _draw_map(axes: Any, road: VectorMap, route: Sequence[str], extent: FloatArray) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
+    layers = map_lines(road, route, extent)
     for name, colour in _LAYERS.items():
         if layers[name]:
             outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
@@ -157,30 +199,66 @@ def _scale_bar(axes: Any, extent: FloatArray) -> None:
     axes.text(x + length / 2.0, y, f"{length} m\n", ha="center", va="bottom", fontsize=8, zorder=9)
 
 
+def _words(scenario: Scenario) -> str:
+    words = (scenario.token, scenario.scenario_type, scenario.city)
+    return "  ".join(words).replace("$", r"\$")
+
+
 def _heading(axes: Any, scenario: Scenario, time: float) -> None:
-    words = (scenario.token, scenario.scenario_type, scenario.city, f"{time:.1f} s")
-    axes.set_title("  ".join(words).replace("$", r"\$"), fontsize=9)
+    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=9)
 
 
-def _moment(axes: Any, shown: Sequence[Shown], row: int) -> list[Any]:
+def _caption(item: Shown) -> str:
+    """Planner, noise, score and what cost most of it."""
+    name = item.planner if item.noise == "none" else f"{item.planner} {item.noise}"
+    score = "" if item.cls is None else f": {100.0 * item.cls:.0f}"
+    found = _gravest(item)
+    return f"{name}{score}" if found is None else f"{name}{score}, {_told(found)}"
+
+
+def _told(found: Mapping[str, Any]) -> str:
+    return f"{found['words']}, {found['t']:.1f} s"
+
+
+def _gravest(item: Shown) -> dict[str, Any] | None:
+    """The violation that cost most: the first of a multiplier, else the first."""
+    found = violations(item)
+    return next((one for one in found if one["multiplier"]), found[0] if found else None)
+
+
+def _moment(axes: Any, shown: Sequence[Shown], row: int, styles: Mapping[str, Style]) -> list[Any]:
     """Everything that moves at one sample; returns what was drawn."""
-    styles = planner_styles(item.planner for item in shown)
     drawn = _recorded(axes, shown[0].log, row)
     for item in shown:
         style, ego = styles[item.planner], item.log.ego
-        clean = item.noise == "none"
-        label = item.planner if clean else f"{item.planner} {item.noise}"
-        line = {"color": style.colour, "linewidth": 1.8, "linestyle": "-" if clean else (0, (5, 3))}
-        mark = {"marker": style.marker, "markevery": (min(10, len(ego) - 1), 30)}
-        drawn += axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=label, **line, **mark, **_MARKER)
+        is_clean = item.noise == "none"
+        line = {"color": style.colour, "linewidth": 1.8, "linestyle": "-" if is_clean else "--"}
+        mark = {"marker": style.marker, "markevery": (min(10, len(ego) - 1), 50)}
+        look = {"markerfacecolor": "white" if is_clean else style.colour, **line, **mark, **_MARKER}
+        look["markeredgecolor"] = style.colour
+        drawn += axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=_caption(item), **look)
         drawn += _draw_ego(axes, item.log, row, style.colour)
-    _legend(axes)
+        drawn += _draw_violation(axes, item, style.colour)
     return drawn
 
 
+def _draw_violation(axes: Any, item: Shown, colour: str) -> list[Any]:
+    """A cross where the gravest violation began; the caption says what it was."""
+    found = _gravest(item)
+    if found is None:
+        return []
+    time_us = item.log.time_us
+    row = int(np.searchsorted(time_us, time_us[0] + found["t"] * 1e6 - 1.0))
+    x, y = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
+    place: dict[str, Any] = {"xytext": (6, 6), "textcoords": "offset points", "zorder": 10}
+    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": colour, "lw": 0.8, "alpha": 0.85}
+    words = axes.annotate(found["short"], (x, y), fontsize=7, bbox=box, **place)
+    cross = {"marker": "x", "color": _ALARM, "s": 60, "linewidths": 2.2, "zorder": 9}
+    return [axes.scatter([x], [y], **cross), words]
+
+
 def _legend(axes: Any) -> None:
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
-    axes.legend(fontsize=8, frameon=False, **place)
+    axes.legend(fontsize=8, loc="best", framealpha=0.85, edgecolor="none").set_zorder(11)
 
 
 def _draw_ego(axes: Any, log: SimulationLog, row: int, colour: str) -> list[Any]:
@@ -214,8 +292,10 @@ def _draw_boxes(
     return [axes.add_collection(boxes, autolim=False)]
 
 
-def _film(path: Path, figure: Any, axes: Any, shown: Sequence[Shown]) -> None:
+def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
     """All samples, one after the other."""
+    extent = _extent_of(scenario, shown)
+    figure, ((axes,),) = _panels(1, 1, extent)
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     writer: Any = PillowWriter(fps=_FPS)
@@ -223,11 +303,16 @@ def _film(path: Path, figure: Any, axes: Any, shown: Sequence[Shown]) -> None:
         if not FFMpegWriter.isAvailable():
             raise MissingExtraError("mp4 needs ffmpeg", hint="install ffmpeg, or write a .gif")
         writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
+    _draw_map(axes, scenario.map, scenario.route, extent)
+    _scale_bar(axes, extent)
+    styles = planner_styles(item.planner for item in shown)
     times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
     with writer.saving(figure, str(path), _FILM_DPI):
         for row, time in enumerate(times):
-            drawn = _moment(axes, shown, row)
-            axes.set_title(f"{shown[0].log.token}  {time:.1f} s", fontsize=9)
+            drawn = _moment(axes, shown, row, styles)
+            if row == 0:
+                _legend(axes)  # of lines that look the same in all samples
+            _heading(axes, scenario, float(time))
             writer.grab_frame()
             for artist in drawn:
                 artist.remove()

@@ -2,7 +2,7 @@
 // Curves over time below the scene: speed, acceleration, noise, and the first violations.
 // They are painted once; moving in time only moves the cursor.
 
-const STRIP_HEIGHT = 46;
+const STRIP_HEIGHT = window.innerHeight >= 800 ? 64 : 46;
 const STRIP_LEFT = 46;
 const STRIP_RIGHT = 10;
 const VIOLATION_ROW = 13;
@@ -94,14 +94,19 @@ class Strips {
   paintMarks(context, top) {
     context.textAlign = "left";
     if (!this.marks.length) context.fillText("no violations", STRIP_LEFT + 4, top + 11);
+    const ends = []; // of the texts so far, by row: none is written over another
     for (const mark of this.marks) {
       const y = top + mark.row * VIOLATION_ROW + 8;
       drawMarker(context, mark.marker, this.x(mark.t), y, 4.5, mark.colour);
       context.fillStyle = "#3a3a3a";
       const text = ` ${mark.text}`;
-      const fits = this.x(mark.t) + 8 + context.measureText(text).width < this.width;
-      context.textAlign = fits ? "left" : "right";
-      context.fillText(text, this.x(mark.t) + (fits ? 4 : -8), y + 4);
+      const width = context.measureText(text).width;
+      const fits = this.x(mark.t) + 8 + width < this.width;
+      const left = fits ? this.x(mark.t) + 4 : this.x(mark.t) - 8 - width;
+      if (left < (ends[mark.row] || 0)) continue;
+      ends[mark.row] = left + width + 8;
+      context.textAlign = "left";
+      context.fillText(text, left, y + 4);
     }
     context.textAlign = "left";
   }

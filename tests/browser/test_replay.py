@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from stores import write_toy_store
@@ -17,6 +18,17 @@ SIZES = [(1440, 900), (800, 600)]
 HOSTILE = (
     "<img src=x onerror=\"document.title='owned'\"></script><script>document.title='owned'</script>"
 )
+MARKS = """(() => {
+  const spans = [], pen = strips.picture.getContext("2d"), fill = pen.fillText.bind(pen);
+  pen.fillText = (text, x, y) => {
+    spans.push([x, x + pen.measureText(text).width]);
+    fill(text, x, y);
+  };
+  const mark = (t) => ({ t, row: 0, text: "TTC NCR", colour: "#000000", marker: "o" });
+  strips.marks = [0, 0.1, 0.2, 5].map(mark);
+  strips.paintMarks(pen, 100);
+  return spans;
+})()"""  # from where to where the words of four marks go
 VIOLATED = "0001cafe"  # its ego meets a parked car
 
 
@@ -151,9 +163,46 @@ def test_the_next_violation_is_jumped_to_and_its_partner_marked(replay):
     assert now(replay) == pytest.approx(later[0] if later else first)
 
 
+def test_a_violation_is_told_in_words_near_and_with_its_partner(replay):
+    assert replay.run("state.told") == []
+    replay.run("zoom(0.2, 300, 200)")
+
+    partner = replay.run("violations().find((v) => v.partner)")
+    replay.run("jumpTo(violations().find((v) => v.partner))")
+
+    assert partner["words"] in replay.run("state.told")
+    assert f"vehicle {partner['partner']}" in partner["words"]
+    assert replay.run("state.scale") >= 14
+    assert replay.run("tracksOf(state.focus).names[highlighted]") == partner["partner"]
+
+
+def test_a_link_to_a_violation_marks_its_partner(page, folder):
+    page.open(address(folder))
+    first = page.run("violations().find((v) => v.partner)")
+    page.open(f"{address(folder)}#t={first['t']:.2f}&focus={first['index'] + 1}")
+
+    page.wait("document.documentElement.dataset.ready")
+    assert page.run("tracksOf(state.focus).names[highlighted]") == first["partner"]
+
+
+def test_abbreviations_are_explained_and_the_keys_are_listed(replay):
+    titles = replay.run("[...document.querySelectorAll('abbr')].map((a) => a.title)")
+    assert "at-fault collision" in titles
+    assert not replay.run("document.getElementById('keys').open")
+    replay.press("?")
+    assert replay.run("document.getElementById('keys').open")
+
+
+def test_words_of_marks_never_lie_on_each_other(page, folder):
+    page.open(address(folder), (800, 600))
+    spans = sorted(page.run(MARKS))
+    assert len(spans) >= 2
+    assert all(a[1] <= b[0] for a, b in pairwise(spans))
+
+
 def test_a_violation_button_jumps_to_its_rollout(replay):
     button = replay.browser.find_elements("css selector", ".rollout button")[-1]
-    seconds = float(button.text.split()[1])
+    seconds = float(button.text.split()[0])
 
     button.click()
 
