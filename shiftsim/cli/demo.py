@@ -1,12 +1,13 @@
 """`shiftsim demo`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Quiet, say
+from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
 from shiftsim.cli.running import run_config
 
 _PLANNERS = ("log-future", "idm", "constant-velocity")
@@ -15,15 +16,23 @@ _NOISE = ("none", "ou-high")
 
 @cli.with_settings("workers", "limit")
 def demo(
-    out: Annotated[Path | None, typer.Option(help="Folder of the demo store.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the store.")] = None,
+    towns: Annotated[
+        int | None, typer.Option(min=1, help="Only make a store of N random towns to train in.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random towns.")] = 0,
     *,
     settings: cli.Settings,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed."""
-    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
     from shiftsim.files import store_path
+
+    if towns is not None:
+        _make_towns(out or store_path(f"towns-{seed}"), towns, seed, settings, quiet=quiet)
+        return
+    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
     from shiftsim.runs.config import DEFAULT_STORE, make_config
     from shiftsim.verify.warmup import warm_up
 
@@ -50,3 +59,26 @@ def demo(
         say("  shiftsim report runs/<id>        shiftsim view runs/<id>")
         say("  shiftsim explain runs/<id> TOKEN")
         say("  shiftsim planners list           shiftsim --help")
+
+
+def _make_towns(
+    folder: Path, towns: int, seed: int, settings: cli.Settings, *, quiet: bool
+) -> None:
+    """Generate, convert and filter random towns."""
+    from shiftsim.data.towns.store import write_towns
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.filter import filter_store
+    from shiftsim.runs.workers import map_unordered
+
+    workers = settings.get("workers", 0) or default_workers()
+    say(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
+    with progress_bar(quiet=quiet) as advance:
+        spread = partial(map_unordered, workers=min(workers, towns), alone=1)
+        write_towns(folder, towns=towns, seed=seed, spread=spread, progress=advance)
+    say("driving every scenario as recorded, to leave out those that cannot be driven so")
+    with progress_bar(quiet=quiet) as advance:
+        found = filter_store(
+            folder, workers=workers, on_progress=lambda done, total: advance(done, total, "")
+        )
+    counts = found.counts()
+    say(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
