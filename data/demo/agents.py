@@ -38,6 +38,7 @@ class Driver:
     halt: tuple[float, float] = (0.0, 0.0)
     # share by which it slows down again and again, and how often that is [s]
     wave: tuple[float, float] = (0.0, 1.0)
+    is_parked: bool = False  # whether it moves off beside the road, once nobody comes from behind
     token: int = 0  # number of its track
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y [m], heading [rad] of its centre
 

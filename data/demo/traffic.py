@@ -151,11 +151,13 @@ class Traffic:
             wanted = _MIN_GAP + max(0.0, driver.v * _HEADWAY + closing)
             following = free - _MAX_ACCEL * (wanted / max(gap, 0.3)) ** 2
             accel = min(accel, max(following, -_HARDEST))
-        for name, place in self._places_to_wait(driver, walkers):
+        for name, place in self._places_to_wait(driver, drivers, walkers):
             accel = min(accel, _even_braking(driver, name, place))
         return accel
 
-    def _places_to_wait(self, driver: Driver, walkers: list[Walker]) -> list[tuple[str, float]]:
+    def _places_to_wait(
+        self, driver: Driver, drivers: list[Driver], walkers: list[Walker]
+    ) -> list[tuple[str, float]]:
         places = []
         path = driver.path
         for zone in path.zones:
@@ -172,7 +174,8 @@ class Traffic:
                 driver.waiting.discard(name)
         if driver.halt[1] > 0.0 and driver.front <= driver.halt[0]:
             places.append(("halt", driver.halt[0]))
-            if driver.v < 0.1 and driver.halt[0] - driver.front < 3.0:
+            waits = driver.is_parked and any(_comes(x, driver) for x in drivers)
+            if driver.v < 0.1 and driver.halt[0] - driver.front < 3.0 and not waits:
                 driver.halt = driver.halt[0], driver.halt[1] - DT
         if path.is_parking:
             places.append(("end", path.length + 0.5 * driver.length + 0.9))
@@ -287,6 +290,15 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
         if gap < best:
             best, speed = gap, max(0.0, other.v * cos(turn))
     return best, float(speed)
+
+
+def _comes(other: Driver, driver: Driver) -> bool:
+    """Whether somebody is beside or behind on the lane that a parked driver moves off to."""
+    x, y, heading = driver.place
+    dx, dy = other.place[0] - x, other.place[1] - y
+    along = dx * cos(heading) + dy * sin(heading)
+    near = -4.5 * other.v - 12.0 < along < 9.0 and 0.5 < driver.aside(*other.place[:2]) < 5.0
+    return near and cos(other.place[2] - heading) > 0.5
 
 
 def _may_lead(other: Driver, driver: Driver, reach: float) -> bool:

@@ -1,7 +1,7 @@
-"""Streets of random towns, each a kind of place: junctions, roundabouts, winding streets and so on.
+"""Streets of random towns, each a kind of place: junctions, roundabouts, winding streets, car parks.
 
-Streets are drawn without a place, fanned out around their junctions, and drawn again until no two of
-them come too close.
+Streets are drawn without a place, fanned out around their junctions, and drawn again until no two
+of them come too close.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,7 +59,7 @@ def _winding(
     pieces, turned = [line(calm)], 0.0
     straight = rng.random() < 0.25
     while (rest := length - sum(piece.length for piece in pieces)) > 8.0:
-        radius = max(comfortable * float(rng.uniform(0.35, 2.5)), half + 6.0, 13.0)
+        radius = max(comfortable * float(rng.uniform(0.35, 2.5)), half + 9.0, 16.0)
         angle = float(rng.uniform(0.2, 0.9) * rng.choice((-1.0, 1.0)))
         easing = min(float(rng.uniform(6.0, 16.0)), 0.5 * abs(angle) * radius)
         if straight or abs(turned + angle) > 0.8 or abs(angle) * radius + easing > rest - 6.0:
@@ -82,7 +82,7 @@ def _street(rng: np.random.Generator, number: int, **options: object) -> Street:
     lanes = int(options.get("lanes", 1))  # type: ignore[call-overload]
     limits = ((20.0, 30.0, 30.0, 40.0, 50.0), (30.0, 40.0, 50.0, 50.0, 60.0), (50.0, 60.0, 70.0))
     limit = float(options.get("limit", rng.choice(limits[lanes - 1])))  # type: ignore[arg-type]
-    width = round(float(rng.uniform(3.0, 3.75) if limit > 30.0 else rng.uniform(2.9, 3.5)), 2)
+    width = round(float(rng.uniform(3.1, 3.75) if limit > 30.0 else rng.uniform(3.0, 3.5)), 2)
     has_cars = lanes == 1 and limit <= 40.0 and rng.random() < 0.4
     chosen = {
         "width": width,
@@ -157,7 +157,7 @@ def _fan(
 
 
 def _reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float) -> list[float]:
-    """How far from the middle of a junction its streets must begin, by the radius of its kerbs [m]."""
+    """How far from the middle of a junction with round kerbs its streets must begin [m]."""
     count = len(streets)
     out = [9.0] * count
     for one in range(count):
@@ -174,7 +174,7 @@ def _reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float
 
 def _rounding(rng: np.random.Generator) -> float:
     """Radius of the kerbs of a junction [m]."""
-    return float(rng.uniform(4.5, 8.0))
+    return float(rng.uniform(8.5, 13.5))
 
 
 def _angles(rng: np.random.Generator, count: int) -> list[float]:
@@ -375,7 +375,7 @@ def _narrow_street(rng: np.random.Generator) -> list[Street]:
     """A winding street with parked cars, narrow places and a side street or none of note."""
     limit = float(rng.choice((30.0, 30.0, 40.0, 50.0)))
     angles = [0.0, np.pi / 2 + float(rng.uniform(-0.3, 0.3)), np.pi + float(rng.uniform(-0.3, 0.3))]
-    width = round(float(rng.uniform(2.95, 3.4)), 2)
+    width = round(float(rng.uniform(3.0, 3.4)), 2)
     arms = []
     for place in range(3):
         is_side = place == 1
@@ -400,7 +400,7 @@ def _narrow_street(rng: np.random.Generator) -> list[Street]:
 
 def _car_park(rng: np.random.Generator) -> list[Street]:
     """A car park with diagonal spaces along an aisle that leaves a street and returns to it."""
-    apart, start = float(rng.uniform(22.0, 30.0)), 12.0
+    apart, start = float(rng.uniform(24.0, 32.0)), float(rng.uniform(13.5, 16.0))
     aisle, top = float(rng.uniform(40.0, 70.0)), float(rng.uniform(14.0, 20.0))
     east, north, south = 0.0, np.pi / 2, -np.pi / 2
     x, y = -apart, start + aisle

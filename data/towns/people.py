@@ -11,7 +11,7 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES, Driver, Walker, has_room
 from shiftsim.data.demo.network import Town
-from shiftsim.data.demo.paths import STEP, Path
+from shiftsim.data.demo.paths import STEP, Path, arc_at, shifted
 from shiftsim.data.demo.traffic import Box, Traffic
 from shiftsim.data.towns.layouts import Place
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -27,6 +27,7 @@ _KINDS = {
     "bicycle": 0.06,
 }
 _CHANGING = 70.0  # m, shortest street to change lanes on
+_MERGING = 14.0  # m, on which who was parked joins the lane
 _ROUNDS = 12  # how often somebody is left out
 _MARGIN = 0.1  # m around every vehicle, within which two of them count as touching
 
@@ -169,6 +170,8 @@ def _standing_and_moving(place: Place, ways: _Ways, rng: np.random.Generator) ->
         is_red = _is_red(place, entry)
         if rng.random() < (0.85 if is_red else 0.12):
             placed += _queue(ways, entry, rng, placed)
+    for entry in ways.entries:
+        placed += _moving_off(ways, entry, rng)
     wanted = int(rng.integers(3, 16))
     for _ in range(4 * wanted):
         if len(placed) >= wanted:
@@ -188,6 +191,41 @@ def _standing_and_moving(place: Place, ways: _Ways, rng: np.random.Generator) ->
         if _may_begin(driver) and _fits(driver, placed):
             placed.append(driver)
     return placed
+
+
+def _moving_off(ways: _Ways, entry: str, rng: np.random.Generator) -> list[Driver]:
+    """Vehicles that stand in a parking space along a street until they move off."""
+    town = ways.town
+    bays, free = town.bays.get(entry), town.streets[entry].empty
+    if bays is None:
+        return []
+    out = []
+    inward = [x for x in free if len(bays) // 2 <= x < len(bays)]  # on the side that enters
+    for space in rng.permutation(inward)[: int(rng.integers(0, 4))].tolist():
+        path = ways.path(entry, "car")
+        if path is None or not path.zones:
+            continue
+        s = arc_at(path.points, bays[space, :2])
+        x, y, heading = path.at(s)
+        aside = (bays[space, 1] - y) * np.cos(heading) - (bays[space, 0] - x) * np.sin(heading)
+        if aside > -1.5 or s < 15.0 or path.zones[0].stop < s + 30.0:
+            continue
+        category = str(rng.choice(("car", "van"), p=(0.85, 0.15)))
+        driver = _driver(_merging(path, s, float(aside)), category, rng, s=s, v=0.0)
+        driver.halt = (driver.front + 1.0, round(float(rng.uniform(0.5, 20.0)), 1))
+        driver.wave, driver.is_parked = (0.0, 1.0), True
+        out.append(driver)
+    return out
+
+
+def _merging(path: Path, s: float, aside: float) -> Path:
+    """A path that begins beside the road and joins the lane from an arc length on [m]."""
+    arc = STEP * np.arange(len(path.points))
+    share = np.clip((s + 2.5 + _MERGING - arc) / _MERGING, 0.0, 1.0)
+    slow = (arc > s - 5.0) & (share > 0.1)
+    speed = np.where(slow, np.minimum(path.speed, 4.5), path.speed)
+    moved = shifted(path, aside * share * share * (3.0 - 2.0 * share))
+    return replace(moved, speed=speed)
 
 
 def _queue(ways: _Ways, entry: str, rng: np.random.Generator, placed: list[Driver]) -> list[Driver]:
@@ -274,7 +312,7 @@ def _walkers(town: Town, rng: np.random.Generator, duration: float) -> list[Walk
     """Pedestrians over crossings and along the streets."""
     out = []
     level = float(rng.choice((0.15, 0.5, 1.0)))
-    for name, walk in town.walks.items():
+    for walk in town.walks.values():
         crosses = bool(walk.crossing)
         if rng.random() >= level * (0.55 if crosses else 0.8):
             continue
