@@ -46,6 +46,7 @@ class Street:
     narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
     # how far vehicles swing to the left there, along s and against it; who must more gives way [m]
     swings: tuple[float, float] = (_NARROW_ASIDE, _NARROW_ASIDE)
+    wide: float = 0.0  # how far vehicles swing out to turn right at its junctions [m]
     obstacles: tuple[tuple[float, float], ...] = ()  # s and t of cars parked on the road [m]
     has_lights: bool = False  # whether traffic lights stand before its junctions
 
@@ -249,7 +250,8 @@ def _make_way(town: Town, way: str) -> paths.Path:
             parts.append(points)
             limits.append(min(street.limit, onward.limit))
             zone = paths.Zone(connector, 0.0, 0.0, 0.0, rank, origin)
-            zones.append((zone, points[0], points[-1], street.stop, 0.0))
+            swing = street.wide if _turn(town, leg, target) < -0.5 else 0.0
+            zones.append((zone, points[0], points[-1], street.stop, swing))
             lane, is_forward = to_lane, target.is_forward
     path = paths.make_path(parts, limits)
     return _with_places(path, zones, crossings, is_parking=bool(steps[-1] and steps[-1][4]))
@@ -274,10 +276,11 @@ def _with_places(
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
         made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
-        if zone.id < 0:
+        if swing or zone.id < 0:
             outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
             share = np.clip(1.0 - outside, 0.0, 1.0)
             aside += swing * share * share * (3.0 - 2.0 * share)
+        if zone.id < 0:
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
     path = paths.shifted(replace(path, speed=paths.brake_in_time(speed)), aside)
     order = tuple(sorted(made, key=lambda zone: zone.entry))

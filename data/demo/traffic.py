@@ -51,7 +51,9 @@ class Traffic:
     _waits: dict[str, float] = field(default_factory=dict)
 
     def record(self, duration: float) -> list[Box]:
-        """Simulate from time 0 and return the boxes of all frames."""
+        """Simulate from time 0, once, and return the boxes of all frames."""
+        if self.boxes:
+            return self.boxes
         everybody: list[Driver | Walker] = [*self.drivers, *self.walkers]
         for number, agent in enumerate(everybody, start=1):
             agent.token = number

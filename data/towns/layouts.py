@@ -21,6 +21,7 @@ _AT_JUNCTION = ((3.0, 7.0),)  # m along a street, crosswalk at a junction
 _STEP = 4.0  # m between the places of streets that are compared
 _APART = 3.0  # m between streets
 _LATERAL_ACCEL = 1.8  # m/s^2, of a driver in a curve
+_WIDE = 0.3  # m, to the left of the lane in right turns
 _TRIES = 300
 
 
@@ -74,7 +75,7 @@ def _winding(
 
 def _length(rng: np.random.Generator, limit: float) -> float:
     """Of a street that leads out of town, long enough for those who do not stop [m]."""
-    return limit / 3.6 * float(rng.uniform(8.5, 12.0)) + 25.0
+    return limit / 3.6 * float(rng.uniform(9.5, 15.0)) + 25.0
 
 
 def _street(rng: np.random.Generator, number: int, **options: object) -> Street:
@@ -82,12 +83,13 @@ def _street(rng: np.random.Generator, number: int, **options: object) -> Street:
     lanes = int(options.get("lanes", 1))  # type: ignore[call-overload]
     limits = ((20.0, 30.0, 30.0, 40.0, 50.0), (30.0, 40.0, 50.0, 50.0, 60.0), (50.0, 60.0, 70.0))
     limit = float(options.get("limit", rng.choice(limits[lanes - 1])))  # type: ignore[arg-type]
-    width = round(float(rng.uniform(3.1, 3.75) if limit > 30.0 else rng.uniform(3.0, 3.5)), 2)
+    width = round(float(rng.uniform(3.2, 3.75) if limit > 30.0 else rng.uniform(3.2, 3.5)), 2)
     has_cars = lanes == 1 and limit <= 40.0 and rng.random() < 0.4
     chosen = {
         "width": width,
         "lanes": lanes,
         "parking": round(float(rng.uniform(2.1, 2.4)), 2) if has_cars else 0.0,
+        "wide": _WIDE,
         "sidewalk": round(float(rng.uniform(2.0, 3.5)), 2),
     } | {name: value for name, value in options.items() if name not in ("lanes", "limit", "length")}
     half = lanes * width + float(chosen["parking"])  # type: ignore[arg-type]
@@ -174,7 +176,7 @@ def _reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float
 
 def _rounding(rng: np.random.Generator) -> float:
     """Radius of the kerbs of a junction [m]."""
-    return float(rng.uniform(8.5, 13.5))
+    return float(rng.uniform(10.0, 15.0))
 
 
 def _angles(rng: np.random.Generator, count: int) -> list[float]:
@@ -375,7 +377,7 @@ def _narrow_street(rng: np.random.Generator) -> list[Street]:
     """A winding street with parked cars, narrow places and a side street or none of note."""
     limit = float(rng.choice((30.0, 30.0, 40.0, 50.0)))
     angles = [0.0, np.pi / 2 + float(rng.uniform(-0.3, 0.3)), np.pi + float(rng.uniform(-0.3, 0.3))]
-    width = round(float(rng.uniform(3.0, 3.4)), 2)
+    width = round(float(rng.uniform(3.15, 3.45)), 2)
     arms = []
     for place in range(3):
         is_side = place == 1
@@ -411,12 +413,12 @@ def _car_park(rng: np.random.Generator) -> list[Street]:
         line(aisle),
     )
     length = sum(piece.length for piece in way)
-    limit, width = float(rng.choice((30.0, 40.0, 50.0))), round(float(rng.uniform(3.1, 3.6)), 2)
+    limit, width = float(rng.choice((30.0, 40.0, 50.0))), round(float(rng.uniform(3.25, 3.6)), 2)
     free = np.flatnonzero(rng.random(60) < rng.uniform(0.2, 0.6))
     lot = Street(
-        "lot", 4, (x, start, north), way, 3.0, 20.0, is_main=False, junctions=(101, 102),
+        "lot", 4, (x, start, north), way, 3.4, 20.0, wide=_WIDE, is_main=False, junctions=(101, 102),
         stop=2.0, sidewalk=1.8, parking=5.2,
-        stalls=((8.0, aisle - 6.0), (length - aisle + 6.0, length - 8.0)),
+        stalls=((18.0, aisle - 6.0), (length - aisle + 6.0, length - 18.0)),
         empty=tuple(free.tolist()), crossings=((0.5 * aisle, 0.5 * aisle + 3.0),), is_marked=False,
     )  # fmt: skip
     side = partial(_street, rng, lanes=1, limit=limit, width=width, parking=0.0)

@@ -18,13 +18,13 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.world.state import LightStatus
 
 _KINDS = {
-    "car": 0.69,
+    "car": 0.71,
     "van": 0.09,
     "pickup": 0.06,
     "truck": 0.04,
     "bus": 0.03,
     "motorcycle": 0.03,
-    "bicycle": 0.06,
+    "bicycle": 0.04,
 }
 _CHANGING = 70.0  # m, shortest street to change lanes on
 _MERGING = 14.0  # m, on which who was parked joins the lane
@@ -40,28 +40,20 @@ def random_traffic(place: Place, rng: np.random.Generator, duration: float) -> T
     drivers += _arriving(ways, rng, duration)
     walkers = _walkers(town, rng, duration)
     for _ in range(_ROUNDS):
-        traffic = Traffic(town, [_anew(x) for x in drivers], [_anew_on_foot(x) for x in walkers],
-                          lights=place.lights)  # fmt: skip
-        boxes = traffic.record(duration)
-        culprit = _who_touches(boxes, town.parked(), drivers)
-        if culprit is None:
+        traffic = Traffic(
+            town, [_anew(x) for x in drivers], [replace(x) for x in walkers], lights=place.lights
+        )
+        culprits = _who_touches(traffic.record(duration), town.parked(), drivers)
+        if not culprits:
             break
-        if culprit < len(drivers):
-            drivers.pop(culprit)
-        else:
-            walkers.pop(culprit - len(drivers))
-    return Traffic(
-        town, [_anew(x) for x in drivers], [_anew_on_foot(x) for x in walkers], lights=place.lights
-    )
+        walkers = [x for k, x in enumerate(walkers, len(drivers)) if k not in culprits]
+        drivers = [x for k, x in enumerate(drivers) if k not in culprits]
+    return traffic
 
 
 def _anew(driver: Driver) -> Driver:
     """A driver who has not set off yet."""
     return replace(driver, held=set(), waiting=set())
-
-
-def _anew_on_foot(walker: Walker) -> Walker:
-    return replace(walker)
 
 
 class _Ways:
@@ -107,7 +99,7 @@ class _Ways:
             _, lane = self.town.connectors[junction, current, lane, target]
             street = self.town.streets[target]
             seen.add(target)
-            if street.name == "lot" and self.rng.random() < 0.6:
+            if street.name == "lot" and self.rng.random() < 0.35:
                 free = [x for x in street.empty if x < len(self.town.bays["lot"])]
                 if free:
                     names.append(f"lot@{self._bay(free, street.junctions[0] == junction)}")
@@ -145,7 +137,7 @@ def _driver(path: Path, category: str, rng: np.random.Generator, **rest: float) 
     if category in ("truck", "bus"):
         eager = float(rng.uniform(0.7, 0.92))
     made = Driver(category, path, eager=round(eager, 3), **rest)  # type: ignore[arg-type]
-    if rng.random() < 0.2:
+    if rng.random() < 0.16:
         made.wave = (round(float(rng.uniform(0.15, 0.65)), 2), round(float(rng.uniform(6, 15)), 1))
     if rng.random() < (0.4 if category == "bus" else 0.05) and not path.is_parking:
         made.halt = _halt(path, made, rng)
@@ -325,17 +317,21 @@ def _walkers(town: Town, rng: np.random.Generator, duration: float) -> list[Walk
     return sorted(out, key=lambda x: x.start)
 
 
-def _who_touches(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> int | None:
-    """Number of the agent to leave out, since it is the first one to touch somebody."""
+def _who_touches(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set[int]:
+    """Numbers of agents to leave out, so that nobody touches anybody."""
     rows = np.array([(x[0], x[1], *x[3:6], *SIZES[x[2]][:2]) for x in boxes])
+    out: set[int] = set()
     if not len(rows):
-        return None
+        return out
     still = np.column_stack(
-        [np.full(len(parked), -1.0), np.full(len(parked), 1e9), parked,
-         np.tile([4.5, 1.85], (len(parked), 1))]
-    )  # fmt: skip
-    last = int(rows[:, 0].max())
-    for frame in range(0, last + 1, 3):
+        [
+            np.full(len(parked), -1.0),
+            np.full(len(parked), 1e9),
+            parked,
+            np.tile([4.5, 1.85], (len(parked), 1)),
+        ]
+    )
+    for frame in range(0, int(rows[:, 0].max()) + 1, 3):
         low, high = np.searchsorted(rows[:, 0], (frame, frame + 1))
         now = np.concatenate([rows[low:high], still])
         count = high - low
@@ -349,11 +345,11 @@ def _who_touches(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) ->
             continue
         sizes = now[:, 5:7] + np.where(now[:, 1:2] < 1e9, _MARGIN, 0.0)
         shapes = shapely.polygons(boxes_to_corners(now[:, 2:5], sizes))
-        meet = shapely.intersects(shapes[i], shapes[j])
-        if meet.any():
-            one, two = (int(x[meet][0]) for x in (i, j))
-            return _blamed(now[one], now[two], drivers)
-    return None
+        for k in np.flatnonzero(shapely.intersects(shapes[i], shapes[j])).tolist():
+            one, two = now[i[k]], now[j[k]]
+            if not out & {int(one[1]) - 1, int(two[1]) - 1}:
+                out.add(_blamed(one, two, drivers))
+    return out
 
 
 def _blamed(one: FloatArray, two: FloatArray, drivers: list[Driver]) -> int:

@@ -25,6 +25,7 @@ from shiftsim.data.store.tracks import open_recording
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.towns.layouts import KINDS, Place, random_place
 from shiftsim.data.towns.people import random_traffic
+from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import TrafficLights
 
@@ -48,7 +49,10 @@ class MakeTown:
         for attempt in range(_TRIES):
             with tempfile.TemporaryDirectory(prefix="shiftsim-town-") as scratch:
                 store = Path(scratch) / "store"
-                count = _make(name, _generator(name, attempt), Path(scratch) / name, store)
+                try:
+                    count = _make(name, _generator(name, attempt), Path(scratch) / name, store)
+                except ConversionError:  # such as traffic that is not on the road
+                    continue
                 if count >= _ENOUGH:
                     shutil.move(store, self.folder / name)
                     return
