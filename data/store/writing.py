@@ -43,7 +43,10 @@ class StoreWriter:
     """
 
     def __init__(self, path: str | Path, generator: dict[str, Any] | None = None) -> None:
-        """`generator` says what made the content up; a store of recordings has none."""
+        """`generator` says what made all the content up; a store of recordings has none.
+
+        What is added without one to a generated store makes it a store of recordings.
+        """
         self.path = Path(path)
         self._generator = generator
         self._rows: dict[str, dict[str, Any]] = {}

@@ -9,6 +9,7 @@ from typing import Any
 
 from shiftsim.data.deepplan.convert import Spread
 from shiftsim.data.store.reading import ScenarioStore, read_report
+from shiftsim.data.store.tables import MANIFEST
 from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.data.towns.recordings import MakeTown, town_names
 from shiftsim.errors import ConfigError, DataError
@@ -24,21 +25,26 @@ def write_towns(
     spread: Spread,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ScenarioStore:
-    """A new store of random towns, the same bytes for the same number and seed.
+    """A store of random towns, the same bytes for the same number and seed.
 
     Args:
-        path: Its folder, which must not exist.
+        path: Its folder, which must not exist, or hold that store already.
         towns: How many towns; a store of more holds those of fewer.
         seed: Of everything that is random.
         spread: How towns are spread over processes.
         progress: Called with towns done, towns in all and the name of the last one.
 
     Raises:
-        ConfigError: The folder is there already.
+        ConfigError: The folder holds something else.
         DataError: A process died.
     """
+    generator = {"name": GENERATOR, "seed": seed, "towns": towns}
     if path.exists():
-        raise ConfigError(f"{str(path)!r} is there already", hint="give a new folder, or remove it")
+        if (path / MANIFEST).is_file() and (found := ScenarioStore(path)).generator == generator:
+            return found
+        raise ConfigError(
+            f"{str(path)!r} holds something else", hint="name a new folder with --out"
+        )
     names = town_names(towns, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     progress(0, towns, "")
@@ -50,7 +56,7 @@ def write_towns(
                 raise DataError(f"town {outcome.task!r}: {outcome.death}", hint="start again")
             progress(done, towns, outcome.task)
         store = Path(scratch) / "store"
-        with StoreWriter(store, {"name": GENERATOR, "seed": seed, "towns": towns}) as writer:
+        with StoreWriter(store, generator) as writer:
             for name in names:
                 _add(parts / name, name, writer)
         store.rename(path)

@@ -9,6 +9,7 @@ import typer
 from shiftsim import cli
 from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
 from shiftsim.cli.running import run_config
+from shiftsim.errors import ConfigError
 
 _PLANNERS = ("log-future", "idm", "constant-velocity")
 _NOISE = ("none", "ou-high")
@@ -20,18 +21,25 @@ def demo(
     towns: Annotated[
         int | None, typer.Option(min=1, help="Only make a store of N random towns to train in.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random towns.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of the random towns; same seed, same bytes. [0]")
+    ] = None,
     *,
     settings: cli.Settings,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Generate small recordings, convert them, run three planners clean and disturbed."""
+    """Generate small recordings, convert them, run three planners clean and disturbed.
+
+    With --towns, generate, convert and filter random towns to train in, and run nothing.
+    """
     from shiftsim.files import store_path
 
     if towns is not None:
-        _make_towns(out or store_path(f"towns-{seed}"), towns, seed, settings, quiet=quiet)
+        _make_towns(out, towns, seed or 0, settings, quiet=quiet)
         return
+    if seed is not None:
+        raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
     from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
     from shiftsim.runs.config import DEFAULT_STORE, make_config
     from shiftsim.verify.warmup import warm_up
@@ -62,14 +70,18 @@ def demo(
 
 
 def _make_towns(
-    folder: Path, towns: int, seed: int, settings: cli.Settings, *, quiet: bool
+    out: Path | None, towns: int, seed: int, settings: cli.Settings, *, quiet: bool
 ) -> None:
     """Generate, convert and filter random towns."""
+    if "limit" in settings:
+        raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
     from shiftsim.data.towns.store import write_towns
+    from shiftsim.files import store_path
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.filter import filter_store
     from shiftsim.runs.workers import map_unordered
 
+    folder = out or store_path(f"towns-{seed}")
     workers = settings.get("workers", 0) or default_workers()
     say(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
     with progress_bar(quiet=quiet) as advance:
@@ -82,3 +94,4 @@ def _make_towns(
         )
     counts = found.counts()
     say(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
+    say(f" next: shiftsim run --planner log-future --store {folder} --limit 20")
