@@ -1,7 +1,7 @@
 """Drivers and pedestrians of the demo, and what a driver knows about the place ahead."""
 
 from dataclasses import dataclass, field
-from math import cos, hypot, sin
+from math import cos, hypot, pi, sin
 
 from shiftsim.data.demo.paths import Path, Walk, Zone
 
@@ -34,6 +34,11 @@ class Driver:
     held: set[int] = field(default_factory=set)  # zones of its path it has been admitted to
     waiting: set[str] = field(default_factory=set)  # places it has begun to brake for
     patience: float = 6.0  # how long it will stand before others let it in [s]
+    # arc length where it stops for a while, and how long [m, s]
+    halt: tuple[float, float] = (0.0, 0.0)
+    # share by which it slows down again and again, and how often that is [s]
+    wave: tuple[float, float] = (0.0, 1.0)
+    is_parked: bool = False  # whether it moves off beside the road, once nobody comes from behind
     token: int = 0  # number of its track
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y [m], heading [rad] of its centre
 
@@ -55,6 +60,11 @@ class Driver:
     def has_arrived(self) -> bool:
         """Whether it leaves the recording."""
         return not self.path.is_parking and self.front >= self.path.length - 1.0
+
+    def pace(self, time: float) -> float:
+        """Factor on the desired speed at a time [s]."""
+        depth, period = self.wave
+        return self.eager * (1.0 - depth * (0.5 - 0.5 * cos(2.0 * pi * time / period)))
 
     def move_to(self, s: float) -> None:
         """Go on to an arc length."""

@@ -1,6 +1,7 @@
 """Generated recordings as files in the layout of DSC3D."""
 
 import json
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES
+from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.scenes import DemoSite, Scene, demo_sites, traffic_of
-from shiftsim.data.demo.traffic import DT, Box
+from shiftsim.data.demo.traffic import DT, Box, Traffic
 from shiftsim.geometry.boxes import wrap_angles
 
 _FRAME_RATE, _FRAME_DISTANCE = 25.0, 2
@@ -22,16 +24,18 @@ _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleratio
 def write_demo(folder: Path) -> None:
     """Write the recordings of the demo, one DSC3D folder per town, always the same bytes."""
     for site in demo_sites():
-        _write_site(folder / site.name, site)
+        town = site.town()
+        traffics = [traffic_of(scene, town) for scene in site.scenes]
+        write_site(folder / site.name, site, town, traffics)
 
 
-def _write_site(folder: Path, site: DemoSite) -> None:
-    town = site.town()
+def write_site(folder: Path, site: DemoSite, town: Town, traffics: Iterable[Traffic]) -> None:
+    """Write a town with the traffic of each of its scenes as one DSC3D folder."""
     (folder / "map").mkdir(parents=True, exist_ok=True)
     (folder / "map/map.xodr").write_text(town.network.xml(), encoding="utf-8")
     categories: set[str] = set()
-    for scene in site.scenes:
-        boxes = traffic_of(scene, town).record(scene.duration)
+    for scene, traffic in zip(site.scenes, traffics, strict=True):
+        boxes = traffic.record(scene.duration)
         table = _annotations(boxes, town.parked())
         categories |= set(table["category"].combine_chunks().dictionary.to_pylist())
         _write_recording(folder / "annotations" / scene.name, scene, table)

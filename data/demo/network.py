@@ -44,6 +44,11 @@ class Street:
     sidewalk: float = 3.0  # width, 0 for none [m]
     has_stop_sign: bool = False  # at its begin
     narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
+    # how far vehicles swing to the left there, along s and against it; who must more gives way [m]
+    swings: tuple[float, float] = (_NARROW_ASIDE, _NARROW_ASIDE)
+    wide: float = 0.0  # how far vehicles swing out to turn right at its junctions [m]
+    obstacles: tuple[tuple[float, float], ...] = ()  # s and t of cars parked on the road [m]
+    has_lights: bool = False  # whether traffic lights stand before its junctions
 
     @property
     def half(self) -> float:
@@ -71,7 +76,9 @@ class Street:
             for number, ends in enumerate(self.crossings if self.is_marked else ())
         ]
         sign = self.stop if self.has_stop_sign else None
-        return replace(road, crosswalks=tuple(walks), stop_sign=sign)
+        ends = ((self.stop, "-"), (road.length - self.stop, "+"))
+        lights = [end for end, x in zip(ends, self.junctions, strict=True) if x and self.has_lights]
+        return replace(road, crosswalks=tuple(walks), stop_sign=sign, lights=tuple(lights))
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,11 @@ class Town:
             np.delete(bays, [x for x in self.streets[name].empty if x < len(bays)], axis=0)
             for name, bays in self.bays.items()
         ]
+        for street in self.streets.values():
+            for s, t in street.obstacles:
+                pose = self.network.roads[street.id].at(np.array([s]), t)
+                pose[:, 2] += np.pi * (t > 0.0)
+                poses.append(pose)
         return np.concatenate([np.zeros((0, 3)), *poses])
 
     def path(self, way: str) -> paths.Path:
@@ -224,7 +236,8 @@ def _make_way(town: Town, way: str) -> paths.Path:
             for n, ends in enumerate(street.crossings)
         ]
         if street.narrow:
-            zones.append((_narrow_zone(leg), *_ends(road, leg, lane, street.narrow), 2.0))
+            ends = _ends(road, leg, lane, street.narrow)
+            zones.append((_narrow_zone(leg), *ends, 2.0, street.swings[not is_forward]))
         if number < len(steps) - 1:
             following = re.split(r"[\d>@]", names[number + 1])[0]
             connector, to_lane = town.connectors[leg.enters, street.name, lane, following]
@@ -237,7 +250,8 @@ def _make_way(town: Town, way: str) -> paths.Path:
             parts.append(points)
             limits.append(min(street.limit, onward.limit))
             zone = paths.Zone(connector, 0.0, 0.0, 0.0, rank, origin)
-            zones.append((zone, points[0], points[-1], street.stop))
+            swing = street.wide if _turn(town, leg, target) < -0.5 else 0.0
+            zones.append((zone, points[0], points[-1], street.stop, swing))
             lane, is_forward = to_lane, target.is_forward
     path = paths.make_path(parts, limits)
     return _with_places(path, zones, crossings, is_parking=bool(steps[-1] and steps[-1][4]))
@@ -245,7 +259,7 @@ def _make_way(town: Town, way: str) -> paths.Path:
 
 def _with_places(
     path: paths.Path,
-    zones: list[tuple[paths.Zone, FloatArray, FloatArray, float]],
+    zones: list[tuple[paths.Zone, FloatArray, FloatArray, float, float]],
     crossings: list[tuple[str, FloatArray, FloatArray]],
     *,
     is_parking: bool,
@@ -257,15 +271,16 @@ def _with_places(
     for name, *ends in crossings:
         first, last = sorted(paths.arc_at(path.points, end) for end in ends)
         places.append((name, first, last))
-    for zone, begin, end, stop in zones:
+    for zone, begin, end, stop, swing in zones:
         entry, leave = paths.arc_at(path.points, begin), paths.arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
         made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
-        if zone.id < 0:
+        if swing or zone.id < 0:
             outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
             share = np.clip(1.0 - outside, 0.0, 1.0)
-            aside += _NARROW_ASIDE * share * share * (3.0 - 2.0 * share)
+            aside += swing * share * share * (3.0 - 2.0 * share)
+        if zone.id < 0:
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
     path = paths.shifted(replace(path, speed=paths.brake_in_time(speed)), aside)
     order = tuple(sorted(made, key=lambda zone: zone.entry))
@@ -275,7 +290,9 @@ def _with_places(
 def _narrow_zone(leg: Leg) -> paths.Zone:
     number = -2 * leg.street.id - leg.is_forward
     name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
-    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - leg.is_forward, name)
+    ahead, back = leg.street.swings
+    goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
+    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - goes_first, name)
 
 
 def _ends(

@@ -88,6 +88,8 @@ class RoadSpec:
     successor: tuple[str, int, str] | None = None  # likewise
     crosswalks: tuple[CrosswalkSpec, ...] = ()  # on this road
     stop_sign: float | None = None  # s of a stop sign for traffic against s; None for none [m]
+    # s of traffic lights, and the direction that they are for, + along s, - against it
+    lights: tuple[tuple[float, str], ...] = ()
 
     @property
     def length(self) -> float:
@@ -292,9 +294,16 @@ def _objects_xml(road: RoadSpec) -> str:
 
 
 def _signals_xml(road: RoadSpec) -> str:
-    if road.stop_sign is None:
-        return ""
-    return (
-        f'<signals><signal id="{road.id}1" s="{road.stop_sign!r}" t="5" name="stop" dynamic="no" '
-        'orientation="-" zOffset="2" country="DE" type="206" subtype="-1" value="-1"/></signals>'
-    )
+    signals = []
+    if road.stop_sign is not None:
+        signals.append(
+            f'<signal id="{road.id}1" s="{road.stop_sign!r}" t="5" name="stop" dynamic="no" '
+            'orientation="-" zOffset="2" country="DE" type="206" subtype="-1" value="-1"/>'
+        )
+    for number, (s, orientation) in enumerate(road.lights, start=2):
+        signals.append(
+            f'<signal id="{road.id}{number}" s="{s!r}" t="5" name="light" dynamic="yes" '
+            f'orientation="{orientation}" zOffset="4" country="OpenDRIVE" type="1000001" '
+            'subtype="-1" value="-1"/>'
+        )
+    return f"<signals>{''.join(signals)}</signals>" if signals else ""

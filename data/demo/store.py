@@ -14,6 +14,7 @@ from shiftsim.data.deepplan.convert import ConversionReport, convert_dsc3d
 from shiftsim.data.demo.city import bench_scene
 from shiftsim.data.demo.files import write_demo
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.writing import StoreWriter
 
 __all__ = ["DEMO_SPLIT", "bench_scene", "convert_demo", "demo_store", "write_demo"]
 
@@ -29,6 +30,7 @@ def convert_demo(recordings: Path, store: Path) -> list[ConversionReport]:
         for site in sorted(recordings.iterdir())
         if (site / "data_meta.json").is_file()
     ]
+    StoreWriter(store, {"name": "demo"}).close()
     tokens = _sample(ScenarioStore(store))
     lines = [f'name = "{DEMO_SPLIT}"', "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
     (store / "splits").mkdir(exist_ok=True)

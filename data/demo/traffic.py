@@ -6,6 +6,7 @@ conflicting ways at a time; a crossing belongs to whoever is on it, then to pede
 vehicles can still stop for. Steps are the frames of the recording.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import cos, inf, sin, sqrt
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
+from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.paths import STEP, Zone, arc_at
 
@@ -40,10 +42,18 @@ class Traffic:
     # frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration [m/s^2], yaw
     # rate [rad/s]
     boxes: list[Box] = field(default_factory=list)
+    lights: Sequence[Lights] = ()  # of junctions
     _passing: dict[tuple[int, int], float] = field(default_factory=dict)
+    _closed: set[int] = field(
+        default_factory=set
+    )  # connecting roads with a light that is not green
+    # how long the light for vehicles will stay red, by crosswalk [s]
+    _waits: dict[str, float] = field(default_factory=dict)
 
     def record(self, duration: float) -> list[Box]:
-        """Simulate from time 0 and return the boxes of all frames."""
+        """Simulate from time 0, once, and return the boxes of all frames."""
+        if self.boxes:
+            return self.boxes
         everybody: list[Driver | Walker] = [*self.drivers, *self.walkers]
         for number, agent in enumerate(everybody, start=1):
             agent.token = number
@@ -57,7 +67,7 @@ class Traffic:
                     waiting.remove(driver)
             walkers = [w for w in self.walkers if w.start <= time and w.is_under_way]
             self._write(frame, active, walkers)
-            self._step(active, walkers)
+            self._step(active, walkers, time)
             active = [d for d in active if not d.has_arrived]
         return self.boxes
 
@@ -70,10 +80,12 @@ class Traffic:
             place = walker.walk.at(walker.s)
             self.boxes.append((frame, walker.token, "pedestrian", *place, walker.v, 0.0, 0.0))
 
-    def _step(self, drivers: list[Driver], walkers: list[Walker]) -> None:
+    def _step(self, drivers: list[Driver], walkers: list[Walker], time: float) -> None:
+        self._closed = {number for lights in self.lights for number in lights.closed(time)}
+        self._waits = {name: x for lights in self.lights for name, x in lights.waits(time).items()}
         self._admit(drivers)
         bodies = _bodies(drivers)
-        wanted = [self._acceleration(d, drivers, walkers, bodies) for d in drivers]
+        wanted = [self._acceleration(d, drivers, walkers, bodies, time) for d in drivers]
         self._let_walk(drivers, walkers)
         for driver, accel in zip(drivers, wanted, strict=True):
             driver.a += min(max(accel - driver.a, -1.5 * _JERK * DT), _JERK * DT)
@@ -97,6 +109,8 @@ class Traffic:
         asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].token))
         refused: list[Zone] = []
         for driver, zone in asking:
+            if zone.id in self._closed:
+                continue
             if driver.v < 0.3 and _place_of(zone) in driver.waiting:
                 driver.patience -= DT
             is_far = driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
@@ -112,7 +126,8 @@ class Traffic:
 
     def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
         return any(
-            zone.id in other.held or goes_first(other, zone, driver, wanted)
+            zone.id in other.held
+            or (zone.id not in self._closed and goes_first(other, zone, driver, wanted))
             for zone in other.path.zones
             if self._conflict(wanted, zone)
         )
@@ -121,10 +136,15 @@ class Traffic:
         return (a.id, b.id) in self.town.conflicts
 
     def _acceleration(
-        self, driver: Driver, drivers: list[Driver], walkers: list[Walker], bodies: FloatArray
+        self,
+        driver: Driver,
+        drivers: list[Driver],
+        walkers: list[Walker],
+        bodies: FloatArray,
+        time: float,
     ) -> float:
         index = min(int(driver.s / STEP), len(driver.path.speed) - 1)
-        target = max(driver.eager * float(driver.path.speed[index]), 0.5)
+        target = max(driver.pace(time) * float(driver.path.speed[index]), 0.5)
         free = _MAX_ACCEL * (1.0 - (driver.v / target) ** 4)
         accel = max(free, -1.8)
         gap, lead_speed = _leader(driver, drivers, bodies)
@@ -133,11 +153,13 @@ class Traffic:
             wanted = _MIN_GAP + max(0.0, driver.v * _HEADWAY + closing)
             following = free - _MAX_ACCEL * (wanted / max(gap, 0.3)) ** 2
             accel = min(accel, max(following, -_HARDEST))
-        for name, place in self._places_to_wait(driver, walkers):
+        for name, place in self._places_to_wait(driver, drivers, walkers):
             accel = min(accel, _even_braking(driver, name, place))
         return accel
 
-    def _places_to_wait(self, driver: Driver, walkers: list[Walker]) -> list[tuple[str, float]]:
+    def _places_to_wait(
+        self, driver: Driver, drivers: list[Driver], walkers: list[Walker]
+    ) -> list[tuple[str, float]]:
         places = []
         path = driver.path
         for zone in path.zones:
@@ -152,6 +174,11 @@ class Traffic:
                 places.append((name, place))
             else:
                 driver.waiting.discard(name)
+        if driver.halt[1] > 0.0 and driver.front <= driver.halt[0]:
+            places.append(("halt", driver.halt[0]))
+            waits = driver.is_parked and any(_comes(x, driver) for x in drivers)
+            if driver.v < 0.1 and driver.halt[0] - driver.front < 3.0 and not waits:
+                driver.halt = driver.halt[0], driver.halt[1] - DT
         if path.is_parking:
             places.append(("end", path.length + 0.5 * driver.length + 0.9))
         return places
@@ -163,6 +190,8 @@ class Traffic:
                 continue
             if walker.crossing:
                 return True
+            if name in self._waits and not self._has_time(walker):
+                continue
             near = walker.s > walker.walk.kerb - 2.5
             if near and (name in driver.waiting or driver.needed(place) < _YIELDING):
                 return True
@@ -189,7 +218,14 @@ class Traffic:
                 walker.crossing = walker.s <= walk.across
             walker.v = min(walker.v + 1.0 * DT, WALKING)
 
+    def _has_time(self, walker: Walker) -> bool:
+        """Whether the light lets a pedestrian cross."""
+        walk = walker.walk
+        return self._waits.get(walk.crossing, inf) > (walk.across - walk.kerb) / WALKING
+
     def _may_cross(self, walker: Walker, drivers: list[Driver]) -> bool:
+        if not self._has_time(walker):
+            return False
         needed = (walker.walk.across - walker.walk.kerb) / WALKING + 2.0
         for driver in drivers:
             for name, first, last in driver.path.crossings:
@@ -256,6 +292,15 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
         if gap < best:
             best, speed = gap, max(0.0, other.v * cos(turn))
     return best, float(speed)
+
+
+def _comes(other: Driver, driver: Driver) -> bool:
+    """Whether somebody is beside or behind on the lane that a parked driver moves off to."""
+    x, y, heading = driver.place
+    dx, dy = other.place[0] - x, other.place[1] - y
+    along = dx * cos(heading) + dy * sin(heading)
+    near = -4.5 * other.v - 12.0 < along < 9.0 and 0.5 < driver.aside(*other.place[:2]) < 5.0
+    return near and cos(other.place[2] - heading) > 0.5
 
 
 def _may_lead(other: Driver, driver: Driver, reach: float) -> bool:

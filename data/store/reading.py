@@ -39,6 +39,8 @@ class ScenarioStore:
         source: Where others find it: the folder, or the URL it is copied from.
         tokens: Tokens of all scenarios, sorted.
         hash: Digest of the content; equal content has an equal hash.
+        generator: What made the content up, such as `{"name": "towns", "seed": 1}`; empty where it
+            was recorded.
         is_reviewed: Whether people said something of the scenarios, in `reviews`.
     """
 
@@ -51,6 +53,7 @@ class ScenarioStore:
         self._fetch = fetch
         manifest = tables.read_manifest(path)
         self.hash = str(manifest["hash"])
+        self.generator: dict[str, Any] = dict(manifest.get("generator", {}))
         self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
         self.is_reviewed = (path / tables.REVIEW).is_file()

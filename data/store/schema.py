@@ -1,6 +1,7 @@
 """What the files of a store hold: every column with its type and unit.
 
-    store.json                        format, version, content hash, digest of every file
+    store.json                        format, version, content hash, digest of every file, and what
+                                      made the content up, where it was generated
     scenarios.parquet                 one row per scenario
     maps/<city>.parquet               one row: the arrays of the map, flat
     recordings/<log>/frames.parquet   one row per row of the recording: time, traffic lights

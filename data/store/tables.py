@@ -81,6 +81,8 @@ def read_manifest(store: Path) -> dict[str, Any]:
             f" {schema.VERSION}",
             hint="convert the data again with this version of shiftsim",
         )
+    if not isinstance(manifest.get("generator", {}), dict):
+        raise DataError(f"{path}: damaged: 'generator' is no table", hint=REPAIR)
     if not isinstance(files, dict):
         raise DataError(f"{path}: damaged: no list of files", hint=REPAIR)
     for name, value in {"hash": content, **files}.items():

@@ -42,8 +42,13 @@ class StoreWriter:
     What is added again replaces what is there. Equal content gives equal bytes.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, generator: dict[str, Any] | None = None) -> None:
+        """`generator` says what made all the content up; a store of recordings has none.
+
+        What is added without one to a generated store makes it a store of recordings.
+        """
         self.path = Path(path)
+        self._generator = generator
         self._rows: dict[str, dict[str, Any]] = {}
         self._files: dict[str, str] = {}
         self._cities: dict[str, str] = {}
@@ -141,7 +146,9 @@ class StoreWriter:
         self._note(self.path / tables.SCENARIOS)
         files = dict(sorted(self._files.items()))
         content = hashlib.sha256(json.dumps(files).encode()).hexdigest()
-        kind = {"format": schema.FORMAT, "version": schema.VERSION}
+        kind: dict[str, Any] = {"format": schema.FORMAT, "version": schema.VERSION}
+        if self._generator is not None:
+            kind["generator"] = self._generator
         tables.write_json(self.path / tables.MANIFEST, kind | {"hash": content, "files": files})
 
     def _name(self, path: Path) -> str:

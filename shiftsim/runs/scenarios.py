@@ -96,7 +96,7 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
     columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
     used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
 
-    with StoreWriter(target) as writer:
+    with StoreWriter(target, store.generator or None) as writer:
         for city in sorted({city for _, _, city in used}):
             writer.add_map(store.map(city))
         for recording in sorted({recording for _, recording, _ in used}):
