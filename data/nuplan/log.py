@@ -276,13 +276,17 @@ def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> Traffic
         joins="JOIN traffic_light_status AS s ON s.lidar_pc_token = pc.token",
         order="s.rowid",
     )
-    index: dict[str, int] = {}
-    connector = [index.setdefault(str(row[1]), len(index)) for row in rows]
     frame = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64)) - first
+    # nuPlan rule 429: a connector keeps all the states that a frame lists, the n-th in column n
+    index: dict[tuple[str, int], int] = {}
+    times: Counter[tuple[int, str]] = Counter()
+    column = np.empty(len(rows), np.int64)
+    for place, (at, (_, connector, _)) in enumerate(zip(frame.tolist(), rows, strict=True)):
+        name = str(connector)
+        column[place] = index.setdefault((name, times[at, name]), len(index))
+        times[at, name] += 1
     status = np.full((last - first, len(index)), int(LightStatus.ABSENT), np.int8)
     # nuPlan rule 428
-    codes = [int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows]
-    status[frame, np.array(connector, np.int64)] = codes
-    twice = len(rows) - int((status != LightStatus.ABSENT).sum())
-    flaws["traffic light listed twice in a frame: the last one is kept"] += twice
-    return TrafficLights(tuple(index), status)
+    status[frame, column] = [int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows]
+    flaws["traffic light listed several times in a frame"] += len(rows) - len(times)
+    return TrafficLights(tuple(name for name, _ in index), status)

@@ -94,7 +94,7 @@ class Observation:
 
     @property
     def traffic_lights(self) -> dict[str, LightStatus]:
-        """Status of the listed lane connectors."""
+        """Status of the listed lane connectors; the last one where one is listed with several."""
         return self.lights.at(0)
 
 

@@ -16,7 +16,7 @@ from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scen
 from shiftsim.errors import ConfigError, ConversionError, DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind
+from shiftsim.world.state import AgentKind, LightStatus
 
 GOLDEN = places.GOLDEN / "nuplan_format"
 TOKEN = "000000012a05f23c"
@@ -135,6 +135,22 @@ def test_a_track_listed_twice_in_a_frame_is_counted_and_the_last_kept(
         GOLDEN / "logs" / "fixture_log_0001.db", TOKEN, road, FROM_START
     ).tracks
     assert np.nansum(changed.poses - original.poses) == pytest.approx(1.0)
+
+
+def test_a_light_with_two_states_at_once_keeps_both(log_path: Path, road: VectorMap) -> None:
+    original, flaws = read(log_path, road).traffic_lights, Counter[str]()
+    edit(
+        log_path,
+        "INSERT INTO traffic_light_status SELECT randomblob(8), lidar_pc_token, lane_connector_id,"
+        " 'yellow' FROM traffic_light_status WHERE rowid <= 2",
+    )
+    lights = read(log_path, road, flaws).traffic_lights
+    row, code = int(original.status.max(axis=1).argmax()), LightStatus.YELLOW
+    name, first = original.listed(row)[0]
+    assert [status for other, status in lights.listed(row) if other == name] == [first, code]
+    assert lights.at(row)[name] == code
+    assert lights.connector_ids[: len(original.connector_ids)] == original.connector_ids
+    assert +flaws == {"traffic light listed several times in a frame": 2}
 
 
 BROKEN = {
