@@ -15,6 +15,7 @@ from pathlib import Path
 from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
 from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
 from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.data.nuplan.surroundings import read_with_surroundings
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import write_json
@@ -79,7 +80,7 @@ def export_nuplan(
     _write_maps(store, report)
     for done, token in enumerate(chosen):
         progress(done, len(chosen), names[token])
-        scenario = store.read(token)
+        scenario = read_with_surroundings(store, token)
         path = report.logs / f"{names[token]}.db"
         mapping = write_nuplan_log(path, scenario, epsg=epsg_of(scenario.map))
         report.tokens[token] = log_token(token).hex()

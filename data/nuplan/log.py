@@ -204,10 +204,10 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
     if not np.isfinite(pose).all():
         what = f"the goal of {log.tokens[row]!r} is not finite"
         raise _damaged(log.path, what, ConversionError)
-    return route, np.array([pose[0, 0], pose[0, 1], _yaw(pose[:, 2:])[0]])
+    return route, np.array([pose[0, 0], pose[0, 1], yaw_of(pose[:, 2:])[0]])
 
 
-def _yaw(quaternions: FloatArray) -> FloatArray:
+def yaw_of(quaternions: FloatArray) -> FloatArray:
     """Heading of quaternions (K, 4) w, x, y, z [rad]."""
     square = (quaternions * quaternions).sum(axis=1, keepdims=True)
     unit = np.abs(1.0 - square) < _UNIT_TOLERANCE
@@ -234,7 +234,7 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
         raise _damaged(log.path, what, ConversionError)
     values = as_numbers(log.path, "ego_pose", [row[1:] for row in rows])
     with np.errstate(invalid="ignore"):
-        heading = _yaw(values[:, 2:6])
+        heading = yaw_of(values[:, 2:6])
     states = np.zeros((len(values), NUM_STATE))
     states[:, :2], states[:, 2], states[:, 3:7] = values[:, :2], heading, values[:, 6:10]
     bad = np.flatnonzero(~np.isfinite(states).all(axis=1))

@@ -15,17 +15,16 @@ from shiftsim.arrays import IntArray
 from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
 from shiftsim.data.nuplan.log import Log, has_goals, open_log, read_ego, read_lights, read_route
 from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.mapping import Mapping, mapping_of
+from shiftsim.data.nuplan.mapping import Mapping, ends_early, mapping_of
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
-ROW_SECONDS = 0.05  # nominal distance of log rows
 _PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window
 # nuPlan rule 417: rows are counted where it looks back and ahead, so keep at least as many
-_PAST_ROWS, _FUTURE_ROWS = 60, 161
+PAST_ROWS, FUTURE_ROWS = 60, 161
 _MIN_ITERATIONS = 3
 EGO = "ego"
 
@@ -108,14 +107,14 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
         scenario_type=scenario_type,
         log_name=log.name,
         ego=EGO,
-        first_row=max(min(early, first - _PAST_ROWS), 0),
-        last_row=min(max(late, int(iterations[-1]) + 1 + _FUTURE_ROWS), len(log.time_us)),
+        first_row=max(min(early, first - PAST_ROWS), 0),
+        last_row=min(max(late, int(iterations[-1]) + 1 + FUTURE_ROWS), len(log.time_us)),
         iteration_rows=iterations,
         row_step=step,
         route=route,
         mission_goal=goal,
         mapping=chosen,
-        is_short=bool(end - log.time_us[-1] > 0.9e6 * ROW_SECONDS),  # a row is missing
+        is_short=ends_early(log.time_us, end),
     )
 
 

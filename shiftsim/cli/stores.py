@@ -207,7 +207,7 @@ def export_to_nuplan(
         say(f" {len(report.renamed)} tokens had another form and were replaced: --json lists them")
     if report.missing_maps:
         say(f" nuPlan's own code also opens the maps {', '.join(report.missing_maps)}: add them")
-    words = {",".join(f"{value:g}" for value in row["mapping"]) for row in mappings}
+    words = {",".join(f"{value:.12g}" for value in row["mapping"]) for row in mappings}
     mapping = f" --mapping {words.pop()}" if len(words) == 1 else ""
     say(
         f" read back: shiftsim convert nuplan {report.logs} {report.maps}"

@@ -135,8 +135,8 @@ def test_a_light_that_is_red_and_green_at_once_is_both(codes: tuple[int, int]) -
 
     def end(road: VectorMap, *codes: int) -> float:
         lights = TrafficLights(("21",) * len(codes), np.full((ROWS, len(codes)), codes, np.int8))
-        changed = replace(base, map=road, traffic_lights=lights)
-        return float(drive(changed, traffic=IdmTraffic(IdmParameters(radius=1e3))).poses[-1, 0, 0])
+        changed, far = replace(base, map=road, traffic_lights=lights), IdmParameters(radius=1e3)
+        return float(drive(changed, steps=150, traffic=IdmTraffic(far)).poses[-1, 0, 0])
 
     assert end(lit, *codes) == end(lit, 0) > 200.0  # enters where green is asked for
     assert end(road, *codes) == end(road, 2) < 200.0  # and not where red is
