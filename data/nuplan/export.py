@@ -22,6 +22,7 @@ from shiftsim.data.store.tables import write_json
 from shiftsim.errors import ConversionError
 
 MAP_VERSION = "1.0.0"
+ROWS_AHEAD = 10  # behind a plan's first state, nuPlan rule 393
 # nuPlan rule 426: maps that its own code opens whatever map is asked for
 ALWAYS_OPENED = (
     "sg-one-north",
@@ -46,6 +47,8 @@ class ExportReport:
     cities: list[str] = field(default_factory=list)  # names of the maps written
     # number of scenarios by type and mapping (duration, offset, ratio)
     mappings: Counter[tuple[str, Mapping]] = field(default_factory=Counter)
+    # scenarios whose recording ends less than 0.5 s after the last plan: log-future fails in nuPlan
+    cut_off: int = 0
     # maps that nuPlan's own code opens and that are not in the folder
     missing_maps: list[str] = field(default_factory=list)
 
@@ -85,6 +88,7 @@ def export_nuplan(
         mapping = write_nuplan_log(path, scenario, epsg=epsg_of(scenario.map))
         report.tokens[token] = log_token(token).hex()
         report.mappings[scenario.scenario_type, mapping] += 1
+        report.cut_off += int(scenario.iteration_rows[-2]) + ROWS_AHEAD >= len(scenario.time_us)
     progress(len(chosen), len(chosen), "")
     report.token_file.write_text("\n".join(sorted(report.tokens.values())) + "\n", "utf-8")
     return report

@@ -107,14 +107,12 @@ def _from_values(path: Path, values: Mapping[str, Any]) -> ScenarioFilter:
     if not 0.0 <= (numbers["min_share"] or 0.0) <= 1.0:
         what = f"fraction_in_token_set_threshold is {numbers['min_share']:g}"
         raise ConfigError(f"{path}: {what}, not within 0 … 1", hint="give a share")
-    types = _names(path, values, "scenario_types")
     per_type, limit = (_count(path, values, key) for key in _COUNTS)
     if isinstance(per_type, float):
         raise ConfigError(f"{path}: num_scenarios_per_type is a share", hint="give a whole number")
     return ScenarioFilter(
         tokens=None if tokens is None else _tokens(path, tokens),
-        # nuPlan rule 432: a row without a tag has no type, and none can ask for it
-        types=None if types is None else types - {"unknown"},
+        types=_names(path, values, "scenario_types"),
         logs=_names(path, values, "log_names"),
         maps=_names(path, values, "map_names"),
         remove_invalid_goals=values.get("remove_invalid_goals") is True,

@@ -37,6 +37,7 @@ _EGO_COLUMNS = {
     **{"acceleration_x": "ax_mps2", "acceleration_y": "ay_mps2"},
 }
 _LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
+UNTAGGED = "unknown"
 _UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
 _IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
 
@@ -113,26 +114,26 @@ def _read_clock(database: Database) -> Log:
         tokens=tokens,
         time_us=time_us,
         rowids=np.array([row[4] for row in rows], np.int64),
-        types=_read_types(database, [row[0] for row in rows], None),
+        types=[text or UNTAGGED for text in _read_tags(database, [row[0] for row in rows])],
         scenes=[row[2] for row in rows],
         is_offered=np.array([row[2] in offered for row in rows], np.bool_),
     )
 
 
 def read_types(log: Log, wanted: frozenset[str]) -> list[str]:
-    """R scenario types, as in `Log.types`, where only those wanted are looked at."""
-    return _read_types(log.database, [bytes.fromhex(token) for token in log.tokens], wanted)
+    """R scenario types, as in `Log.types`, of the tags that are wanted; empty without one."""
+    return _read_tags(log.database, [bytes.fromhex(token) for token in log.tokens], wanted)
 
 
-def _read_types(
-    database: Database, tokens: list[bytes], wanted: frozenset[str] | None
+def _read_tags(
+    database: Database, tokens: list[bytes], wanted: frozenset[str] | None = None
 ) -> list[str]:
     tags: dict[bytes, str] = {}
     listed = database.query("SELECT lidar_pc_token, type FROM scenario_tag", "'scenario_tag'")
     for token, text in listed:  # nuPlan rule 418: the largest of several tags, of those asked for
         if text is not None and (wanted is None or text in wanted):
             tags[token] = max(tags.get(token, ""), str(text))
-    return [tags.get(token) or "unknown" for token in tokens]
+    return [tags.get(token, "") for token in tokens]
 
 
 def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]]) -> IntArray:

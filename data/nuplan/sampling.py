@@ -10,9 +10,9 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.nuplan.filter import ScenarioFilter
-from shiftsim.data.nuplan.log import Log, read_ego
+from shiftsim.data.nuplan.log import UNTAGGED, Log, read_ego
 from shiftsim.data.nuplan.mapping import ROW_SECONDS
-from shiftsim.data.nuplan.scenarios import UNTAGGED, ScenarioEntry
+from shiftsim.data.nuplan.scenarios import ScenarioEntry
 from shiftsim.data.recording import Window
 from shiftsim.errors import ConfigError
 from shiftsim.world.map import VectorMap

@@ -35,7 +35,6 @@ _PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window
 PAST_ROWS, FUTURE_ROWS = 60, 161
 _MIN_ITERATIONS = 3
 EGO = "ego"
-UNTAGGED = "unknown"
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ def offered(
 ) -> list[ScenarioEntry]:
     """The scenarios that nuPlan finds in a log, ordered by time; all tokens and types where None.
 
+    nuPlan rule 418: with types, rows without a tag are not offered, whatever the types.
     Rows of the first two and of the last two scenes (by name) are not offered.
     `remove_invalid_goals` leaves out scenes without a goal.
     """
