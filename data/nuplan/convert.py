@@ -78,11 +78,11 @@ def convert_nuplan(
     with StoreWriter(store) as writer:
         conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
         report = conversion.report
-        taken = _thinned(files, conversion) if chosen.thins_out else None
+        show = progress or (lambda done, total, name: None)
+        taken = _thinned(files, conversion, show) if chosen.thins_out else None
         readable = [path for path in files if path.stem not in report.failed]
         for done, path in enumerate(readable):
-            if progress is not None:
-                progress(done, len(readable), path.stem)
+            show(done, len(readable), path.stem)
             try:
                 with open_log(path) as log:
                     conversion.convert_log(log, taken)
@@ -96,10 +96,13 @@ def convert_nuplan(
     return report
 
 
-def _thinned(files: Sequence[Path], conversion: "_Conversion") -> set[tuple[str, str]]:
+def _thinned(
+    files: Sequence[Path], conversion: "_Conversion", show: Progress
+) -> set[tuple[str, str]]:
     """Log and token of what is left of the scenarios of all logs; logs that fail are noted."""
     entries: list[ScenarioEntry] = []
-    for path in files:
+    for done, path in enumerate(files):
+        show(done, len(files), f"{path.stem}: scenarios")
         try:
             with open_log(path) as log:
                 entries += conversion.offered(log)
