@@ -18,7 +18,7 @@ class Recording:
         log_name: Name of the recording, unique in a store. A part of a longer log is named
             `<log>@<anything>`; its scenarios then carry the name of the log alone.
         city: Name of the map it was recorded on.
-        time_us: (R,) time stamps, strictly increasing [us].
+        time_us: (R,) time stamps, never decreasing [us].
         tracks: All tracks over the rows; a track that serves as ego in some scenario is among
             them, and is left out of that scenario's tracks when it is read.
         lights: Traffic lights over the rows.

@@ -335,9 +335,7 @@ class Idm:
         velocities = tracks.velocities[-1, near]
         speeds = np.where(is_agent, np.hypot(velocities[:, 0], velocities[:, 1]), 0.0)
         lanes = scene.map.edges
-        red = [
-            i for i in red_lanes(scene.map, observation.traffic_lights) if i in self._route_lanes
-        ]
+        red = [i for i in red_lanes(scene.map, observation.lights) if i in self._route_lanes]
         lights = [lanes.rings(lane)[0] for lane in red]
         rings = [*boxes_to_corners(poses[near], sizes[near]), *lights]
         radii = 0.5 * np.hypot(sizes[near, 0], sizes[near, 1])

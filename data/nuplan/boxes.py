@@ -36,7 +36,7 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
     Raises:
         ConversionError: A category is unknown, a pose is not finite or a box has no extent.
     """
-    rows = read_rows(
+    row, rows = read_rows(
         log,
         first,
         last,
@@ -46,17 +46,16 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
         " JOIN category AS c ON t.category_token = c.token",
         order="b.rowid",
     )
-    unknown = sorted({str(row[2]) for row in rows} - set(_KINDS))
+    unknown = sorted({str(r[1]) for r in rows} - set(_KINDS))
     if unknown:
         raise ConversionError(
             f"{log.path}: table 'category': unknown category {unknown[0]!r}",
             hint=f"known are {', '.join(_KINDS)}",
         )
-    row = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64))
-    kind = np.array([_KINDS[r[2]] for r in rows], np.int64)
-    values = as_numbers(log.path, "lidar_box", [r[3:] for r in rows]).reshape(-1, 8)
+    kind = np.array([_KINDS[r[1]] for r in rows], np.int64)
+    values = as_numbers(log.path, "lidar_box", [r[2:] for r in rows]).reshape(-1, 8)
     order = np.lexsort((np.arange(len(rows)), kind, row))
-    token = [token_text(rows[i][1], log.path, "track") for i in order.tolist()]
+    token = [token_text(rows[i][0], log.path, "track") for i in order.tolist()]
     boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
     _check_boxes(log, boxes)
     counts = Counter[str]() if flaws is None else flaws

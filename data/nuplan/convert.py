@@ -4,12 +4,22 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.mapping import Mapping
-from shiftsim.data.nuplan.scenarios import EGO, cut_window, find_maps, load_map, offered, read_span
+from shiftsim.data.nuplan.sampling import is_taken, thin_out
+from shiftsim.data.nuplan.scenarios import (
+    EGO,
+    ScenarioEntry,
+    cut_window,
+    find_maps,
+    load_map,
+    offered,
+    read_span,
+)
 from shiftsim.data.recording import Window
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
@@ -68,20 +78,52 @@ def convert_nuplan(
     with StoreWriter(store) as writer:
         conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
         report = conversion.report
-        for done, path in enumerate(files):
-            if progress is not None:
-                progress(done, len(files), path.stem)
+        show = progress or (lambda done, total, name: None)
+        taken = _thinned(files, conversion, show) if chosen.thins_out else None
+        readable = [path for path in files if path.stem not in report.failed]
+        for done, path in enumerate(readable):
+            show(done, len(readable), path.stem)
             try:
                 with open_log(path) as log:
-                    conversion.convert_log(log)
+                    conversion.convert_log(log, taken)
             except DataError as error:
                 report.failed[path.stem] = _reason(error)
+    unread = [path.name for path in files if path.stem in report.failed]
     for token in sorted((chosen.tokens or frozenset()) - conversion.found):
-        names = ", ".join(path.name for path in files[:5]) + (", …" if len(files) > 5 else "")
-        report.failed[token] = f"not offered by any of {len(files)} logs searched ({names})"
+        report.failed[token] = _missing([path.name for path in files], unread)
     for flaw, count in report.flaws.items():
         _LOG.warning("%s (%d)", flaw, count)
     return report
+
+
+def _thinned(
+    files: Sequence[Path], conversion: "_Conversion", show: Progress
+) -> set[tuple[str, str]]:
+    """Log and token of what is left of the scenarios of all logs; logs that fail are noted."""
+    entries: list[ScenarioEntry] = []
+    for done, path in enumerate(files):
+        show(done, len(files), f"{path.stem}: scenarios")
+        try:
+            with open_log(path) as log:
+                entries += conversion.offered(log)
+        except DataError as error:
+            conversion.report.failed[path.stem] = _reason(error)
+    return {(e.log_name, e.token) for e in thin_out(entries, conversion.chosen)}
+
+
+def _missing(names: Sequence[str], unread: Sequence[str]) -> str:
+    """Why there is no such scenario in logs, some of which could not be read."""
+    listed = _few(unread or names)
+    if not unread:
+        return f"not offered by any of {len(names)} logs searched ({listed})"
+    if len(unread) == len(names):
+        return f"none of {len(names)} logs could be read ({listed})"
+    rest = len(names) - len(unread)
+    return f"not offered by the {rest} of {len(names)} logs that could be read; not read: {listed}"
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
 
 
 def _choice(
@@ -140,17 +182,27 @@ class _Conversion:
         self.maps: dict[str, VectorMap] = {}
         self.found: set[str] = set()  # tokens
 
-    def convert_log(self, log: Log) -> None:
-        """Convert the chosen scenarios of one log."""
-        chosen, report = self.chosen, self.report
+    def offered(self, log: Log) -> list[ScenarioEntry]:
+        """The scenarios of a log that are asked for."""
+        chosen = self.chosen
         if chosen.maps is not None and log.map_name not in chosen.maps:
-            return
-        windows: list[Window] = []
+            return []
         with_goals = chosen.remove_invalid_goals
-        for entry in offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals):
-            self.found.add(entry.token)
+        found = offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals)
+        self.found.update(entry.token for entry in found)
+        return found
+
+    def convert_log(self, log: Log, taken: set[tuple[str, str]] | None) -> None:
+        """Convert the chosen scenarios of one log, or of these the ones `taken` (log and token)."""
+        report = self.report
+        windows: list[Window] = []
+        for entry in self.offered(log):
+            if taken is not None and (log.name, entry.token) not in taken:
+                continue
             try:
-                window = cut_window(log, entry.token, self.mapping)
+                window = cut_window(log, entry.token, self.mapping, entry.scenario_type)
+                if not is_taken(log, window, partial(self._map, log.map_name), self.chosen):
+                    continue
             except ConversionError as error:
                 report.failed[entry.token] = _reason(error)
                 continue

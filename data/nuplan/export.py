@@ -15,12 +15,14 @@ from pathlib import Path
 from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
 from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
 from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.data.nuplan.surroundings import read_with_surroundings
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import write_json
 from shiftsim.errors import ConversionError
 
 MAP_VERSION = "1.0.0"
+ROWS_AHEAD = 10  # behind a plan's first state, nuPlan rule 393
 # nuPlan rule 426: maps that its own code opens whatever map is asked for
 ALWAYS_OPENED = (
     "sg-one-north",
@@ -45,6 +47,8 @@ class ExportReport:
     cities: list[str] = field(default_factory=list)  # names of the maps written
     # number of scenarios by type and mapping (duration, offset, ratio)
     mappings: Counter[tuple[str, Mapping]] = field(default_factory=Counter)
+    # scenarios whose recording ends less than 0.5 s after the last plan: log-future fails in nuPlan
+    cut_off: int = 0
     # maps that nuPlan's own code opens and that are not in the folder
     missing_maps: list[str] = field(default_factory=list)
 
@@ -79,11 +83,12 @@ def export_nuplan(
     _write_maps(store, report)
     for done, token in enumerate(chosen):
         progress(done, len(chosen), names[token])
-        scenario = store.read(token)
+        scenario = read_with_surroundings(store, token)
         path = report.logs / f"{names[token]}.db"
         mapping = write_nuplan_log(path, scenario, epsg=epsg_of(scenario.map))
         report.tokens[token] = log_token(token).hex()
         report.mappings[scenario.scenario_type, mapping] += 1
+        report.cut_off += int(scenario.iteration_rows[-2]) + ROWS_AHEAD >= len(scenario.time_us)
     progress(len(chosen), len(chosen), "")
     report.token_file.write_text("\n".join(sorted(report.tokens.values())) + "\n", "utf-8")
     return report

@@ -4,14 +4,15 @@ import hashlib
 import pickle
 import re
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
-from shiftsim.data.nuplan.log import LIDAR_CHANNEL
-from shiftsim.data.nuplan.mapping import Mapping
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.nuplan.log import LIDAR_CHANNEL, yaw_of
+from shiftsim.data.nuplan.mapping import Mapping, ends_early
 from shiftsim.data.nuplan.sqlite import Value, write_database
 from shiftsim.errors import ConversionError
 from shiftsim.world.scenario import Scenario
@@ -76,14 +77,18 @@ _INDEXES = tuple(
 def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
     """Row that carries token and tag, and the mapping that cuts the scenario out again from it.
 
-    The mapping is the scenario's own, unless that does not give its iterations.
+    The mapping is the scenario's own, unless that does not give its iterations, or would not if
+    the recording went on.
 
     Raises:
         ConversionError: Its iterations are not evenly spaced rows.
     """
     time, rows = scenario.time_us, scenario.iteration_rows
-    span = float(time[rows[-1]] - time[rows[0]]) * 1e-6
+    span = int(time[rows[-1]] - time[rows[0]]) / 1e6
     for mapping in (scenario.mapping, (span, 0.0, 1.0 / scenario.row_step)):
+        end = int(time[rows[0]]) + int(mapping[0] * 1e6)
+        if mapping == scenario.mapping and ends_early(time, end) and not scenario.is_short:
+            continue
         starts = time + int(mapping[1] * 1e6)
         fitting = np.flatnonzero(np.searchsorted(time, starts) == rows[0])
         for anchor in fitting[::-1].tolist():  # several where the log starts too late
@@ -164,18 +169,16 @@ class _Log:
 
     def ego_poses(self) -> Rows:
         scenario, zero = self.scenario, 0.0
-        half = scenario.ego[:, 2] / 2.0
-        columns = np.column_stack([scenario.ego, np.cos(half), np.sin(half)]).tolist()
+        columns = np.column_stack([scenario.ego, quaternions_of(scenario.ego[:, 2])]).tolist()
         out: Rows = []
         for token, time, row in zip(self.poses, scenario.time_us.tolist(), columns, strict=True):
-            x, y, _, vx, vy, ax, ay, *_, qw, qz = row
-            quaternion = (qw, zero, zero, qz)
+            x, y, _, vx, vy, ax, ay, *_ = row
+            quaternion = row[-4:]
             motion = (vx, vy, zero, ax, ay, zero, zero, zero, zero)
             out.append((token, time, x, y, zero, *quaternion, *motion, self.epsg, self.token))
         goal = scenario.mission_goal
         if goal is not None:
-            x, y, heading = goal.tolist()
-            quaternion = (float(np.cos(heading / 2)), zero, zero, float(np.sin(heading / 2)))
+            (x, y, _), (quaternion,) = goal.tolist(), quaternions_of(goal[2:]).tolist()
             after = int(scenario.time_us[-1]) + 1
             still = (zero,) * 9
             token = self.make("goal")
@@ -254,6 +257,29 @@ class _Log:
                 f"scenario {self.scenario.token!r}: a traffic light names connector {name!r}",
                 hint="nuPlan's format has integer ids",
             ) from error
+
+
+def quaternions_of(headings: FloatArray) -> FloatArray:
+    """(K, 4) w, x, y, z from which nuPlan reads the headings (K,) back to the bit [rad].
+
+    Of the nearest floats of w and z, and of no tilt and one of 2e-8 rad, which adds the last bit.
+    """
+    exact = np.column_stack(
+        [np.cos(headings / 2), *np.zeros((2, len(headings))), np.sin(headings / 2)]
+    )
+    out = exact.copy()
+    for tilt, towards_w, towards_z in product((0.0, 1e-8), (0, 1, -1), (0, 1, -1)):
+        missing = yaw_of(out) != headings
+        if not missing.any():
+            break
+        near = exact[missing]
+        for column, towards in ((0, towards_w), (3, towards_z)):
+            if towards:
+                near[:, column] = np.nextafter(near[:, column], towards * np.inf)
+        near[:, 2] = tilt
+        found = yaw_of(near) == headings[missing]
+        out[np.flatnonzero(missing)[found]] = near[found]
+    return out
 
 
 def _neighbours(row: IntArray, track: IntArray) -> tuple[list[int], list[int]]:

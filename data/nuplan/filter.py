@@ -1,39 +1,61 @@
 """Which scenarios to take: nuPlan's scenario-filter YAML, or a plain list of tokens."""
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import yaml
 
 from shiftsim.errors import ConfigError
 
 _TOKEN = re.compile(r"[0-9a-f]{16}\Z")
 
-# Keys that choose among scenarios in ways of their own: they must be off, unless tokens are given.
-_SAMPLING = ("num_scenarios_per_type", "limit_total_scenarios", "timestamp_threshold_s")
-_UNSUPPORTED = (
-    "ego_displacement_minimum_m",
-    "ego_start_speed_threshold",
-    "ego_stop_speed_threshold",
-    "fraction_in_neighbor_threshold",
-    "token_set_path",
-)
-_NEUTRAL = ("_target_", "_convert_", "shuffle", "speed_noise_tolerance")
-_USED = ("scenario_types", "scenario_tokens", "log_names", "map_names", "remove_invalid_goals")
+_NEUTRAL = ("_target_", "_convert_")
+# keys of nuPlan's scenario filters with a number, and the field that holds it
+_NUMBERS = {
+    "timestamp_threshold_s": "min_gap_s",
+    "ego_displacement_minimum_m": "min_way",
+    "ego_start_speed_threshold": "start_speed",
+    "ego_stop_speed_threshold": "stop_speed",
+    "speed_noise_tolerance": "speed_noise",
+    "fraction_in_token_set_threshold": "min_share",
+    "ego_route_radius": "route_radius",
+}
+_FLAGS = ("remove_invalid_goals", "shuffle")
+_USED = ("scenario_types", "scenario_tokens", "log_names", "map_names", "token_set_path")
+_COUNTS = ("num_scenarios_per_type", "limit_total_scenarios")
 
 
 @dataclass(frozen=True)
 class ScenarioFilter:
-    """A choice of scenarios; None means no restriction."""
+    """A choice of scenarios; None means no restriction. The latter half is `sampling`'s."""
 
     tokens: frozenset[str] | None = None  # scenario tokens
     types: frozenset[str] | None = None  # scenario types
     logs: frozenset[str] | None = None  # log names
     maps: frozenset[str] | None = None  # map names
     remove_invalid_goals: bool = False  # whether scenes without a goal are left out
+    per_type: int | None = None  # scenarios of each type
+    limit: int | float | None = None  # scenarios in all, or their share
+    min_gap_s: float | None = None  # between scenarios of a type [s]
+    min_way: float | None = None  # of the ego's centre [m]
+    start_speed: float | None = None  # which the ego must come to exceed [m/s]
+    stop_speed: float | None = None  # which the ego must come down to [m/s]
+    speed_noise: float = 0.1  # changes up to this do not count there [m/s]
+    token_set: frozenset[str] | None = None  # rows of logs …
+    min_share: float | None = None  # … of which a scenario must have more than this share
+    route_radius: float | None = None  # within which the ego must have its route [m]
+    shuffle: bool = False  # whether nuPlan draws at random where it leaves out
+    source: str = ""  # the file
+
+    @property
+    def thins_out(self) -> bool:
+        """Whether what is taken depends on all scenarios that the logs offer."""
+        return not (self.per_type is self.limit is self.min_gap_s is None)
 
 
 def read_filter(path: Path) -> ScenarioFilter:
@@ -67,24 +89,74 @@ def _from_values(path: Path, values: Mapping[str, Any]) -> ScenarioFilter:
     tokens = values.get("scenario_tokens")
     if tokens is not None and not isinstance(tokens, list):
         raise ConfigError(f"{path}: scenario_tokens is not a list", hint="write it as a list")
-    for key, value in values.items():
-        given_tokens = key in _SAMPLING and tokens is not None
-        off = value is None or value is False or given_tokens
-        if key in (*_USED, *_NEUTRAL) or (key in (*_SAMPLING, *_UNSUPPORTED) and off):
-            continue
-        if key == "expand_scenarios" and not value:
-            continue
+    if values.get("expand_scenarios"):
         raise ConfigError(
-            f"{path}: {key}: {value!r} is not supported",
-            hint="give scenario_tokens, or choose by types and map_names only",
+            f"{path}: expand_scenarios: true makes scenarios of a single row",
+            hint="nothing can be simulated in them: set it to false",
         )
+    known = {*_USED, *_NEUTRAL, *_FLAGS, *_NUMBERS, *_COUNTS, "expand_scenarios"}
+    for key, value in values.items():
+        if key not in known and value is not None and value is not False:
+            raise ConfigError(
+                f"{path}: {key}: {value!r} is not known",
+                hint=f"leave it out; known are {', '.join(sorted(known))}",
+            )
+    numbers: dict[str, Any] = {n: _number(path, values, k) for k, n in _NUMBERS.items()}
+    if numbers["speed_noise"] is None:
+        del numbers["speed_noise"]
+    if not 0.0 <= (numbers["min_share"] or 0.0) <= 1.0:
+        what = f"fraction_in_token_set_threshold is {numbers['min_share']:g}"
+        raise ConfigError(f"{path}: {what}, not within 0 … 1", hint="give a share")
+    per_type, limit = (_count(path, values, key) for key in _COUNTS)
+    if isinstance(per_type, float):
+        raise ConfigError(f"{path}: num_scenarios_per_type is a share", hint="give a whole number")
     return ScenarioFilter(
         tokens=None if tokens is None else _tokens(path, tokens),
         types=_names(path, values, "scenario_types"),
         logs=_names(path, values, "log_names"),
         maps=_names(path, values, "map_names"),
         remove_invalid_goals=values.get("remove_invalid_goals") is True,
+        per_type=per_type,
+        limit=limit,
+        token_set=_token_set(path, values) if numbers["min_share"] is not None else None,
+        shuffle=values.get("shuffle") is True,
+        source=str(path),
+        **numbers,
     )
+
+
+def _number(path: Path, values: Mapping[str, Any], key: str) -> float | None:
+    value = values.get(key)
+    if value is None or (type(value) in (int, float) and np.isfinite(value)):
+        return value
+    raise ConfigError(f"{path}: {key}: {value!r} is not a number", hint="give one, or null")
+
+
+def _count(path: Path, values: Mapping[str, Any], key: str) -> int | float | None:
+    """A number of scenarios, or a share of them."""
+    value = _number(path, values, key)
+    if value is None or (0.0 < value < 1.0 if isinstance(value, float) else value > 0):
+        return value
+    raise ConfigError(
+        f"{path}: {key}: {value!r} is neither a number of scenarios nor a share of them",
+        hint="give a whole number above 0, or null; limit_total_scenarios may be a share below 1.0",
+    )
+
+
+def _token_set(path: Path, values: Mapping[str, Any]) -> frozenset[str] | None:
+    """Tokens of rows from the JSON file that a filter names."""
+    name = values.get("token_set_path")
+    if name is None:
+        return None
+    try:
+        tokens = json.loads(Path(str(name)).expanduser().read_text("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        what = f"{path}: token_set_path: {name}: not readable JSON: {error}"
+        raise ConfigError(what, hint="give a path that holds from the current folder") from error
+    if not isinstance(tokens, list) or not all(isinstance(token, str) for token in tokens):
+        what = f"{path}: token_set_path: {name}: not a list of tokens"
+        raise ConfigError(what, hint="give a JSON list of texts")
+    return frozenset(tokens)
 
 
 def _names(path: Path, values: Mapping[str, Any], key: str) -> frozenset[str] | None:

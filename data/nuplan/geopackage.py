@@ -1,8 +1,9 @@
 """Layers of a GeoPackage (.gpkg), without GDAL.
 
-A GeoPackage is an SQLite file whose geometries are a short header followed by WKB. Layers are kept
-in longitude and latitude and projected to the metric system that the table `meta` names. The same
-content is written with the same bytes.
+A GeoPackage is an SQLite file whose geometries are a short header followed by WKB. nuPlan's layers
+are in longitude and latitude and are projected to the metric system that the table `meta` names.
+Those written here are in that system itself (nuPlan rule 430), which nuPlan's code and this one
+then leave as it is. The same content is written with the same bytes.
 """
 
 import struct
@@ -87,11 +88,15 @@ class GeoPackage:
         """
         raw = self.database.columns(name, ["fid", "geom", *columns.split()], extra.split())
         where = f"{self.path}: layer {name!r}"
-        bodies = [self._wkb(b, name, f) for f, b in zip(raw["fid"], raw["geom"], strict=True)]
+        blobs = [self._wkb(b, name, f) for f, b in zip(raw["fid"], raw["geom"], strict=True)]
+        systems, bodies = {system for system, _ in blobs}, [body for _, body in blobs]
+        if len(systems) > 1:
+            raise DataError(f"{where} has several coordinate systems: {sorted(systems)}", REPAIR)
         try:
             shapes = shapely.force_2d(shapely.from_wkb(np.array(bodies, object)))
-            xy = shapely.get_coordinates(shapes)
-            x, y = self._project.transform(xy[:, 0], xy[:, 1])
+            x, y = shapely.get_coordinates(shapes).T
+            if systems == {_WGS84}:
+                x, y = self._project.transform(x, y)
         except (shapely.errors.GEOSException, pyproj.exceptions.ProjError) as error:
             raise DataError(f"{where}: broken geometry: {error}", REPAIR) from error
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -102,7 +107,8 @@ class GeoPackage:
         ids = [_id(v, name, "fid") for v in raw["fid"]]
         return LayerTable(name, ids, list(projected), raw)
 
-    def _wkb(self, blob: object, layer: str, fid: object) -> bytes:
+    def _wkb(self, blob: object, layer: str, fid: object) -> tuple[int, bytes]:
+        """The coordinate system of a geometry, and its WKB."""
         where = f"{self.path}: layer {layer!r}: geometry of fid {fid!r}"
         if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
             raise DataError(f"{where} is not a GeoPackage geometry", hint=REPAIR)
@@ -110,9 +116,10 @@ class GeoPackage:
         if envelope >= len(_ENVELOPE_BYTES) or blob[3] & 0x30:
             raise DataError(f"{where} is empty or of an unknown kind", hint=REPAIR)
         (system,) = struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])
-        if system != _WGS84:
-            raise DataError(f"{where} has the coordinate system {system}, not {_WGS84}", REPAIR)
-        return blob[8 + _ENVELOPE_BYTES[envelope] :]
+        if system not in (_WGS84, self.epsg):
+            known = f"neither {_WGS84} nor {self.epsg}"
+            raise DataError(f"{where} has the coordinate system {system}, {known}", REPAIR)
+        return system, blob[8 + _ENVELOPE_BYTES[envelope] :]
 
 
 @lru_cache(maxsize=8)
@@ -150,29 +157,32 @@ class FeatureLayer:
 def write_geopackage(
     path: Path, layers: Sequence[FeatureLayer], *, epsg: int, meta: Mapping[str, str]
 ) -> None:
-    """Write layers in longitude and latitude; `epsg` is the metric system of their geometries."""
+    """Write layers as they are; `epsg` is the metric system of their geometries."""
     tables = dict(_SYSTEM_TABLES)
-    wgs84 = pyproj.CRS(_WGS84).to_wkt("WKT1_GDAL")
+    systems = {code: pyproj.CRS(code) for code in (_WGS84, epsg)}
     rows: dict[str, list[Sequence[Value]]] = {
         "gpkg_spatial_ref_sys": [
             ("Undefined cartesian SRS", -1, "NONE", -1, "undefined", None),
             ("Undefined geographic SRS", 0, "NONE", 0, "undefined", None),
-            ("WGS 84 geodetic", _WGS84, "EPSG", _WGS84, wgs84, None),
+            *(
+                (system.name, code, "EPSG", code, system.to_wkt("WKT1_GDAL"), None)
+                for code, system in systems.items()
+            ),
         ],
         "gpkg_contents": [],
         "gpkg_geometry_columns": [],
     }
     for layer in layers:
-        shapes, kind = _projected(layer, epsg)
+        shapes, kind = _shapes_of(layer)
         bounds = shapely.total_bounds(shapes).tolist() if len(shapes) else [None] * 4
-        contents = (layer.name, "features", layer.name, "", _LAST_CHANGE, *bounds, _WGS84)
+        contents = (layer.name, "features", layer.name, "", _LAST_CHANGE, *bounds, epsg)
         rows["gpkg_contents"].append(contents)
-        rows["gpkg_geometry_columns"].append((layer.name, "geom", kind, _WGS84, 0, 0))
+        rows["gpkg_geometry_columns"].append((layer.name, "geom", kind, epsg, 0, 0))
         columns = "".join(f', "{name}" {sql}' for name, sql in layer.columns.items())
         tables[layer.name] = f'{_FID}, "geom" {kind}{columns}'
         rows[layer.name] = [
             (fid, blob, *(values.get(name, layer.defaults.get(name)) for name in layer.columns))
-            for (fid, _, values), blob in zip(layer.rows, _blobs(shapes), strict=True)
+            for (fid, _, values), blob in zip(layer.rows, _blobs(shapes, epsg), strict=True)
         ]
     rows["gpkg_contents"].append(("meta", "attributes", "meta", "", _LAST_CHANGE, *[None] * 5))
     tables["meta"] = f'{_FID}, "key" TEXT, "value" TEXT'
@@ -181,21 +191,19 @@ def write_geopackage(
     write_database(path, tables, rows, header)
 
 
-def _projected(layer: FeatureLayer, epsg: int) -> tuple[np.ndarray, str]:
-    """Geometries in longitude and latitude; all of them multiple when one is."""
+def _shapes_of(layer: FeatureLayer) -> tuple[np.ndarray, str]:
+    """Geometries and their kind; all of them multiple when one is."""
     shapes = np.empty(len(layer.rows), object)
     shapes[:] = [shape for _, shape, _ in layer.rows]
     kind = layer.geometry
     if any(shape.geom_type.startswith("Multi") for shape in shapes):
         kind = f"MULTI{kind}"
         shapes[:] = [shapely.multipolygons(shapely.get_parts(shape)) for shape in shapes]
-    xy = shapely.get_coordinates(shapes)
-    lon, lat = to_metres(epsg).transform(xy[:, 0], xy[:, 1], direction="INVERSE")
-    return shapely.set_coordinates(shapes, np.column_stack([lon, lat])), kind
+    return shapes, kind
 
 
-def _blobs(shapes: np.ndarray) -> list[bytes]:
+def _blobs(shapes: np.ndarray, epsg: int) -> list[bytes]:
     envelopes = shapely.bounds(shapes)[:, [0, 2, 1, 3]].tolist()  # low and high x, low and high y
-    head = ("<2sBBi4d", b"GP", 0, _LITTLE_ENDIAN_WITH_ENVELOPE, _WGS84)
+    head = ("<2sBBi4d", b"GP", 0, _LITTLE_ENDIAN_WITH_ENVELOPE, epsg)
     bodies = shapely.to_wkb(shapes, byte_order=1)
     return [struct.pack(*head, *e) + body for e, body in zip(envelopes, bodies, strict=True)]

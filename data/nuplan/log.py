@@ -37,6 +37,7 @@ _EGO_COLUMNS = {
     **{"acceleration_x": "ax_mps2", "acceleration_y": "ay_mps2"},
 }
 _LIGHTS = {status.name.lower(): status for status in LightStatus if status >= 0}
+UNTAGGED = "unknown"
 _UNIT_TOLERANCE = 1e-14  # nuPlan rule 414: quaternions this near to length 1 stay as they are
 _IGNORED_SCENES = 2  # nuPlan rule 411: at either end of a log
 
@@ -53,7 +54,8 @@ class Log:
     name: str  # log name, the file name without its ending
     map_name: str  # map it was recorded on
     tokens: list[str]  # R tokens of the lidar rows, 16 hexadecimal digits
-    time_us: IntArray  # (R,) time stamps [us]
+    time_us: IntArray  # (R,) time stamps, not decreasing [us]
+    rowids: IntArray  # (R,) where the rows stand in the table
     types: list[str]  # R scenario types, `unknown` without a tag
     scenes: list[bytes]  # R tokens of the scenes
     is_offered: BoolArray  # (R,) whether nuPlan offers the row as a scenario
@@ -93,8 +95,9 @@ def _read_clock(database: Database) -> Log:
             hint="the log was exported without its lidar rows; export it again",
         )
     rows = database.query(
-        "SELECT pc.token, pc.timestamp, pc.scene_token, pc.next_token FROM lidar_pc AS pc"
-        " JOIN lidar AS l ON pc.lidar_token = l.token WHERE l.channel = ? ORDER BY pc.timestamp",
+        "SELECT pc.token, pc.timestamp, pc.scene_token, pc.next_token, pc.rowid"
+        " FROM lidar_pc AS pc JOIN lidar AS l ON pc.lidar_token = l.token"
+        " WHERE l.channel = ? ORDER BY pc.timestamp, pc.rowid",
         "table 'lidar_pc'",
         [LIDAR_CHANNEL],
     )
@@ -102,12 +105,6 @@ def _read_clock(database: Database) -> Log:
         raise _damaged(path, f"table 'lidar_pc' has no row of {LIDAR_CHANNEL!r}")
     tokens = [token_text(row[0], path, "lidar_pc") for row in rows]
     time_us = _check_clock(path, tokens, rows)
-    tags = dict(  # nuPlan rule 418: the largest of several tags
-        database.query(
-            "SELECT lidar_pc_token, MAX(type) FROM scenario_tag GROUP BY lidar_pc_token",
-            "table 'scenario_tag'",
-        )
-    )
     ordered = database.query("SELECT token FROM scene ORDER BY name", "table 'scene'")
     offered = {row[0] for row in ordered[_IGNORED_SCENES : max(len(ordered) - _IGNORED_SCENES, 0)]}
     return Log(
@@ -116,10 +113,27 @@ def _read_clock(database: Database) -> Log:
         map_name=maps[0][0].removesuffix(".gpkg"),  # nuPlan rule 419
         tokens=tokens,
         time_us=time_us,
-        types=[str(tags.get(row[0]) or "unknown") for row in rows],
+        rowids=np.array([row[4] for row in rows], np.int64),
+        types=[text or UNTAGGED for text in _read_tags(database, [row[0] for row in rows])],
         scenes=[row[2] for row in rows],
         is_offered=np.array([row[2] in offered for row in rows], np.bool_),
     )
+
+
+def read_types(log: Log, wanted: frozenset[str]) -> list[str]:
+    """R scenario types, as in `Log.types`, of the tags that are wanted; empty without one."""
+    return _read_tags(log.database, [bytes.fromhex(token) for token in log.tokens], wanted)
+
+
+def _read_tags(
+    database: Database, tokens: list[bytes], wanted: frozenset[str] | None = None
+) -> list[str]:
+    tags: dict[bytes, str] = {}
+    listed = database.query("SELECT lidar_pc_token, type FROM scenario_tag", "'scenario_tag'")
+    for token, text in listed:  # nuPlan rule 418: the largest of several tags, of those asked for
+        if text is not None and (wanted is None or text in wanted):
+            tags[token] = max(tags.get(token, ""), str(text))
+    return [tags.get(token, "") for token in tokens]
 
 
 def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]]) -> IntArray:
@@ -128,13 +142,9 @@ def _check_clock(path: Path, tokens: list[str], rows: Sequence[tuple[Any, ...]])
     except (TypeError, ValueError, OverflowError) as error:
         raise _damaged(path, f"lidar_pc.timestamp is not an integer: {error}") from error
     require(STORE, "time_us", time_us, f"{path}: lidar_pc")
-    twice = np.flatnonzero(np.diff(time_us) <= 0)
-    if len(twice):
-        at = int(twice[0])
-        raise _damaged(path, f"lidar_pc {tokens[at + 1]!r}: time stamp {time_us[at]} occurs twice")
     row_of = {row[0]: index for index, row in enumerate(rows)}
     for index, row in enumerate(rows):
-        if row_of.get(row[3], index + 1) <= index:
+        if time_us[row_of.get(row[3], index)] < time_us[index]:
             what = f"lidar_pc {tokens[index]!r}: its next row has an earlier time stamp"
             raise _damaged(path, what)
     return time_us
@@ -204,10 +214,10 @@ def read_route(log: Log, row: int) -> tuple[tuple[str, ...], FloatArray | None]:
     if not np.isfinite(pose).all():
         what = f"the goal of {log.tokens[row]!r} is not finite"
         raise _damaged(log.path, what, ConversionError)
-    return route, np.array([pose[0, 0], pose[0, 1], _yaw(pose[:, 2:])[0]])
+    return route, np.array([pose[0, 0], pose[0, 1], yaw_of(pose[:, 2:])[0]])
 
 
-def _yaw(quaternions: FloatArray) -> FloatArray:
+def yaw_of(quaternions: FloatArray) -> FloatArray:
     """Heading of quaternions (K, 4) w, x, y, z [rad]."""
     square = (quaternions * quaternions).sum(axis=1, keepdims=True)
     unit = np.abs(1.0 - square) < _UNIT_TOLERANCE
@@ -221,20 +231,20 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
 
     nuPlan rule 415: steering, yaw rate and their rates are 0.
     """
-    rows = read_rows(
+    place, rows = read_rows(
         log,
         first,
         last,
         columns="e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.acceleration_x, e.acceleration_y",
         joins="JOIN ego_pose AS e ON pc.ego_pose_token = e.token",
     )
-    if [row[0] for row in rows] != log.time_us[first:last].tolist():
+    if not np.array_equal(place, np.arange(first, last)):
         between = f"between {log.tokens[first]!r} and {log.tokens[last - 1]!r}"
         what = f"{between} a row of 'lidar_pc' names an unknown ego_pose"
         raise _damaged(log.path, what, ConversionError)
-    values = as_numbers(log.path, "ego_pose", [row[1:] for row in rows])
+    values = as_numbers(log.path, "ego_pose", rows)
     with np.errstate(invalid="ignore"):
-        heading = _yaw(values[:, 2:6])
+        heading = yaw_of(values[:, 2:6])
     states = np.zeros((len(values), NUM_STATE))
     states[:, :2], states[:, 2], states[:, 3:7] = values[:, :2], heading, values[:, 6:10]
     bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
@@ -250,25 +260,32 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
 
 def read_rows(
     log: Log, first: int, last: int, *, columns: str, joins: str, order: str = ""
-) -> list[tuple[Any, ...]]:
-    """Time stamp and columns of what belongs to the rows first … last - 1, ordered by time.
+) -> tuple[IntArray, list[tuple[Any, ...]]]:
+    """Row of the log and columns of what belongs to the rows first … last - 1, ordered by row.
 
     `joins` are tables besides `lidar_pc` (`pc`) and `lidar` (`l`), and errors name the first one;
-    the column `order` orders what has one time stamp.
+    the column `order` orders what belongs to one row.
     """
     sql = (
-        f"SELECT pc.timestamp, {columns} FROM lidar_pc AS pc"
+        f"SELECT {columns}, pc.rowid FROM lidar_pc AS pc"
         f" JOIN lidar AS l ON pc.lidar_token = l.token {joins}"
         " WHERE l.channel = ? AND pc.timestamp BETWEEN ? AND ?"
-        f" ORDER BY pc.timestamp{order and ', '}{order}"
+        f" ORDER BY pc.timestamp, pc.rowid{order and ', '}{order}"
     )
     ends = int(log.time_us[first]), int(log.time_us[last - 1])
-    return log.database.query(sql, f"table {joins.split()[1]!r}", [LIDAR_CHANNEL, *ends])
+    found = log.database.query(sql, f"table {joins.split()[1]!r}", [LIDAR_CHANNEL, *ends])
+    # nuPlan rule 431: time stamps may repeat, so rows are told apart by their place in the table
+    by_place = np.argsort(log.rowids)
+    rowids = np.array([row[-1] for row in found], np.int64)
+    place = by_place[np.searchsorted(log.rowids, rowids, sorter=by_place)]
+    inside = (place >= first) & (place < last)
+    kept = [row[:-1] for row, good in zip(found, inside.tolist(), strict=True) if good]
+    return place[inside], kept
 
 
 def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> TrafficLights:
     """Traffic lights of the rows first … last - 1."""
-    rows = read_rows(
+    row, listed = read_rows(
         log,
         first,
         last,
@@ -276,13 +293,17 @@ def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> Traffic
         joins="JOIN traffic_light_status AS s ON s.lidar_pc_token = pc.token",
         order="s.rowid",
     )
-    index: dict[str, int] = {}
-    connector = [index.setdefault(str(row[1]), len(index)) for row in rows]
-    frame = np.searchsorted(log.time_us, np.array([r[0] for r in rows], np.int64)) - first
+    frame = row - first
+    # nuPlan rule 429: a connector keeps all the states that a frame lists, the n-th in column n
+    index: dict[tuple[str, int], int] = {}
+    times: Counter[tuple[int, str]] = Counter()
+    column = np.empty(len(listed), np.int64)
+    for place, (at, (connector, _)) in enumerate(zip(frame.tolist(), listed, strict=True)):
+        name = str(connector)
+        column[place] = index.setdefault((name, times[at, name]), len(index))
+        times[at, name] += 1
     status = np.full((last - first, len(index)), int(LightStatus.ABSENT), np.int8)
     # nuPlan rule 428
-    codes = [int(_LIGHTS.get(row[2], LightStatus.UNKNOWN)) for row in rows]
-    status[frame, np.array(connector, np.int64)] = codes
-    twice = len(rows) - int((status != LightStatus.ABSENT).sum())
-    flaws["traffic light listed twice in a frame: the last one is kept"] += twice
-    return TrafficLights(tuple(index), status)
+    status[frame, column] = [int(_LIGHTS.get(text, LightStatus.UNKNOWN)) for _, text in listed]
+    flaws["traffic light listed several times in a frame"] += len(listed) - len(times)
+    return TrafficLights(tuple(name for name, _ in index), status)

@@ -1,5 +1,6 @@
 """How a scenario is cut from a log: duration, offset and subsample ratio by scenario type."""
 
+from shiftsim.arrays import IntArray
 from shiftsim.errors import ConfigError
 
 Mapping = tuple[float, float, float]
@@ -37,6 +38,14 @@ NAMED_TYPES = frozenset(
     traversing_traffic_light_intersection waiting_for_pedestrian_to_cross
     """.split()
 )
+
+
+ROW_SECONDS = 0.05  # nominal distance of log rows
+
+
+def ends_early(time_us: IntArray, end_us: int) -> bool:
+    """Whether a log with rows at some times lacks a row before the end of a scenario [us]."""
+    return bool(end_us - time_us[-1] > 0.9e6 * ROW_SECONDS)
 
 
 def mapping_of(scenario_type: str) -> Mapping:

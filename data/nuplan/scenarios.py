@@ -13,19 +13,26 @@ import numpy as np
 
 from shiftsim.arrays import IntArray
 from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
-from shiftsim.data.nuplan.log import Log, has_goals, open_log, read_ego, read_lights, read_route
+from shiftsim.data.nuplan.log import (
+    Log,
+    has_goals,
+    open_log,
+    read_ego,
+    read_lights,
+    read_route,
+    read_types,
+)
 from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.mapping import Mapping, mapping_of
+from shiftsim.data.nuplan.mapping import Mapping, ends_early, mapping_of
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
-ROW_SECONDS = 0.05  # nominal distance of log rows
 _PAST_SECONDS, _FUTURE_SECONDS = 3.0, 8.0  # kept around the window
 # nuPlan rule 417: rows are counted where it looks back and ahead, so keep at least as many
-_PAST_ROWS, _FUTURE_ROWS = 60, 161
+PAST_ROWS, FUTURE_ROWS = 60, 161
 _MIN_ITERATIONS = 3
 EGO = "ego"
 
@@ -60,25 +67,30 @@ def offered(
 ) -> list[ScenarioEntry]:
     """The scenarios that nuPlan finds in a log, ordered by time; all tokens and types where None.
 
+    nuPlan rule 418: with types, rows without a tag are not offered, whatever the types.
     Rows of the first two and of the last two scenes (by name) are not offered.
     `remove_invalid_goals` leaves out scenes without a goal.
     """
     keep = log.is_offered
     if remove_invalid_goals:
         keep = keep & has_goals(log)
+    kinds = log.types if types is None else read_types(log, types)
     return [
         ScenarioEntry(token, kind, log.name, log.map_name, time_us)
         for token, kind, time_us, kept in zip(
-            log.tokens, log.types, log.time_us.tolist(), keep, strict=True
+            log.tokens, kinds, log.time_us.tolist(), keep, strict=True
         )
         if kept and (tokens is None or token in tokens) and (types is None or kind in types)
     ]
 
 
-def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
+def cut_window(
+    log: Log, token: str, mapping: Mapping | None = None, scenario_type: str | None = None
+) -> Window:
     """The rows of a scenario; the window counts rows from the start of the log.
 
-    `token` names the anchor row; where `mapping` is None, it is nuPlan's for the type.
+    `token` names the anchor row; where `mapping` is None, it is nuPlan's for the type. That is the
+    anchor's own where `scenario_type` is None.
 
     Raises:
         ConversionError: The log does not have the token, or too few rows there.
@@ -86,7 +98,7 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
     if token not in log.row_of:
         raise ConversionError(f"{log.path}: there is no lidar_pc {token!r}", hint="check the token")
     row = log.row_of[token]
-    scenario_type = log.types[row]
+    scenario_type = scenario_type or log.types[row]
     chosen = mapping_of(scenario_type) if mapping is None else mapping
     duration, offset, ratio = chosen
     start = int(int(log.time_us[row]) + offset * 1e6)
@@ -100,6 +112,13 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
             f"{log.path}: scenario {token!r} has {len(iterations)} iterations",
             hint=f"at least {_MIN_ITERATIONS} are needed: choose another mapping",
         )
+    still = iterations[:-1][np.diff(log.time_us[iterations]) == 0]
+    if len(still):
+        raise ConversionError(
+            f"{log.path}: scenario {token!r} has two iterations at time stamp"
+            f" {log.time_us[still[0]]}, the first is lidar_pc {log.tokens[int(still[0])]!r}",
+            hint="nuPlan fails there, too: leave this scenario out",
+        )
     early = int(np.searchsorted(log.time_us, start - int(_PAST_SECONDS * 1e6)))
     late = int(np.searchsorted(log.time_us, end + int(_FUTURE_SECONDS * 1e6), side="right"))
     route, goal = read_route(log, row)
@@ -108,14 +127,14 @@ def cut_window(log: Log, token: str, mapping: Mapping | None = None) -> Window:
         scenario_type=scenario_type,
         log_name=log.name,
         ego=EGO,
-        first_row=max(min(early, first - _PAST_ROWS), 0),
-        last_row=min(max(late, int(iterations[-1]) + 1 + _FUTURE_ROWS), len(log.time_us)),
+        first_row=max(min(early, first - PAST_ROWS), 0),
+        last_row=min(max(late, int(iterations[-1]) + 1 + FUTURE_ROWS), len(log.time_us)),
         iteration_rows=iterations,
         row_step=step,
         route=route,
         mission_goal=goal,
         mapping=chosen,
-        is_short=bool(end - log.time_us[-1] > 0.9e6 * ROW_SECONDS),  # a row is missing
+        is_short=ends_early(log.time_us, end),
     )
 
 
@@ -123,6 +142,7 @@ def read_span(
     log: Log, name: str, first: int, last: int, flaws: Counter[str]
 ) -> tuple[Recording, EgoTrace]:
     """The rows first … last - 1 of a log as a recording of its own, with the ego."""
+    flaws["lidar_pc: time stamp repeated"] += int((np.diff(log.time_us[first:last]) == 0).sum())
     recording = Recording(
         log_name=name,
         city=log.map_name,

@@ -34,7 +34,7 @@ def require_plausible(scene: Scenario, ego: str, folder: Path) -> None:
     """Refuse a scenario with a number outside of its range; `folder` is that of its recording."""
     frames, tracks = f"{folder / FRAMES}: column", scene.tracks
     require(STORE, "time_us", scene.time_us, frames)
-    if (np.diff(scene.time_us) <= 0).any():
+    if (np.diff(scene.time_us) < 0).any() or (np.diff(scene.iteration_times) <= 0).any():
         raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
     require(STORE, "light_status", scene.traffic_lights.status, frames)
     low, high = _EGO_LIMITS.T

@@ -157,8 +157,8 @@ class ScenarioStore:
         """As `read`, without the review."""
         window = self.window(token)
         first, last = window.first_row, window.last_row
-        recording = self._recording(window.log_name).read(first, last)
-        states = ego_states(self._ego(window.log_name, window.ego), first, last)
+        recording = self.recording(window.log_name).read(first, last)
+        states = ego_states(self.ego(window.log_name, window.ego), first, last)
         # The span starts at the window's first row, and so do the ego states.
         ego = EgoTrace(window.log_name, window.ego, 0, states)
         scene = make_scenario(recording, ego, window, self.map(recording.city), offset=first)
@@ -188,13 +188,15 @@ class ScenarioStore:
         self._fetch(place.relative_to(self.path).as_posix())
         return place
 
-    def _recording(self, name: str) -> StoredRecording:
+    def recording(self, name: str) -> StoredRecording:
+        """A whole recording, open; its rows are read when asked for."""
         if name not in self._recordings:
             _limit(self._recordings)
             self._recordings[name] = open_recording(self.recording_folder(name))
         return self._recordings[name]
 
-    def _ego(self, recording: str, name: str) -> tables.Table:
+    def ego(self, recording: str, name: str) -> tables.Table:
+        """The states of an ego of a recording, open."""
         key = (recording, name)
         if key not in self._egos:
             _limit(self._egos)

@@ -51,7 +51,7 @@ SCENARIOS = _schema(
 SAME = ("token", "ego", "first_row", "last_row", "row_step", "is_short")
 
 FRAMES = _schema(
-    time_us=_I64,  # strictly increasing
+    time_us=_I64,  # never decreasing, and strictly increasing over iterations
     light_status=pa.list_(pa.field("item", pa.int8(), nullable=False)),
     # … one LightStatus code per connector of the footer, -1 not listed
 )

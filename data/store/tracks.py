@@ -154,14 +154,24 @@ def open_ego(folder: Path, name: str) -> Table:
     return Table(ego_file(folder, name), schema.EGO)
 
 
+def ego_span(table: Table) -> tuple[int, int]:
+    """Row of the recording of an ego's first state, and one past that of its last.
+
+    Raises:
+        DataError: The file is damaged.
+    """
+    start = int(_footer(table, {"first_row": int})["first_row"])
+    return start, start + table.num_rows
+
+
 def ego_states(table: Table, first: int, last: int) -> FloatArray:
     """(R, 11) states of an ego over the rows first … last - 1 of the recording.
 
     Raises:
         DataError: The file is damaged or does not have the rows.
     """
-    start = int(_footer(table, {"first_row": int})["first_row"])
-    if not start <= first < last <= start + table.num_rows:
+    start, stop = ego_span(table)
+    if not start <= first < last <= stop:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
     rows = _rows(table, first - start, last - start)
     states = np.empty((last - first, NUM_STATE))

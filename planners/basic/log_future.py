@@ -1,5 +1,7 @@
 """The oracle: drives what was recorded."""
 
+import numpy as np
+
 from shiftsim.errors import PlannerError
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.scenario import Scenario
@@ -34,7 +36,11 @@ class LogFuture:
         if scenario is None:
             raise PlannerError("log-future: plan() was called before reset()")
         row = int(scenario.iteration_rows[observation.iteration])
-        rows = slice(row, row + POSES * ROWS_BETWEEN + 1, ROWS_BETWEEN)
+        # nuPlan rule 431: on from the first row with that time stamp
+        first = int(np.searchsorted(scenario.time_us, scenario.time_us[row]))
+        rows = np.arange(first, first + POSES * ROWS_BETWEEN + 1, ROWS_BETWEEN)
+        rows[0] = row
+        rows = rows[rows < len(scenario.time_us)]
         times = scenario.time_us[rows].copy()
         if len(times) > 1:
             self._previous = Trajectory(times, scenario.ego[rows].copy())

@@ -141,9 +141,18 @@ def _clockwise_hull(ring: FloatArray) -> FloatArray:
 class LightLookup:
     """Traffic lights by edge, `edges` with a light; the ids of one scenario are looked up once."""
 
-    def __init__(self, road: VectorMap, default: LightStatus = LightStatus.UNKNOWN) -> None:
-        """Take the map of the scenario, and the status of edges for which no light is listed."""
-        self._road, self._default = road, int(default)
+    def __init__(
+        self,
+        road: VectorMap,
+        default: LightStatus = LightStatus.UNKNOWN,  # of edges for which no light is listed
+        ranked: tuple[LightStatus, ...] | None = None,
+    ) -> None:
+        """Take the map of the scenario.
+
+        nuPlan rule 429: of several states of an edge the last one listed counts, or, where states
+        are `ranked`, the last one in this order; others than these then count as not listed.
+        """
+        self._road, self._default, self._ranked = road, int(default), ranked
         self._ids: tuple[str, ...] | None = None
         self._columns = self.edges = np.zeros(0, np.int64)
         self._status = np.full(len(road.edges), self._default)
@@ -160,9 +169,14 @@ class LightLookup:
             self._columns, self.edges = found[:, 0].copy(), found[:, 1].copy()
             self._ids = lights.connector_ids
             self._status[:] = self._default
-        codes = lights.status[0, self._columns].astype(np.int64)
-        codes[codes == LightStatus.ABSENT] = self._default
-        self._status[self.edges] = codes
+        codes = lights.status[0, self._columns]
+        self._status[self.edges] = self._default
+        if self._ranked is None:
+            listed = codes != LightStatus.ABSENT
+            self._status[self.edges[listed]] = codes[listed]  # NumPy keeps the last one
+        else:
+            for status in self._ranked:
+                self._status[self.edges[codes == status]] = status
         return self._status
 
 

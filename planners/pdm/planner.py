@@ -140,7 +140,7 @@ class PdmClosed:
         """What is around, and the tokens of tracks and red lights."""
         tracks, center = observation.history.tracks, observation.ego.center
         chosen = select_tracks(tracks, center[0], center[1], set(self.collided), self.parameters)
-        red = red_lanes(road, observation.traffic_lights)
+        red = red_lanes(road, observation.lights)
         red = [lane for lane in red if route.areas.on_route[lane]]
         tokens = [tracks.tokens[i] for i in chosen.tolist()]
         tokens += [LIGHT_TOKEN + road.edges.ids[i] for i in red]

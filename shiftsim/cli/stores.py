@@ -197,7 +197,8 @@ def export_to_nuplan(
     if as_json:
         names = ("logs", "maps", "token_file", "tokens", "cities")
         shown = {name: getattr(report, name) for name in names}
-        say_json(shown | {"mappings": mappings, "missing_maps": report.missing_maps})
+        rest = {"cut_off": report.cut_off, "missing_maps": report.missing_maps}
+        say_json(shown | {"mappings": mappings} | rest)
         return
     say(f" {plural(len(report.tokens), 'log')} → {report.logs}")
     say(f" {plural(len(report.cities), 'map')} → {report.maps}")
@@ -205,9 +206,12 @@ def export_to_nuplan(
         say(f" scenario mapping to use: {row['type']}: {row['mapping']}")
     if report.renamed:
         say(f" {len(report.renamed)} tokens had another form and were replaced: --json lists them")
+    if report.cut_off:
+        ended = plural(report.cut_off, "recording")
+        say(f" {ended} ended within 0.5 s of the last plan: nuPlan's LogFuturePlanner fails there")
     if report.missing_maps:
         say(f" nuPlan's own code also opens the maps {', '.join(report.missing_maps)}: add them")
-    words = {",".join(f"{value:g}" for value in row["mapping"]) for row in mappings}
+    words = {",".join(f"{value:.12g}" for value in row["mapping"]) for row in mappings}
     mapping = f" --mapping {words.pop()}" if len(words) == 1 else ""
     say(
         f" read back: shiftsim convert nuplan {report.logs} {report.maps}"

@@ -85,7 +85,7 @@ class VectorObserver:
         line = route_line(scene, route_blocks(scene), center)
         arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
         self._route = Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
-        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT, ranked=(LightStatus.RED,))
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""

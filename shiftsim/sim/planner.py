@@ -120,7 +120,7 @@ class Observation:
 
     @property
     def traffic_lights(self) -> dict[str, LightStatus]:
-        """Status of the listed lane connectors."""
+        """Status of the listed lane connectors; the last one where one is listed with several."""
         return self.lights.at(0)
 
 
@@ -196,7 +196,10 @@ def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> Sce
 def past_rows(scenario: Scenario, iteration: int, samples: int = HISTORY_SAMPLES) -> IntArray:
     """(H,) rows of the log that an iteration looks back on, itself last; those it has."""
     row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
-    rows = np.arange(row - (samples - 1) * step, row + 1, step)
+    # nuPlan rule 431: back from the last row with that time stamp
+    last = int(np.searchsorted(scenario.time_us, scenario.time_us[row], side="right")) - 1
+    rows = np.arange(last - (samples - 1) * step, last + 1, step)
+    rows[-1] = row
     return rows[rows >= 0]
 
 

@@ -22,7 +22,7 @@ class Scenario:
         log_name: Recording it was cut from.
         city: Map name.
         map: The map.
-        time_us: (R,) time stamps of the rows, strictly increasing [us].
+        time_us: (R,) time stamps of the rows [us], never decreasing; increasing over iterations.
         ego: (R, 11) recorded ego states, columns of `state.STATE_COLUMNS`.
         tracks: Recorded tracks over the rows.
         traffic_lights: Recorded lights over the rows.

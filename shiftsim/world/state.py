@@ -171,7 +171,11 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class TrafficLights:
-    """Traffic light states of lane connectors over a span of time."""
+    """Traffic light states of lane connectors over a span of time.
+
+    A connector that some row lists n times, maybe with several states at once, has n columns, in
+    the order in which its rows list it.
+    """
 
     connector_ids: tuple[str, ...]  # C lane connector ids
     status: np.ndarray  # (T, C) LightStatus codes, int8; `ABSENT` where the connector is not listed
@@ -187,13 +191,17 @@ class TrafficLights:
         """The same lights in an array that cannot be written."""
         return TrafficLights(self.connector_ids, sealed(self.status))
 
-    def at(self, row: int) -> dict[str, LightStatus]:
-        """Status by connector id, of the connectors listed in one row."""
-        return {
-            name: LightStatus(code)
+    def listed(self, row: int) -> list[tuple[str, LightStatus]]:
+        """Connector ids and states that one row lists; an id may occur several times."""
+        return [
+            (name, LightStatus(code))
             for name, code in zip(self.connector_ids, self.status[row].tolist(), strict=True)
             if code != LightStatus.ABSENT
-        }
+        ]
+
+    def at(self, row: int) -> dict[str, LightStatus]:
+        """Status by connector id, of the connectors listed in one row; the last where several."""
+        return dict(self.listed(row))
 
     @staticmethod
     def empty(num_rows: int) -> "TrafficLights":

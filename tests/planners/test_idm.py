@@ -97,6 +97,9 @@ def test_a_red_light_counts_as_a_standing_object_and_green_does_not():
     red = replace(scenario, traffic_lights=TrafficLights(("21", "unknown"), status))
     green = replace(scenario, traffic_lights=TrafficLights(("21",), 0 * status[:, :1]))
     assert roll_out(red)[1][-1] < 2.0
+    status[:, 1] = 0
+    both = replace(scenario, traffic_lights=TrafficLights(("21", "21"), status))
+    np.testing.assert_array_equal(roll_out(both)[1], roll_out(red)[1])
     np.testing.assert_array_equal(roll_out(green)[1], roll_out(scenario)[1])
 
 

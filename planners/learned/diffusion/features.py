@@ -19,7 +19,7 @@ from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import Tracks
+from shiftsim.world.state import LightStatus, Tracks
 
 RADIUS = 100.0  # m, half side of the square from which lanes are taken
 LANES, ROUTE_LANES = 70, 25
@@ -28,6 +28,7 @@ START_SQUARE = 1.0  # m, half side of the square that is searched for the start 
 
 # one-hot position of each LightStatus; nuPlan rule 332: yellow counts as unknown
 _LIGHT_COLUMN = np.array([kernels.GREEN, kernels.UNKNOWN, kernels.RED, kernels.UNKNOWN])
+_RANKED = (LightStatus.GREEN, LightStatus.RED)
 
 Single = NDArray[np.float32]
 
@@ -75,7 +76,7 @@ class FeatureBuilder:
         self._road, self._lanes = scene.map, lanes
         blocks = route_blocks(scene)
         self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None
-        self._lights = LightLookup(scene.map)
+        self._lights = LightLookup(scene.map, ranked=_RANKED)
 
     def __call__(self, seen: Observation, noise: Single) -> Features:
         """Features of an observation and the start noise that goes with them."""

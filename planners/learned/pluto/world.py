@@ -84,7 +84,7 @@ def _touch_areas(polygons: Polygons, selected: IntArray, corners: FloatArray) ->
 
 def red_lights(road: VectorMap, route: RouteLanes, observation: Observation) -> IntArray:
     """Connectors of the route whose light is red."""
-    red = red_lanes(road, observation.traffic_lights)
+    red = red_lanes(road, observation.lights)
     return np.array([lane for lane in red if route.is_on[lane]], np.int64)
 
 

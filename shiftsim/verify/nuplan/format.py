@@ -75,7 +75,7 @@ def _scene_fields(scene: Scenario, start: int, origin: FloatArray) -> dict[str, 
     row = int(scene.iteration_rows[0])
     state, moved = scene.ego[row], np.append(origin, 0.0)
     kinds = scene.tracks.kinds[scene.tracks.valid[row]]
-    lights = scene.traffic_lights.at(row)
+    lights = scene.traffic_lights.listed(row)
     return {
         "iterations": scene.num_iterations,
         "interval": 0.05 / scene.mapping[2],
@@ -90,7 +90,7 @@ def _scene_fields(scene: Scenario, start: int, origin: FloatArray) -> dict[str, 
         "past2s": len(excerpt_rows(scene, row, 20, 40, -1)),
         "future8s": len(excerpt_rows(scene, row, 80, 160, 1)),
         "objects": [AgentKind(kind).name for kind in kinds.tolist()],
-        "lights": [[int(name), LightStatus(status).name] for name, status in lights.items()],
+        "lights": [[int(name), LightStatus(status).name] for name, status in lights],
     }
 
 

@@ -1,7 +1,7 @@
 """The importer against what the official stack reads from the same logs and maps."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -147,6 +147,8 @@ def expert_route(road: VectorMap, points: FloatArray) -> list[str]:
 def excerpt_rows(scene: Scenario, row: int, num: int, horizon: int, direction: int) -> IntArray:
     """Rows that nuPlan reads for `num` samples over `horizon` rows ahead (1) or back (-1)."""
     step = (horizon + 1) // num
+    side: Literal["left", "right"] = "left" if direction > 0 else "right"  # nuPlan rule 431
+    row = int(np.searchsorted(scene.time_us, scene.time_us[row], side)) - (direction < 0)
     rows = row + direction * step * np.arange(1, num + 1)
     # nuPlan rule 604: rows are counted, and those outside the log are silently left out
     return np.sort(rows[(rows >= 0) & (rows < len(scene.time_us))])

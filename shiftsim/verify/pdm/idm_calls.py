@@ -25,7 +25,7 @@ def _compare(call: Source, where: str, scenario: Scenario) -> None:
     seen = observe_log(scenario, iteration, samples=1)
     centers, speeds = planner.roll_out(seen)
     # what the call recorded of its inputs is also in the log
-    tracks, lights = seen.tracks, seen.traffic_lights.items()
+    tracks, lights = seen.tracks, seen.lights.listed(0)
     inputs = {
         "route": list(scenario.route),
         "time_us": seen.time_us,

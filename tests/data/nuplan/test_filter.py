@@ -40,6 +40,9 @@ def test_a_genuine_filter_is_read(tmp_path: Path) -> None:
         tokens=frozenset(["026c317cfdcf519a", "1111111111111111", "2222222222222222"]),
         types=frozenset(["starting_left_turn", "changing_lane"]),
         remove_invalid_goals=True,
+        per_type=25,
+        min_gap_s=15,
+        source=str(tmp_path / "filter.yaml"),
     )
 
 
@@ -80,9 +83,15 @@ def test_what_cannot_be_read_is_refused_with_its_line(text: str, tmp_path: Path)
 @pytest.mark.parametrize(
     "text",
     [
-        "num_scenarios_per_type: 10\n",
+        "num_scenarios_per_type: 0\n",
+        "num_scenarios_per_type: 0.5\n",
+        "limit_total_scenarios: 1.0\n",
+        "limit_total_scenarios: -3\n",
         "expand_scenarios: true\n",
-        "ego_start_speed_threshold: 1.0\n",
+        "ego_start_speed_threshold: fast\n",
+        "timestamp_threshold_s: .nan\n",
+        "fraction_in_token_set_threshold: 1.5\n",
+        "token_set_path: nowhere.json\nfraction_in_token_set_threshold: 0.5\n",
         "something_new: 1\n",
         "scenario_tokens:\n  - abc\n",
         "scenario_types: left\n",

@@ -3,6 +3,8 @@
 import shutil
 import sqlite3
 from collections import Counter
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,11 @@ from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
 from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scenario
 from shiftsim.errors import ConfigError, ConversionError, DataError
+from shiftsim.planners.basic.log_future import LogFuture
+from shiftsim.sim.planner import observe_log, past_rows, scene_info
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind
+from shiftsim.world.state import AgentKind, LightStatus
 
 GOLDEN = places.GOLDEN / "nuplan_format"
 TOKEN = "000000012a05f23c"
@@ -137,6 +141,75 @@ def test_a_track_listed_twice_in_a_frame_is_counted_and_the_last_kept(
     assert np.nansum(changed.poses - original.poses) == pytest.approx(1.0)
 
 
+def test_a_light_with_two_states_at_once_keeps_both(log_path: Path, road: VectorMap) -> None:
+    original, flaws = read(log_path, road).traffic_lights, Counter[str]()
+    edit(
+        log_path,
+        "INSERT INTO traffic_light_status SELECT randomblob(8), lidar_pc_token, lane_connector_id,"
+        " 'yellow' FROM traffic_light_status WHERE rowid <= 2",
+    )
+    lights = read(log_path, road, flaws).traffic_lights
+    row, code = int(original.status.max(axis=1).argmax()), LightStatus.YELLOW
+    name, first = original.listed(row)[0]
+    assert [status for other, status in lights.listed(row) if other == name] == [first, code]
+    assert lights.at(row)[name] == code
+    assert lights.connector_ids[: len(original.connector_ids)] == original.connector_ids
+    assert +flaws == {"traffic light listed several times in a frame": 2}
+
+
+def repeat_stamp(path: Path, row: int) -> None:
+    """Give a row the time stamp of the one before."""
+    place = f"(SELECT rowid FROM lidar_pc ORDER BY timestamp LIMIT 1 OFFSET {row})"
+    before = f"(SELECT timestamp FROM lidar_pc ORDER BY timestamp LIMIT 1 OFFSET {row - 1})"
+    edit(path, f"UPDATE lidar_pc SET timestamp = {before} WHERE rowid = {place}")
+
+
+def test_a_repeated_time_stamp_changes_that_time_and_nothing_else(
+    log_path: Path, road: VectorMap
+) -> None:
+    original, flaws = read(log_path, road), Counter[str]()
+    repeat_stamp(log_path, 101)
+    found = read(log_path, road, flaws)
+    assert +flaws == {"lidar_pc: time stamp repeated": 1}
+    assert np.flatnonzero(found.time_us != original.time_us).tolist() == [101]
+    np.testing.assert_array_equal(found.ego, original.ego)
+    np.testing.assert_array_equal(found.iteration_rows, original.iteration_rows)
+    np.testing.assert_array_equal(found.tracks.poses, original.tracks.poses)
+    np.testing.assert_array_equal(found.traffic_lights.status, original.traffic_lights.status)
+
+
+@pytest.mark.parametrize("index", [False, True])
+def test_rows_with_one_time_stamp_are_counted_as_nuplans_queries_do(
+    log_path: Path, road: VectorMap, index: bool
+) -> None:
+    edit(log_path, *["DROP INDEX IF EXISTS lidar_pc_timestamp_idx"] * (not index))
+    edit(log_path, *["CREATE INDEX IF NOT EXISTS stamps ON lidar_pc (timestamp)"] * index)
+    for row in (101, 104):  # of which the former is the first of two, the latter the second
+        repeat_stamp(log_path, row if row == 104 else row + 1)
+    scenario = read(log_path, road)
+    with closing(sqlite3.connect(log_path)) as connection:
+        for row in (101, 104):
+            stamp = int(scenario.time_us[row])
+            ahead, back = (
+                [
+                    r[0]
+                    for r in connection.execute(
+                        "SELECT timestamp FROM lidar_pc WHERE timestamp"
+                        f" {sign} ? ORDER BY timestamp {order}",
+                        [stamp],
+                    )
+                ]
+                for sign, order in ((">=", ""), ("<=", "DESC"))
+            )
+            cut = replace(scenario, iteration_rows=np.array([row, row + 2, row + 4]))
+            past = scenario.time_us[past_rows(cut, 0)]
+            assert past.tolist() == [stamp, *back[2:43:2]][::-1]
+            planner = LogFuture()
+            planner.reset(scene_info(cut, planner=planner))
+            plan = planner.plan(observe_log(cut, 0, samples=1))
+            assert plan.time_us.tolist() == [stamp, *ahead[10:161:10]]
+
+
 BROKEN = {
     "merged point cloud": ("UPDATE lidar SET channel = 'other'", "MergedPointCloud"),
     "table": ("DROP TABLE lidar_box", "'lidar_box' is missing"),
@@ -146,7 +219,7 @@ BROKEN = {
     "box pose": ("UPDATE lidar_box SET yaw = NULL", "not finite"),
     "text": ("UPDATE lidar_box SET x = 'abc'", "no number"),
     "zero length": ("UPDATE lidar_box SET length = 0", "no length or width"),
-    "duplicate stamps": ("UPDATE lidar_pc SET timestamp = 1600000000000000", "occurs twice"),
+    "all stamps equal": ("UPDATE lidar_pc SET timestamp = 1600000000000000", "two iterations at"),
     "unordered": (
         "UPDATE lidar_pc SET next_token = (SELECT token FROM lidar_pc ORDER BY timestamp LIMIT 1)",
         "earlier time stamp",

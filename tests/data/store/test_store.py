@@ -217,7 +217,7 @@ def test_a_window_reads_only_its_part_of_a_long_recording(
     write_store(tmp_path / "s", road, make_recording(2000, 3, rng), make_window("a", 1000, 1200))
     store = open_store(tmp_path / "s")
     asked: list[list[int]] = []
-    tracks = store._recording("drive").tracks
+    tracks = store.recording("drive").tracks
     read = tracks.read
     monkeypatch.setattr(tracks, "read", lambda blocks: asked.append(blocks) or read(blocks))
     store.read("a")

@@ -198,6 +198,17 @@ def test_a_light_belongs_to_its_connector_and_unknown_ids_are_left_out():
     assert (lookup.at(lights.rows(slice(1, 2))) == LightStatus.UNKNOWN).all()
 
 
+def test_of_several_lights_at_once_the_last_or_the_highest_ranked_counts():
+    road, green, red = straight_road(), LightStatus.GREEN, LightStatus.RED
+    listed = (((red, green), green, red), ((green, red), red, red), ((red, -1), red, red))
+    listed += (((green, LightStatus.YELLOW), LightStatus.YELLOW, green),)
+    plain, ranked = LightLookup(road), LightLookup(road, ranked=(green, red))
+    for codes, last, highest in listed:
+        lights = TrafficLights(("20", "20"), np.array([codes], np.int8))
+        assert plain.at(lights)[road.edges.index["20"]] == last
+        assert ranked.at(lights)[road.edges.index["20"]] == highest
+
+
 @given(seeds, st.integers(0, 60), st.integers(1, 25))
 def test_agent_histories_are_as_computed_one_by_one(seed, count, samples):
     rng = np.random.default_rng(seed)

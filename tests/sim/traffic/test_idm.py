@@ -20,7 +20,7 @@ from shiftsim.verify.report import Report
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks
+from shiftsim.world.state import AgentKind, Tracks, TrafficLights
 
 GOLDEN = places.GOLDEN / "idm_worlds"
 VEHICLE, BICYCLE = AgentKind.VEHICLE, AgentKind.BICYCLE
@@ -125,6 +125,21 @@ def test_agents_beyond_the_radius_are_removed_for_good() -> None:
     last = int(np.flatnonzero(tracks.valid[:, 0])[-1])
     assert 0 < last < 40
     assert tracks.poses[last, 0, 0] > 105.0
+
+
+@pytest.mark.parametrize("codes", [(2, 0), (0, 2)])
+def test_a_light_that_is_red_and_green_at_once_is_both(codes: tuple[int, int]) -> None:
+    base = scene([(150.0, 0.0, 0.0)], [VEHICLE], speed=5.0)
+    road = base.map
+    lit = replace(road, has_traffic_lights=np.ones(len(road.edges), np.bool_))
+
+    def end(road: VectorMap, *codes: int) -> float:
+        lights = TrafficLights(("21",) * len(codes), np.full((ROWS, len(codes)), codes, np.int8))
+        changed, far = replace(base, map=road, traffic_lights=lights), IdmParameters(radius=1e3)
+        return float(drive(changed, steps=150, traffic=IdmTraffic(far)).poses[-1, 0, 0])
+
+    assert end(lit, *codes) == end(lit, 0) > 200.0  # enters where green is asked for
+    assert end(road, *codes) == end(road, 2) < 200.0  # and not where red is
 
 
 def test_parameters_change_the_driving() -> None:

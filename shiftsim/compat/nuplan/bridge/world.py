@@ -88,7 +88,7 @@ def traffic_lights(time_us: int, lights: TrafficLights) -> list[Any]:
             lane_connector_id=int(name) if name.isdecimal() else name,
             timestamp=int(time_us),
         )
-        for name, status in lights.at(0).items()
+        for name, status in lights.listed(0)
     ]
 
 

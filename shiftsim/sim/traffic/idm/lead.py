@@ -8,7 +8,7 @@ from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.paths import remaining_path
-from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
+from shiftsim.sim.traffic.idm.scene import PROGRESS, RED, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
     UNSURE,
@@ -16,10 +16,8 @@ from shiftsim.sim.traffic.idm.shapes import (
     ring_gap,
     touches_corridor,
 )
-from shiftsim.world.state import LightStatus
 
 FREE, OFF_PATH = -1, -2  # instead of a footprint: nobody ahead; outside of the own corridor
-_RED = int(LightStatus.RED)
 _TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to see ties
 _MARGIN = 1.1  # corridors lie within this many half widths of their line
 
@@ -80,7 +78,7 @@ def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> flo
     best = limit
     for segment in range(fleet.route_size[agent]):
         edge = fleet.route[agent, segment]
-        if graph.status[edge] != _RED:
+        if not graph.lights[edge] & RED:
             continue
         for entry in range(stop_lines.ptr[edge], stop_lines.ptr[edge + 1]):
             stop = stop_lines.items[entry]

@@ -15,6 +15,8 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
 from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import (
+    GREEN,
+    RED,
     REPLAYED_KINDS,
     IdmParameters,
     Scene,
@@ -33,7 +35,7 @@ from shiftsim.sim.traffic.idm.step import (
     write_agents,
 )
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
+from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, LightStatus, Tracks, center_poses
 
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
@@ -82,10 +84,7 @@ class IdmTraffic:
         # nuPlan rule 129: the first gaps are measured between boxes on the lanes, not footprints
         for agent, start in enumerate(placed):
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
-        lights, edges = scenario.traffic_lights, scenario.map.edges.index
-        listed = [i for i, name in enumerate(lights.connector_ids) if name in edges]
-        self._light_edges = np.array([edges[lights.connector_ids[i]] for i in listed], np.int64)
-        self._lights = lights.status[scenario.iteration_rows][:, listed].astype(np.int64)
+        self._light_edges, self._lights = _light_flags(scenario)
         # nuPlan rule 11: a difference of epoch seconds
         self._spans = np.diff(scenario.iteration_times * 1e-6)
         _remove(tracks, row, ~is_replayed)
@@ -101,7 +100,7 @@ class IdmTraffic:
         if scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
         # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
-        scene.graph.status[self._light_edges] = self._lights[iteration + 1]
+        scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
         end, what, first = -1, 0, BEGIN
         while end != DONE:
             end, what = advance(scene, ego, row_of(tracks, row), self._spans[iteration], first)
@@ -136,6 +135,20 @@ class IdmTraffic:
         fleet = self._scene.fleet
         speeds: FloatArray = fleet.speed[fleet.alive]
         return speeds
+
+
+def _light_flags(scenario: Scenario) -> tuple[IntArray, IntArray]:
+    """(L,) edges with a light, and (T, L) which lights are listed at each iteration."""
+    lights, index = scenario.traffic_lights, scenario.map.edges.index
+    status = lights.status[scenario.iteration_rows]
+    flags = GREEN * (status == LightStatus.GREEN) + RED * (status == LightStatus.RED)
+    known = [i for i, name in enumerate(lights.connector_ids) if name in index]
+    named = np.array([index[lights.connector_ids[i]] for i in known], np.int64)
+    edges, place = np.unique(named, return_inverse=True)
+    out = np.zeros((len(edges), len(status)), np.int64)
+    # nuPlan rule 429: whoever asks for green finds green, whoever asks for red finds red
+    np.bitwise_or.at(out, place, flags[:, known].T)
+    return edges, np.ascontiguousarray(out.T)
 
 
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:

@@ -13,9 +13,11 @@ from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import interpolate, point_on_polyline, vertex_heading
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
+    GREEN,
     HEADING,
     MAX_ROUTE,
     PROGRESS,
+    RED,
     Fleet,
     Footprints,
     IdmParameters,
@@ -24,12 +26,10 @@ from shiftsim.sim.traffic.idm.scene import (
 )
 from shiftsim.sim.traffic.idm.shapes import bound_ring
 from shiftsim.world.layers import Polylines
-from shiftsim.world.state import LightStatus
 
 _SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
 _CURVATURE_SPACING = 2.0  # m between the three points of the estimate, nuPlan
 _STRAIGHT = 1e-6  # m^4, 16 times the squared area below which three points count as aligned
-_GREEN, _RED = int(LightStatus.GREEN), int(LightStatus.RED)
 
 
 @lean_kernel
@@ -128,9 +128,9 @@ def choose_successor(graph: LaneGraph, edge: int) -> int:
         following = graph.outgoing.items[entry]
         # nuPlan rule 126: with lights only green is open, without any listed state but red
         if graph.has_lights[following]:
-            if graph.status[following] != _GREEN:
+            if not graph.lights[following] & GREEN:
                 continue
-        elif graph.status[following] == _RED:
+        elif graph.lights[following] & RED:
             continue
         curvature = initial_curvature(graph.baselines, following)
         if curvature < best:

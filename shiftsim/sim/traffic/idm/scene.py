@@ -12,7 +12,7 @@ from shiftsim.geometry.polylines import RUN
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import AgentKind, LightStatus, Tracks
+from shiftsim.world.state import AgentKind, Tracks
 
 # Kinds that are replayed from the log, in nuPlan's order of observation.
 REPLAYED_KINDS = (
@@ -23,6 +23,7 @@ REPLAYED_KINDS = (
     AgentKind.GENERIC_OBJECT,
 )
 HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
+GREEN, RED = 1, 2  # lights of an edge, added up where several are listed
 MAX_ROUTE = 5  # segments an agent remembers, nuPlan
 _CURVE_CAPACITY = 256  # vertices of a footprint to begin with
 _EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the path
@@ -49,7 +50,7 @@ class LaneGraph(NamedTuple):
     has_lights: BoolArray  # (E,) whether lights govern the edge
     stop_lines: Lists  # stop polygons of an edge
     stops: Polygons  # the stop polygons
-    status: IntArray  # (E,) LightStatus codes of the present step
+    lights: IntArray  # (E,) which lights are listed in the present step: GREEN and RED added up
 
 
 class Fleet(NamedTuple):
@@ -127,7 +128,7 @@ def lane_graph(map: VectorMap) -> LaneGraph:
         map.stop_lines,
         # maps are read-only, which to a kernel is another type than footprints are
         Polygons._make(array.copy() for array in map.stop_polygons.polygons),
-        np.full(len(map.edges), LightStatus.ABSENT, np.int64),
+        np.zeros(len(map.edges), np.int64),
     )
 
 
