@@ -13,7 +13,7 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.dsc3d.motion import track_medians
 from shiftsim.data.tracks.columns import KINDS, UNITS, Columns
 from shiftsim.data.tracks.fit import Fit, fit_map
-from shiftsim.data.tracks.motion import contradicting, fitted_velocities
+from shiftsim.data.tracks.motion import contradiction, fitted_velocities
 from shiftsim.data.tracks.reading import TrackTable
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.world.map import VectorMap
@@ -305,7 +305,7 @@ def _velocities_fit(motion: _Motion) -> bool:
     stored, rows = motion.table.velocities, motion.rows(_FAST)
     if stored is None or not len(rows):
         return False
-    wrong = contradicting(stored, motion.derived, motion.time, motion.table.track)
+    wrong, _ = contradiction(stored, motion.derived, motion.time, motion.table.track)
     return bool(wrong[motion.table.track[rows]].mean() <= _LEAST_CONTRADICTING)
 
 
@@ -393,7 +393,7 @@ def _check_velocities(motion: _Motion, fit: Fit, out: Doubts) -> None:
         return
     moving = np.unique(table.track[rows])
     derived = fit.turned(motion.derived)
-    wrong = contradicting(stored, derived, motion.time, table.track)[moving]
+    wrong = contradiction(stored, derived, motion.time, table.track)[0][moving]
     out.figures["contradicting_share"] = float(wrong.mean())
     rows = rows[np.isfinite(stored[rows]).all(axis=1)]
     rows = rows[np.isin(table.track[rows], moving[wrong])]
