@@ -12,8 +12,8 @@ from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
 
 def export_town(folder: Path, town: str):
     """Columns of a demo recording at 12.5 Hz by name, and its map; `folder` is made if needed."""
-    if not folder.exists():
-        write_demo(folder)
+    if not (folder / town).exists():
+        write_demo(folder, town)
     site = open_site(folder / town)
     found = read_recording(site, site.recordings[0])
     track = found.track
