@@ -182,7 +182,7 @@ SPOILT = {
     ),
     "places of the rear": (_along(-0.5), "in turns", "reference = 'rear'", {"reference": "rear"}),
     "one id for two objects": (_merged, "has two rows", "ids of their own", None),
-    "a row far away": (_jumping, "jumps 8", "a row is wrong", None),
+    "a row far away": (_jumping, "jumps 79.6 m", "a row is wrong", None),
     "numbers for kinds": (
         lambda c: {"kind": np.where(c["kind"] == "pedestrian", 1, 2)},
         "kinds '1', '2' are unknown",
