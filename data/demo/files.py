@@ -21,12 +21,16 @@ _GROUND = 512.0  # m, altitude of everything
 _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleration")
 
 
-def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes."""
+def write_demo(folder: Path, only: str = "") -> None:
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
+
+    All towns are written, or the one named.
+    """
     for site in demo_sites():
-        town = site.town()
-        traffics = [traffic_of(scene, town) for scene in site.scenes]
-        write_site(folder / site.name, site, town, traffics)
+        if only in ("", site.name):
+            town = site.town()
+            traffics = [traffic_of(scene, town) for scene in site.scenes]
+            write_site(folder / site.name, site, town, traffics)
 
 
 def write_site(folder: Path, site: DemoSite, town: Town, traffics: Iterable[Traffic]) -> None:

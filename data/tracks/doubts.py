@@ -1,0 +1,262 @@
+"""What cannot be right about a table of tracks, recognised by what it does, and the remedy.
+
+A wrong unit, axis, order or origin shows in how objects move, in their sizes, and in where they are
+on the map. Every explanation that is known is tried; the one that makes the numbers fit is named.
+"""
+
+import numpy as np
+
+from shiftsim.arrays import BoolArray, FloatArray
+from shiftsim.data.tracks.axes import check_headings, check_reference, check_velocities
+from shiftsim.data.tracks.build import numbered
+from shiftsim.data.tracks.columns import KINDS, UNITS, Columns
+from shiftsim.data.tracks.evidence import FAST, LEAST_CONTRADICTING, Doubts, Motion
+from shiftsim.data.tracks.fit import Fit, fit_map
+from shiftsim.data.tracks.motion import contradiction
+from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import AgentKind
+
+_RATES = (2.0, 100.0)  # Hz
+_MAX_SPEED = 60.0  # m/s, of 95 % of the vehicles' rows
+_LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
+_MOVING = 1.0  # m/s
+_MAX_GAP = 1.0  # s without a row of any object
+_DEGREE = 1e5  # m, about
+_JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
+_LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
+_MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
+
+
+def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
+    """Everything that cannot be right; `min_share` of the moving vehicles must be on the map."""
+    out = Doubts()
+    used = np.unique(table.category).tolist()
+    if unknown := [
+        name for i, name in enumerate(table.categories) if i in used and name not in KINDS
+    ]:
+        names = ", ".join(map(repr, unknown))
+        out.say(
+            f"kinds {names} are unknown",
+            f"say what they are in a TOML file for --columns: [kinds] {unknown[0]!r} = 'car';"
+            f" known are {', '.join(sorted(KINDS))}",
+        )
+        return out
+    vehicles = [KINDS.get(name) == AgentKind.VEHICLE for name in table.categories]
+    is_vehicle = np.array(vehicles, np.bool_)[table.category]
+    if not is_vehicle.any():
+        out.say(
+            f"none of the {len(table.track_ids)} objects is a vehicle, so none can be the ego:"
+            f" kinds {', '.join(map(repr, table.categories))}",
+            "check the column of kinds, or map them: [kinds]",
+        )
+        return out
+    same = np.diff(table.track) == 0
+    step = np.diff(table.time_us)[same] / 1e6
+    if not _check_times(table, step, out):
+        return out
+    time = (table.time_us - table.time_us.min()) / 1e6
+    motion = Motion(table, is_vehicle, time, float(np.median(step)))
+    _check_jumps(motion, same, out)
+    if not _check_speeds(motion, out):
+        return out
+    moving = motion.rows(_MOVING)
+    _check_gaps(table, out)
+    # another unit of length would show elsewhere, too
+    is_metric = _has_usual_sizes(motion) and _velocities_fit(motion)
+    fit = fit_map(road, table.xy[moving], motion.derived[moving], min_share, only_metres=is_metric)
+    out.figures.update({"drivable_share": fit.share, "along_share": fit.along})
+    _check_fit(fit, table.columns, min_share, out)
+    if fit.is_good and fit.overspeed > _MAX_OVERSPEED:
+        out.figures["overspeed"] = fit.overspeed
+        out.note(
+            f"a tenth of the moving vehicles is {fit.overspeed:.2g} times as fast as the speed"
+            f" limit of their lane or faster, usual is less than {_MAX_OVERSPEED:g}",
+            "check --hz or the unit of time, unless the limits of the map are wrong",
+        )
+    _check_sizes(motion, out)
+    check_headings(motion, fit, out)
+    check_velocities(motion, fit, out)
+    if not out.found:
+        check_reference(motion, out)
+        out.derived = motion.derived
+    return out
+
+
+def _check_times(table: TrackTable, step: FloatArray, out: Doubts) -> bool:
+    """Whether motion can be told at all."""
+    if not len(step):
+        out.say(
+            f"each of the {len(table.track_ids)} objects has one row only",
+            "check the column of ids: an object needs the same id in all its rows",
+        )
+        return False
+    twice = np.flatnonzero((np.diff(table.track) == 0) & (np.diff(table.time_us) == 0))
+    if len(twice):
+        name = table.track_ids[table.track[twice[0]]].item()
+        when = (table.time_us[twice[0]] - table.time_us.min()) / 1e6
+        out.say(
+            f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are"
+            " repeated, or one id names two objects",
+            "leave repeated rows out, give objects ids of their own, and check the unit of time",
+        )
+        return False
+    period = float(np.median(step))
+    slow, fast = _RATES
+    if 0.99 / fast <= period <= 1.01 / slow:
+        return True
+    column = table.columns.found.get("time")
+    remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
+    if column is not None and table.hz is None:
+        units = UNITS["time"]
+        for unit, factor in units.items():
+            if 1.0 / fast <= period * factor / units[column.unit] <= 1.0 / slow:
+                remedy = f"{column.name!r} looks like {unit}: [units] time = {unit!r}"
+        if abs(period / (units[column.unit] / 1e6) - 1.0) < 1e-9:
+            remedy += f"; if it counts frames: [columns] frame = {column.name!r}, and --hz"
+    else:
+        remedy = "check --hz, the number of frames per second"
+    out.say(
+        f"rows of an object are {period:g} s apart ({1.0 / period:g} Hz), need"
+        f" {slow:g} … {fast:g} Hz",
+        remedy,
+    )
+    return False
+
+
+def _check_gaps(table: TrackTable, out: Doubts) -> None:
+    stamps, _ = numbered(table.time_us)
+    gaps = np.flatnonzero(np.diff(stamps) > _MAX_GAP * 1e6)
+    if len(gaps):
+        begin, end = (stamps[gaps[0] : gaps[0] + 2] - stamps[0]) / 1e6
+        out.note(
+            f"no object has a row between {begin:g} s and {end:g} s ({len(gaps)} such gaps of more"
+            f" than {_MAX_GAP:g} s)",
+            "no scenario reaches over it; if two recordings were joined, convert each by itself",
+        )
+
+
+def _check_jumps(motion: Motion, same: BoolArray, out: Doubts) -> None:
+    """Single rows that are far from their neighbours."""
+    table = motion.table
+    way = np.hypot(*np.diff(table.xy, axis=0).T)
+    far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(motion.time))
+    share = far.sum() / max(1, same.sum())
+    out.figures["jumps"] = float(far.sum())
+    if 0.0 < share < 0.01:
+        row = int(np.flatnonzero(far)[0])
+        name = table.track_ids[table.track[row]].item()
+        out.say(
+            f"object {name!r} jumps {way[row]:.1f} m within"
+            f" {motion.time[row + 1] - motion.time[row]:g} s at {motion.time[row]:g} s ({far.sum()}"
+            f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
+            "one id names two objects, or a row is wrong: give objects ids of their own",
+        )
+
+
+def _check_speeds(motion: Motion, out: Doubts) -> bool:
+    speed = motion.speed[motion.is_vehicle]
+    high, fastest = float(np.percentile(speed, 95)), float(speed.max())
+    out.figures.update({"fastest_vehicle_mps": fastest})
+    table = motion.table
+    column = table.columns.found["x"]
+    if high > _MAX_SPEED:
+        units = UNITS["position"]
+        fitting = [u for u, f in units.items() if 1 < high * f / units[column.unit] < 40]
+        guess = (
+            f": they look like {fitting[0]}: [units] position = {fitting[0]!r}" if fitting else ""
+        )
+        out.say(
+            f"vehicles move at {high:.4g} m/s (95 % of the rows are slower), at most {_MAX_SPEED:g}"
+            " m/s is possible",
+            f"check the units of positions and time{guess}",
+        )
+        return False
+    if fastest < _LEAST_SPEED:
+        spread = float((table.xy.max(axis=0) - table.xy.min(axis=0)).max())
+        remedy = "check the units of positions and time; an ego must move"
+        if _LEAST_SPEED < fastest * UNITS["position"]["km"] < _MAX_SPEED:
+            remedy = "positions look like kilometres: [units] position = 'km'"
+        elif _LEAST_SPEED < fastest * _DEGREE < _MAX_SPEED and np.abs(table.xy).max() <= 360.0:
+            remedy = (
+                "positions look like degrees of longitude and latitude: project them to the metric"
+                " frame of the map (pyproj)"
+            )
+        out.say(
+            f"no vehicle is faster than {fastest:.3g} m/s, and all positions are within"
+            f" {spread:.3g} m; an ego must reach {_LEAST_SPEED:g} m/s",
+            remedy,
+        )
+        return False
+    return True
+
+
+def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Doubts) -> None:
+    if fit.is_good:
+        return
+    if fit.share < min_share:
+        what = (
+            f"only {fit.share:.0%} of the moving vehicles are on drivable area, need"
+            f" {min_share:.0%}"
+        )
+    else:
+        what = (
+            f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
+            f" {fit.min_along:.0%}"
+        )
+    if fit.best is None:
+        out.say(
+            what,
+            "no other unit, axis or origin fits better: give the map of this place, and check that"
+            " it is of this recording",
+        )
+        return
+    x, y = columns.found["x"].name, columns.found["y"].name
+    remedy = ", and ".join(fit.best.remedies(x, y))
+    out.say(f"{what}; {fit.best.share:.0%} {fit.best.words}", f"in a TOML file: {remedy}")
+
+
+def _usual(length: float, width: float) -> bool:
+    return _LENGTHS[0] <= length <= _LENGTHS[1] and _WIDTHS[0] <= width <= _WIDTHS[1]
+
+
+def _has_usual_sizes(motion: Motion) -> bool:
+    return motion.vehicle_size is not None and _usual(*motion.vehicle_size)
+
+
+def _velocities_fit(motion: Motion) -> bool:
+    stored, rows = motion.table.velocities, motion.rows(FAST)
+    if stored is None or not len(rows):
+        return False
+    wrong, _ = contradiction(stored, motion.derived, motion.time, motion.table.track)
+    return bool(wrong[motion.table.track[rows]].mean() <= LEAST_CONTRADICTING)
+
+
+def _check_sizes(motion: Motion, out: Doubts) -> None:
+    if motion.vehicle_size is None:
+        return
+    length, width = motion.vehicle_size
+    out.figures.update({"median_length_m": length, "median_width_m": width})
+    columns = motion.table.columns.found
+    names = columns["length"].name, columns["width"].name
+
+    if _usual(length, width):
+        return
+    remedy = "check the unit and the columns of length and width"
+    units = UNITS["size"]
+    for unit, factor in units.items():
+        scale = factor / units[columns["length"].unit]
+        if _usual(length * scale, width * scale):
+            remedy = f"they look like {unit}: [units] size = {unit!r}"
+        elif _usual(width * scale, length * scale):
+            remedy = (
+                f"length and width look swapped: [columns] length = {names[1]!r}, width ="
+                f" {names[0]!r}" + ("" if scale == 1 else f", [units] size = {unit!r}")
+            )
+    if _usual(2.0 * length, 2.0 * width):
+        remedy = "these look like halves (extents from the middle): write whole lengths and widths"
+    out.say(
+        f"the median vehicle is {length:.3g} m long and {width:.3g} m wide, need"
+        f" {_LENGTHS[0]:g} … {_LENGTHS[1]:g} m and {_WIDTHS[0]:g} … {_WIDTHS[1]:g} m",
+        remedy,
+    )
