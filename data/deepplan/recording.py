@@ -1,4 +1,4 @@
-"""One DSC3D recording to scenarios.
+"""One recording to scenarios.
 
 One pass: windows and verdicts on the source frames, everything at 20 Hz once, then an ego trace per
 accepted track and a scenario per accepted (window, track). Whatever is dropped is counted.
@@ -6,6 +6,7 @@ accepted track and a scenario per accepted (window, track). Whatever is dropped 
 
 import hashlib
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +19,13 @@ from shiftsim.data.deepplan.windows import (
     LANE,
     ROUTE,
     ConversionConfig,
+    Span,
     find_runs,
     judge_windows,
     rows_of,
 )
-from shiftsim.data.dsc3d.recording import Annotations
 from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import rear_poses
 
@@ -57,23 +59,45 @@ class Converted:
 
 
 def convert_recording(
-    source: Annotations, road: VectorMap, offset: FloatArray, config: ConversionConfig
+    source: TrackSamples,
+    road: VectorMap,
+    offset: FloatArray,
+    config: ConversionConfig,
+    *,
+    spans: Sequence[Span] | None = None,
+    scenario_type: str = SCENARIO_TYPE,
 ) -> Converted:
-    """All scenarios of one recording; the map is in UTM, as is `offset` (2,) of the origin [m]."""
-    return _Conversion(source, road, offset, config).convert()
+    """All scenarios of one recording.
+
+    Args:
+        source: The recording.
+        road: The map.
+        offset: (2,) what to add to places of the recording to get those of the map [m].
+        config: Thresholds.
+        spans: Windows to look at; all that fit into the recording by default.
+        scenario_type: Tag of the scenarios.
+    """
+    return _Conversion(source, road, offset, config, spans, scenario_type).convert()
 
 
 class _Conversion:
     """One recording on its way; arguments as above."""
 
     def __init__(
-        self, source: Annotations, road: VectorMap, offset: FloatArray, config: ConversionConfig
+        self,
+        source: TrackSamples,
+        road: VectorMap,
+        offset: FloatArray,
+        config: ConversionConfig,
+        spans: Sequence[Span] | None,
+        scenario_type: str,
     ) -> None:
         self.source, self.road, self.offset, self.config = source, road, offset, config
+        self.scenario_type = scenario_type
         self.log_name = f"{road.name}_{source.name}"
         self.runs = find_runs(source, config.max_hole_s)
         self.padding = rows_of(config.padding_s)
-        self.windows = judge_windows(source, self.runs, config)
+        self.windows = judge_windows(source, self.runs, config, spans)
         self.verdicts: Counter[str] = Counter()
 
     def convert(self) -> Converted:
@@ -124,21 +148,22 @@ class _Conversion:
         return accepted
 
     def _trace(self, run: int, numbers: list[int]) -> EgoTrace:
-        starts = [rows_of(self.windows[number].start_s) for number in numbers]
+        spans = [self.windows[number].span for number in numbers]
         return ego_trace(
             self.source,
             self.runs,
             run,
             log_name=self.log_name,
             offset=self.offset,
-            first_row=min(starts),
-            last_row=max(starts) + self.padding + rows_of(self.config.window_s),
+            first_row=min(rows_of(span.start_s) for span in spans),
+            last_row=max(rows_of(s.start_s) + rows_of(s.length_s) for s in spans) + self.padding,
             padding=self.padding,
         )
 
     def _scenarios(self, run: int, numbers: list[int], trace: EgoTrace) -> list[Window]:
         """Scenarios of one ego; what has no lane or no route is counted."""
-        starts = np.array([self.windows[n].start_s + self.config.history_s for n in numbers])
+        spans = [self.windows[number].span for number in numbers]
+        starts = np.array([span.start_s + span.history_s for span in spans])
         at_start = sample_runs(self.source, self.runs, np.full(len(starts), run), starts).poses
         at_start[:, :2] += self.offset
         out = []
@@ -154,10 +179,11 @@ class _Conversion:
     def _scenario(self, run: int, number: int, trace: EgoTrace) -> Window | None:
         """One scenario, or None where the ego touches no roadblock."""
         source, config, road = self.source, self.config, self.road
-        start_s = self.windows[number].start_s
+        span = self.windows[number].span
+        start_s = span.start_s
         first = rows_of(start_s)  # with the padding, one padding earlier than the window
-        start = first + self.padding + rows_of(config.history_s)
-        end = first + self.padding + rows_of(config.window_s)
+        start = first + self.padding + rows_of(span.history_s)
+        end = first + self.padding + rows_of(span.length_s)
         states = trace.states[start - trace.first_row : end - trace.first_row]
         track = int(self.runs.track[run])
         route = find_route(road, states[:, :3], config)
@@ -165,13 +191,13 @@ class _Conversion:
             return None
         goal = states[-1, :3].copy()
         last = int(np.searchsorted(source.track, track, side="right")) - 1
-        if source.time[last] > start_s + config.window_s:
+        if source.time[last] > start_s + span.length_s:
             center = np.array([*source.centers[last, :2] + self.offset, source.headings[last]])
             goal = rear_poses(center)  # nuPlan rule 457
-        key = f"{road.name}|{source.name}|{start_s}|{source.track_ids[track]}|{config.window_s}"
+        key = f"{road.name}|{source.name}|{start_s}|{source.track_ids[track]}|{span.length_s}"
         return Window(
             token=hashlib.blake2b(key.encode(), digest_size=8).hexdigest(),
-            scenario_type=SCENARIO_TYPE,
+            scenario_type=self.scenario_type,
             log_name=self.log_name,
             ego=trace.name,
             first_row=first,
@@ -180,13 +206,13 @@ class _Conversion:
             row_step=2,
             route=route.ids,
             mission_goal=goal,
-            mapping=(config.window_s - config.history_s, 0.0, 0.5),
-            is_short=config.is_short,
+            mapping=(span.length_s - span.history_s, 0.0, 0.5),
+            is_short=span.is_short,
             metadata={
                 "recording": source.name,
                 "window": number,
                 "window_start_s": start_s,
-                "track_id": int(source.track_ids[track]),
+                "track_id": source.track_ids[track].item(),
                 "category": source.categories[track],
                 "size_m": source.sizes[track].tolist(),
                 "driven_blocks": route.num_driven,

@@ -10,14 +10,14 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.deepplan.windows import ROW_S, Runs, rows_of
-from shiftsim.data.dsc3d.recording import Annotations
 from shiftsim.data.recording import EgoTrace, Recording
+from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 
 _EPS = 1e-9  # s
-_ROW_US = 50_000  # us, as `ROW_S`
+ROW_US = 50_000  # us, as `ROW_S`
 _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second order
 
 
@@ -30,7 +30,7 @@ class Samples:
     heights: FloatArray  # (G,) z of the box centre [m]
 
 
-def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatArray) -> Samples:
+def sample_runs(recording: TrackSamples, runs: Runs, run: IntArray, time: FloatArray) -> Samples:
     """Boxes of runs (G,) at times (G,) since the first frame [s], linear between the frames.
 
     Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
@@ -61,13 +61,13 @@ def sample_runs(recording: Annotations, runs: Runs, run: IntArray, time: FloatAr
     )
 
 
-def _rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
+def rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
     """First and last 20 Hz row of time spans; first > last where one lies between two rows."""
     first = np.ceil(first_s / ROW_S - _EPS).astype(np.int64)
     return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
 
 
-def run_token(recording: Annotations, runs: Runs, run: int) -> str:
+def run_token(recording: TrackSamples, runs: Runs, run: int) -> str:
     """Track token of a run: the track id; a presence after a long hole is a track of its own."""
     number = int(runs.number[run])
     name = str(recording.track_ids[runs.track[run]])
@@ -75,7 +75,7 @@ def run_token(recording: Annotations, runs: Runs, run: int) -> str:
 
 
 def resample(
-    recording: Annotations,
+    recording: TrackSamples,
     runs: Runs,
     *,
     log_name: str,
@@ -90,7 +90,7 @@ def resample(
     """
     padding = rows_of(padding_s)
     num_rows = int(np.floor(recording.duration / ROW_S + _EPS)) + 1 + padding
-    first, last = _rows_between(recording.time[runs.first], recording.time[runs.last])
+    first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
     first = np.where(recording.frame[runs.first] == 0, -padding, first)
     kept = np.flatnonzero(last >= first)
     kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
@@ -115,12 +115,12 @@ def resample(
     moves = (kinds <= LAST_AGENT_KIND)[column]
     tracks.velocities[row[moves], column[moves]] = samples.velocities[moves]
     tracks.sizes[row, column] = recording.sizes[runs.track[kept]][column, :2]
-    times = recording.start_us + (np.arange(num_rows) - padding) * _ROW_US
+    times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
 
 
 def ego_trace(
-    recording: Annotations,
+    recording: TrackSamples,
     runs: Runs,
     run: int,
     *,
@@ -136,7 +136,7 @@ def ego_trace(
     they count from the first of the `padding` rows made up before the first frame.
     """
     ends = recording.time[[runs.first[run], runs.last[run]]]
-    begin, end = _rows_between(ends[:1], ends[1:])
+    begin, end = rows_between(ends[:1], ends[1:])
     low = min(int(begin[0]) + padding, first_row)
     high = max(int(end[0]) + 1 + padding, last_row)
     times = np.arange(low - padding, high - padding).astype(np.float64) * ROW_S

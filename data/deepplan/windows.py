@@ -5,14 +5,14 @@ verdict: `ego`, or the first rule it fails: category, presence, speed, overlap (
 lane and route).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.data.dsc3d.recording import Annotations
+from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.world.ranges import SETTINGS
@@ -21,6 +21,21 @@ ROW_S = 0.05  # s between rows of a converted recording
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
 LANE, ROUTE = "lane", "route"
 _EPS = 1e-9  # s
+
+
+@dataclass(frozen=True)
+class Span:
+    """Where a window lies in a recording."""
+
+    start_s: float  # start since the first frame [s]
+    length_s: float  # length with the history [s]
+    history_s: float  # part before iteration 0 [s]
+    only: int = -1  # the one track that is asked for, whatever its category; -1 for all
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it is shorter than the benchmark's, so that scores do not compare."""
+        return self.length_s < 18.0 or self.history_s < 3.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +80,7 @@ class ConversionConfig:
     @property
     def is_short(self) -> bool:
         """Whether scenarios are shorter than the benchmark's, so that scores do not compare."""
-        return self.window_s < 18.0 or self.history_s < 3.0
+        return Span(0.0, self.window_s, self.history_s).is_short
 
 
 def make_config(values: Mapping[str, Any]) -> ConversionConfig:
@@ -120,7 +135,7 @@ class Runs:
 class WindowVerdicts:
     """What became of every track seen in one window. n tracks."""
 
-    start_s: float  # start of the window since the first frame [s]
+    span: Span  # the window
     tracks: IntArray  # (n,) tracks, ascending
     runs: IntArray  # (n,) run that covers the whole window, -1 where none does
     verdicts: tuple[str, ...]  # n names of a rule, or `ego`
@@ -132,7 +147,7 @@ def rows_of(seconds: float) -> int:
     return round(seconds / ROW_S)
 
 
-def find_runs(recording: Annotations, max_hole_s: float) -> Runs:
+def find_runs(recording: TrackSamples, max_hole_s: float) -> Runs:
     """Split the tracks where they are absent for longer than `max_hole_s` (nuPlan rule 458)."""
     time = recording.time
     gap = np.r_[np.inf, np.diff(time)]
@@ -153,22 +168,38 @@ def window_starts(duration: float, config: ConversionConfig) -> FloatArray:
     return np.arange(max(count, 0), dtype=np.float64) * stride
 
 
+def window_spans(duration: float, config: ConversionConfig) -> list[Span]:
+    """Every window that fits into a recording [s]."""
+    starts = window_starts(duration, config).tolist()
+    return [Span(start, config.window_s, config.history_s) for start in starts]
+
+
 def judge_windows(
-    recording: Annotations, runs: Runs, config: ConversionConfig
+    recording: TrackSamples,
+    runs: Runs,
+    config: ConversionConfig,
+    spans: Sequence[Span] | None = None,
 ) -> list[WindowVerdicts]:
-    """The verdict on every track in every window, rules of category to overlap."""
+    """The verdict on every track in every window, rules of category to overlap.
+
+    The windows are those that fit into the recording, unless `spans` are given.
+    """
+    if spans is None:
+        spans = window_spans(recording.duration, config)
+    only = np.array([span.only for span in spans if span.only >= 0], np.int64)
     allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
     speed = _median_of_three(  # nuPlan rule 452
         np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]), recording.track
     )
-    partner = overlap_partners(recording, allowed, config.max_overlap)
-    return [
-        _judge(float(start), recording, runs, config, allowed, speed, partner)
-        for start in window_starts(recording.duration, config)
-    ]
+    asked = allowed & any(span.only < 0 for span in spans)
+    asked[only] = True
+    partner = overlap_partners(recording, asked, config.max_overlap)
+    return [_judge(span, recording, runs, config, allowed, speed, partner) for span in spans]
 
 
-def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap: float) -> IntArray:
+def overlap_partners(
+    recording: TrackSamples, candidates: BoolArray, max_overlap: float
+) -> IntArray:
     """(A,) a track whose box shares more than `max_overlap` [m^2] with the row's, -1 without one.
 
     nuPlan rule 451: with the recorded sizes, and tracks of all categories. Only rows of the
@@ -177,7 +208,7 @@ def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap:
     by_frame = np.lexsort((recording.track, recording.frame))
     frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
     boxes = np.column_stack(
-        [recording.centers[:, :2], recording.angles[:, 0], recording.sizes[recording.track, :2]]
+        [recording.centers[:, :2], recording.raw_headings, recording.sizes[recording.track, :2]]
     )[by_frame]
     asked = candidates[recording.track[by_frame]]
     found = _first_overlaps(np.ascontiguousarray(boxes), frame_ptr, asked, max_overlap)
@@ -187,8 +218,8 @@ def overlap_partners(recording: Annotations, candidates: BoolArray, max_overlap:
 
 
 def _judge(
-    start: float,
-    recording: Annotations,
+    span: Span,
+    recording: TrackSamples,
     runs: Runs,
     config: ConversionConfig,
     allowed: BoolArray,
@@ -196,9 +227,12 @@ def _judge(
     partner: IntArray,
 ) -> WindowVerdicts:
     num_tracks = len(recording.track_ids)
-    first = int(np.searchsorted(recording.clock, start - _EPS))
-    last = int(np.searchsorted(recording.clock, start + config.window_s - _EPS)) - 1
+    first = int(np.searchsorted(recording.clock, span.start_s - _EPS))
+    last = int(np.searchsorted(recording.clock, span.start_s + span.length_s - _EPS)) - 1
     rows = np.flatnonzero((recording.frame >= first) & (recording.frame <= last))
+    if span.only >= 0:
+        allowed = np.arange(num_tracks) == span.only
+        rows = rows[recording.track[rows] == span.only]
     tracks = np.unique(recording.track[rows])
     peak = np.zeros(num_tracks)
     np.maximum.at(peak, recording.track[rows], speed[rows])
@@ -215,7 +249,7 @@ def _judge(
     )
     found = verdict[tracks]
     partners = np.where(found == OVERLAP, hit[tracks], -1)
-    return WindowVerdicts(start, tracks, run[tracks], tuple(found.tolist()), partners)
+    return WindowVerdicts(span, tracks, run[tracks], tuple(found.tolist()), partners)
 
 
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:

@@ -8,7 +8,6 @@ Position and heading are taken as truth, heading through the rotation matrix.
 import json
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from shiftsim.data.dsc3d.motion import (
     rotation_angles,
     track_medians,
 )
+from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import DSC3D, require
 from shiftsim.world.state import AgentKind
@@ -81,38 +81,11 @@ class Site:
 
 
 @dataclass(frozen=True)
-class Annotations:
-    """One recording. F frames, A rows (one per object and frame), N tracks.
+class Annotations(TrackSamples):
+    """One recording, in the local frame."""
 
-    Rows are sorted by track, then frame. Poses are in the local frame.
-    """
-
-    name: str  # name of the recording
-    start_us: int  # UTC time of the first frame [us]
-    period: float  # nominal time between frames [s]
-    clock: FloatArray  # (F,) time of the frames since the first one [s]
-    frame: IntArray  # (A,) frame of the row
-    track: IntArray  # (A,) track of the row
     bottom: FloatArray  # (A, 3) centre of the bottom face [m]
     angles: FloatArray  # (A, 3) yaw, pitch, roll [rad]
-    centers: FloatArray  # (A, 3) centre of the box [m]
-    headings: FloatArray  # (A,) yaw, held where it spins at standstill [rad]
-    velocities: FloatArray  # (A, 2) in the local frame [m/s]
-    track_ids: IntArray  # (N,) ids, ascending
-    categories: tuple[str, ...]  # N normalised names
-    kinds: IntArray  # (N,) AgentKind codes
-    sizes: FloatArray  # (N, 3) length, width, height [m]
-    warnings: dict[str, int]  # count by kind of what was repaired
-
-    @cached_property
-    def time(self) -> FloatArray:
-        """(A,) time of the rows since the first frame [s]."""
-        return self.clock[self.frame]
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last frame [s]."""
-        return float(self.clock[-1])
 
 
 def open_site(src: Path) -> Site:
@@ -244,6 +217,7 @@ def read_recording(
         bottom=bottom,
         angles=angles,
         centers=centers,
+        raw_headings=angles[:, 0],
         headings=held_headings(angles[:, 0], velocities, time, track, warnings),
         velocities=velocities,
         track_ids=track_ids,

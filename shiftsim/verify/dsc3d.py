@@ -272,8 +272,8 @@ def _verify_scripted(expected: Source, folder: Path, maps: Path | None) -> None:
         }
         egos = [track for track, verdict in verdicts.items() if verdict == EGO]
         where, own = (
-            f"{name} window {window.start_s:g} s",
-            {"start_s": window.start_s, "egos": egos},
+            f"{name} window {window.span.start_s:g} s",
+            {"start_s": window.span.start_s, "egos": egos},
         )
         theirs.match(where, own, _EXACT, quantity="window", unordered={"egos"})
         given = {int(track): verdict for track, verdict in theirs["verdict"].items()}

@@ -1,0 +1,218 @@
+"""From columns of a source to `TrackSamples`: sorted, checked, with velocities and headings.
+
+Rows may come in any order and at any rate, and every object may have times of its own. What cannot
+be is an error; what can be repaired is repaired and counted.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.deepplan.states import ROW_US, rows_between, sample_runs
+from shiftsim.data.deepplan.windows import ROW_S, find_runs
+from shiftsim.data.dsc3d.motion import held_headings, track_medians
+from shiftsim.data.dsc3d.recording import CATEGORIES
+from shiftsim.data.tracks.motion import believed, fitted_velocities, headings_of_motion
+from shiftsim.data.tracks.samples import TrackSamples
+from shiftsim.errors import ConversionError
+from shiftsim.world.state import AgentKind
+
+MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
+# length and width of objects of unknown size [m]
+SIZES = {
+    AgentKind.VEHICLE: (4.6, 1.9),
+    AgentKind.BICYCLE: (1.8, 0.6),
+    AgentKind.PEDESTRIAN: (0.7, 0.7),
+    AgentKind.TRAFFIC_CONE: (0.4, 0.4),
+    AgentKind.BARRIER: (2.0, 0.5),
+    AgentKind.CZONE_SIGN: (0.5, 0.5),
+    AgentKind.GENERIC_OBJECT: (1.0, 1.0),
+}
+
+
+def make_samples(
+    name: str,
+    *,
+    time_us: IntArray,
+    ids: NDArray[Any],
+    category: IntArray,
+    categories: Sequence[str],
+    xy: FloatArray,
+    headings: FloatArray | None = None,
+    velocities: FloatArray | None = None,
+    sizes: FloatArray | None = None,
+    trusts_velocities: bool = False,
+    kind_of: Mapping[str, AgentKind] = CATEGORIES,
+) -> TrackSamples:
+    """A recording from its columns. A rows, one per object and time, in any order.
+
+    Args:
+        name: Name of the recording.
+        time_us: (A,) time stamps [us].
+        ids: (A,) integers or texts that name the objects.
+        category: (A,) index into `categories`.
+        categories: Names of categories.
+        xy: (A, 2) box centre [m].
+        headings: (A,) [rad]; the direction of motion where it is not given.
+        velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
+            where they are not given, and for tracks where they contradict the positions.
+        sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
+            NaN or 0. A track gets the median.
+        trusts_velocities: Whether velocities are kept where they contradict the positions.
+        kind_of: AgentKind by name of a category.
+
+    Raises:
+        ConversionError: A value is not finite, a category is unknown, or an object has two rows at
+            one time.
+    """
+    warnings: Counter[str] = Counter()
+    for what, values in (("position", xy), ("heading", headings)):
+        bad = 0 if values is None else int((~np.isfinite(values)).reshape(len(values), -1).sum())
+        if bad:
+            raise ConversionError(
+                f"{name}: {bad} values of {what} are not finite", "leave those rows out"
+            )
+    if len(time_us) < 2 or time_us.min() == time_us.max():
+        raise ConversionError(
+            f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
+        )
+    track_ids, track = _numbered(ids)
+    if (np.diff(track) < 0).any() or ((np.diff(track) == 0) & (np.diff(time_us) <= 0)).any():
+        order = np.lexsort((time_us, track))
+        time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
+        headings, velocities, sizes = (
+            None if part is None else part[order] for part in (headings, velocities, sizes)
+        )
+        _refuse_twice(name, track_ids, track, time_us)
+    stamps, frame = _frames(time_us)
+    time = (time_us - stamps[0]) / 1e6
+    step = np.diff(time)[np.diff(track) == 0]
+    period = float(np.median(step)) if len(step) else ROW_S
+    named, kinds = _kinds(name, category, categories, kind_of, track, warnings)
+    derived = fitted_velocities(xy, time, track, period)
+    speeds = believed(velocities, derived, time, track, warnings, trusts=trusts_velocities)
+    raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
+    samples = TrackSamples(
+        name=name,
+        start_us=int(stamps[0]),
+        period=period,
+        clock=(stamps - stamps[0]) / 1e6,
+        frame=frame,
+        track=track,
+        centers=np.column_stack([xy, np.zeros(len(xy))]),
+        raw_headings=raw,
+        headings=held_headings(raw, speeds, time, track, warnings),
+        velocities=speeds,
+        track_ids=track_ids,
+        categories=named,
+        kinds=kinds,
+        sizes=_sizes(sizes, kinds, track, warnings),
+        warnings=dict(+warnings),
+    )
+    if float(np.median(np.diff(samples.clock))) < 0.5 * period:
+        return on_common_clock(samples)
+    return samples
+
+
+def on_common_clock(samples: TrackSamples) -> TrackSamples:
+    """The same recording with a row every 0.05 s, where objects have times of their own."""
+    runs = find_runs(samples, MAX_HOLE_S)
+    first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
+    counts = np.maximum(last - first + 1, 0)
+    run = np.repeat(np.arange(len(counts)), counts)
+    frame = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    found = sample_runs(samples, runs, run, frame * ROW_S)
+    kept, track = np.unique(runs.track[run], return_inverse=True)
+    lost = len(samples.track_ids) - len(kept)
+    warnings = Counter(samples.warnings)
+    warnings["tracks too short for a row every 0.05 s (left out)"] += lost
+    return TrackSamples(
+        name=samples.name,
+        start_us=samples.start_us,
+        period=ROW_S,
+        clock=np.arange(int(frame.max()) + 1) * ROW_US / 1e6,
+        frame=frame,
+        track=track,
+        centers=np.column_stack([found.poses[:, :2], found.heights]),
+        raw_headings=found.poses[:, 2],
+        headings=found.poses[:, 2],
+        velocities=found.velocities,
+        track_ids=samples.track_ids[kept],
+        categories=tuple(samples.categories[i] for i in kept.tolist()),
+        kinds=samples.kinds[kept],
+        sizes=samples.sizes[kept],
+        warnings=dict(+warnings),
+    )
+
+
+def _numbered(ids: NDArray[Any]) -> tuple[NDArray[Any], IntArray]:
+    """Distinct ids, ascending, and (A,) the number of each row's among them."""
+    encoded = pa.array(ids).dictionary_encode()  # far faster than sorting texts
+    names = encoded.dictionary.to_numpy(zero_copy_only=False)
+    order = np.argsort(names, kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    found = names[order]
+    return found.astype(str) if found.dtype == object else found, rank[encoded.indices.to_numpy()]
+
+
+def _refuse_twice(name: str, ids: NDArray[Any], track: IntArray, time_us: IntArray) -> None:
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
+    if len(twice):
+        one = f"object {ids[track[twice[0]]].item()!r} has two rows"
+        when = f"at {time_us[twice[0]] / 1e6:.3f} s ({len(twice)} such rows)"
+        raise ConversionError(
+            f"{name}: {one} {when}",
+            "leave one of them out, or give two objects with one id ids of their own",
+        )
+
+
+def _frames(time_us: IntArray) -> tuple[IntArray, IntArray]:
+    """Distinct time stamps, and the number of each row's among them; one sort of the distinct."""
+    encoded = pa.array(time_us).dictionary_encode()
+    stamps = encoded.dictionary.to_numpy()
+    order = np.argsort(stamps)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return stamps[order], rank[encoded.indices.to_numpy()]
+
+
+def _kinds(
+    name: str,
+    category: IntArray,
+    categories: Sequence[str],
+    kind_of: Mapping[str, AgentKind],
+    track: IntArray,
+    warnings: Counter[str],
+) -> tuple[tuple[str, ...], IntArray]:
+    """Most frequent category of every track, and its kind."""
+    votes = np.zeros((int(track[-1]) + 1, len(categories)), np.int64)
+    np.add.at(votes, (track, category), 1)
+    changing = int(((votes > 0).sum(axis=1) > 1).sum())
+    warnings["tracks of changing category (most frequent taken)"] += changing
+    names = tuple(categories[code] for code in votes.argmax(axis=1).tolist())
+    for one in sorted(set(names) - set(kind_of)):
+        raise ConversionError(
+            f"{name}: category {one!r} is unknown",
+            f"map it to one of {', '.join(sorted(kind_of))}",
+        )
+    return names, np.array([kind_of[one] for one in names], np.int64)
+
+
+def _sizes(
+    sizes: FloatArray | None, kinds: IntArray, track: IntArray, warnings: Counter[str]
+) -> FloatArray:
+    """(N, 2) median of the sizes of every track, the usual one of its kind where it has none."""
+    usual = np.array([SIZES[AgentKind(kind)] for kind in kinds.tolist()])
+    if sizes is None:
+        warnings["tracks without size (that of their kind)"] += len(kinds)
+        return usual
+    found = np.column_stack([track_medians(sizes[:, axis], track) for axis in (0, 1)])
+    lacking = ~np.all(found > 0.0, axis=1)
+    warnings["tracks without size (that of their kind)"] += int(lacking.sum())
+    return np.where(np.expand_dims(lacking, 1), usual, found)
