@@ -64,6 +64,7 @@ class _Done(NamedTuple):
 
 
 def one_by_one(make: Make, tasks: Sequence[str]) -> Iterator[_Done]:
+    """What `Spread` means, in this process."""
     function = make()
     yield from (_Done(task, function(task)) for task in tasks)
 

@@ -19,8 +19,8 @@ from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.lane_map import build_lane_map
 from shiftsim.data.tracks.pieces import LanePiece, MapSource, clean_line
-from shiftsim.data.tracks.scenes import REPAIR, Scene
 from shiftsim.data.tracks.samples import TrackSamples
+from shiftsim.data.tracks.scenes import REPAIR, Scene
 from shiftsim.data.tracks.tables import numbers, read_columns
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
@@ -119,12 +119,13 @@ def _read_tracks(path: Path) -> TrackSamples:
     return make_samples(
         city,
         time_us=start_us + step * _STEP_US,
-        ids=table["track_id"].combine_chunks(),
+        ids=table["track_id"].to_numpy(),
         category=category,
         categories=types,
         xy=np.column_stack([read["position_x"], read["position_y"]]),
         headings=read["heading"],
         velocities=np.column_stack([read["velocity_x"], read["velocity_y"]]),
+        trusts_velocities=True,
         sizes=sizes[category],
         kind_of={name: kind for name, (kind, *_) in TYPES.items()},
     )

@@ -160,7 +160,7 @@ class _File:
             colors = [_COLORS.get(e.findtext("color"), LightStatus.UNKNOWN) for e in elements]
             offset = light.findtext("cycle/timeOffset", "0")
             at = (steps - self.number(offset, "step", f"{place}: 'timeOffset'")) % sum(lengths)
-            columns[light.get("id", "")] = np.array(colors, np.int8)[
+            columns[light.get("id", "")] = np.array(colors, np.int64)[
                 np.searchsorted(np.cumsum(lengths), at, side="right")
             ]
         if not columns:
@@ -173,7 +173,8 @@ class _File:
         limits = self._sign_limits()
         paths = "successorsRight", "successorsStraight", "successorsLeft"
         inside = {r for p in paths for r in _refs(self.root, f"intersection/incoming/{p}")}
-        pieces, stops, crosswalks, car_parks, paved = [], [], [], [], []
+        pieces, crosswalks, car_parks, paved = [], [], [], []
+        stops: list[StopArea] = []
         for lanelet in self.root.iterfind("lanelet"):
             piece = self._piece(lanelet, inside, limits)
             types = {(e.text or "").strip() for e in lanelet.iterfind("laneletType")}
@@ -255,7 +256,9 @@ class _File:
     def tracks(self, step_s: float) -> TrackSamples:
         """All obstacles whose states are exact; the others are counted."""
         rows = [row for obstacle in self._obstacles() for row in self._rows(obstacle)]
-        still = {row.id: row for obstacle in self._obstacles("static") for row in self._rows(obstacle)}
+        still = {
+            row.id: row for obstacle in self._obstacles("static") for row in self._rows(obstacle)
+        }
         if not rows:
             what = f"{self.path}: no dynamic obstacle with a trajectory of exact states"
             raise ConversionError(what, "leave the file out")
@@ -293,7 +296,9 @@ class _File:
         if box is None:
             self.warnings["obstacle that is no rectangle, left out"] += 1
             return
-        size = [self.number(box.findtext(n), "size", f"{place}: {n!r}") for n in ("length", "width")]
+        size = [
+            self.number(box.findtext(n), "size", f"{place}: {n!r}") for n in ("length", "width")
+        ]
         category = (obstacle.findtext("type") or "unknown").strip()
         for state in (*obstacle.iterfind("initialState"), *obstacle.iterfind("trajectory/state")):
             paths = {"position/point/x": "position", "position/point/y": "position"}

@@ -51,8 +51,8 @@ class _Maker:
         if not source.pieces:
             what = f"map {source.name!r} has no lane that cars may use"
             raise MapError(what, "leave this scene out: without lanes there is no route")
-        ends = np.concatenate([p.left[[0, -1]] for p in source.pieces if len(p.left)] or [[[0, 0]]])
-        extent = float(np.ptp(ends, axis=0).max())
+        points = np.concatenate([np.zeros((0, 2)), *(piece.left for piece in source.pieces)])
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         require(MAP_EXTENT, "extent", extent, f"map {source.name!r}: the lanes'", error=MapError)
         self.source, self.warnings = source, Counter[str]()
         self.graph = build_graph(source.pieces, self.warnings)
@@ -78,8 +78,9 @@ class _Maker:
             drivable_areas=self._areas(source.drivable_areas or self._covered()),
         )
         ids = [*self.lane_ids, *self.connector_ids]
-        runs = [*self.graph.lanes, *self.graph.connectors]
-        origins = {i: tuple(p.piece.id for p in r.parts) for i, r in zip(ids, runs, strict=True)}
+        runs = [lane.parts for lane in self.graph.lanes]
+        runs += [connector.parts for connector in self.graph.connectors]
+        origins = {i: tuple(p.piece.id for p in run) for i, run in zip(ids, runs, strict=True)}
         lit = zip(self.connector_ids, self.lights, strict=True)
         lights = {i: name for i, name in lit if name is not None}
         return PieceMap(road, dict(self.warnings), lights, origins)

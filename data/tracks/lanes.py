@@ -234,7 +234,7 @@ class _Builder:
         """One connector per way from a lane over connector pieces to a lane."""
         used: set[_Node] = set()
         for source, last in enumerate(self.last):
-            stack = [(node,) for node in reversed(self.after[last])]
+            stack: list[tuple[_Node, ...]] = [(node,) for node in reversed(self.after[last])]
             for _ in range(_MAX_STEPS):
                 if not stack:
                     break

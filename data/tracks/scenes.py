@@ -7,7 +7,7 @@ Scenes are converted one by one, in any order and in any process; the bytes are 
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,6 +21,7 @@ from shiftsim.arrays import IntArray
 from shiftsim.data.deepplan.convert import Progress, Spread, one_by_one
 from shiftsim.data.deepplan.parts import Broken, alone_in
 from shiftsim.data.deepplan.recording import Converted
+from shiftsim.data.deepplan.windows import ConversionConfig
 from shiftsim.data.store.schema import VERSION
 from shiftsim.data.store.tables import digest
 from shiftsim.data.store.writing import StoreWriter
@@ -34,6 +35,8 @@ from shiftsim.world.state import TrafficLights
 REPAIR = "get the file again from its source, or leave the scene out"
 _SAVE_EVERY = 1000  # scenes; what is saved is not converted again
 _NOT_LISTED = -1
+# a recording car is an ego whatever it does, also standing
+_RECORDED = ConversionConfig(min_peak_speed=0.0, max_overlap=1e6)
 
 
 @dataclass(frozen=True)
@@ -162,10 +165,12 @@ def convert_scene(scene: Scene, *, vehicles: bool = False) -> Made:
     Raises:
         DataError: Its ego is not among the tracks.
     """
+    egos = None if vehicles else scene.egos
     converted = make_scenarios(
         scene.samples,
         scene.map.road,
-        egos=None if vehicles else scene.egos,
+        egos=egos,
+        config=None if egos is None else _RECORDED,
         left_out_s=scene.left_out_s,
     )
     recording = converted.recording
@@ -181,9 +186,7 @@ def convert_scene(scene: Scene, *, vehicles: bool = False) -> Made:
     return Made(scene.map.road, converted, warnings)
 
 
-def light_rows(
-    states: LightStates, lights: Mapping[str, str], time_us: IntArray
-) -> TrafficLights:
+def light_rows(states: LightStates, lights: Mapping[str, str], time_us: IntArray) -> TrafficLights:
     """Status of every connector with a light at some times; not listed before the first state.
 
     `lights` holds the name of the light by connector.
@@ -193,7 +196,7 @@ def light_rows(
     at = np.searchsorted(states.time_us, time_us, side="right") - 1
     status = states.status[np.maximum(at, 0)][:, list(known.values())]
     status[at < 0] = _NOT_LISTED
-    return TrafficLights(tuple(known), status)
+    return TrafficLights(tuple(known), status.astype(np.int8))
 
 
 class _Converter:

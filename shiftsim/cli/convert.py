@@ -1,4 +1,4 @@
-"""Commands that make scenario stores: convert nuplan, convert dsc3d."""
+"""Commands that make scenario stores: convert nuplan, dsc3d, av2, py123d, commonroad."""
 
 import shlex
 import sys
@@ -13,6 +13,7 @@ from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say,
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
     from shiftsim.data.deepplan.windows import ConversionConfig
+    from shiftsim.data.tracks.scenes import Reader
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 _PARTIAL, _INTERRUPTED = 3, 130
@@ -163,10 +164,7 @@ def dsc3d(
                 spread=partial(map_unordered, workers=count),
             )
         except KeyboardInterrupt:
-            again = shlex.join(["shiftsim", *sys.argv[1:]])
-            typer.echo("error: interrupted", err=True)
-            typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
-            raise typer.Exit(_INTERRUPTED) from None
+            raise _interrupted() from None
     if as_json:
         from dataclasses import asdict
 
@@ -179,6 +177,13 @@ def dsc3d(
         say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
     if report.skipped:
         raise typer.Exit(_PARTIAL)
+
+
+def _interrupted() -> typer.Exit:
+    again = shlex.join(["shiftsim", *sys.argv[1:]])
+    typer.echo("error: interrupted", err=True)
+    typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
+    return typer.Exit(_INTERRUPTED)
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:
@@ -224,3 +229,126 @@ def _show_dsc3d(report: "ConversionReport") -> None:
         say(f" skipped: {name}: {reason}")
     if report.kept:
         say(f" {plural(report.kept, 'recording')} kept from before")
+
+
+Source = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the data set.")]
+Egos = Annotated[
+    str, typer.Option(help="recorded: the recording car; vehicles: each vehicle that drives.")
+]
+
+
+@app.command()
+@cli.with_settings("workers")
+def av2(
+    folder: Source,
+    store: Store,
+    egos: Egos = "recorded",
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Convert scenes of Argoverse 2 motion forecasting, train or val.
+
+    A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
+    on when it is started again. That holds for py123d and commonroad as well.
+    """
+    from shiftsim.data.tracks.av2 import Av2Reader
+
+    _convert_scenes(Av2Reader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+@cli.with_settings("workers")
+def py123d(
+    folder: Source,
+    store: Store,
+    egos: Egos = "recorded",
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
+
+    FOLDER holds logs/ and, for data sets with one map per city, maps/.
+    """
+    from shiftsim.data.tracks.py123d import Py123dReader
+
+    _convert_scenes(Py123dReader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+@cli.with_settings("workers")
+def commonroad(
+    folder: Source,
+    store: Store,
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
+
+    The files have no recording car: each vehicle that drives is an ego.
+    """
+    from shiftsim.data.tracks.commonroad import CommonRoadReader
+
+    reader = CommonRoadReader()
+    _convert_scenes(reader, folder, store, "vehicles", settings, quiet=quiet, as_json=as_json)
+
+
+def _convert_scenes(
+    reader: "Reader",
+    source: Path,
+    store: str,
+    egos: str,
+    settings: cli.Settings,
+    *,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    from functools import partial
+
+    from shiftsim.data.tracks.scenes import convert_scenes
+    from shiftsim.errors import one_of
+    from shiftsim.files import store_path
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
+
+    vehicles = one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
+    folder = store_path(store)
+    count = settings.get("workers") or default_workers()
+    with progress_bar(quiet=quiet or as_json) as advance:
+        try:
+            report = convert_scenes(
+                reader,
+                source,
+                folder,
+                vehicles=vehicles,
+                progress=advance,
+                spread=partial(map_unordered, workers=count),
+            )
+        except KeyboardInterrupt:
+            raise _interrupted() from None
+    if as_json:
+        from dataclasses import asdict
+
+        say_json(asdict(report))
+    else:
+        for title, counts in (("not an ego by rule", report.rejected), ("note", report.warnings)):
+            for name, number in sorted(counts.items()):
+                say(f" {title}: {name} ({number})")
+        for name, reason in list(report.failed.items())[:_MAX_NAMED]:
+            say(f" failed: {name}: {reason}")
+        say(
+            f" {plural(report.scenes, 'scene')} converted, {report.without} of them without a "
+            f"scenario, {report.kept} kept from before, {len(report.failed)} failed"
+        )
+        say(f" {plural(report.scenarios, 'new scenario')} → {folder}")
+        say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
+    if report.failed:
+        raise typer.Exit(_PARTIAL)
