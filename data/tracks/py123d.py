@@ -194,7 +194,7 @@ def _read_tracks(path: Path) -> TrackSamples:
         if (count != counts["label"]).any():
             raise ConversionError(f"{file}: {name!r} and 'label' differ in length", _HINT)
     stamps = numbers(table, f"{prefix}.timestamp_us", "time", file).astype(np.int64)
-    label_class = str(_notes(file).get("box_detection_label_class"))
+    label_class = str(_notes(file).get("box_detection_label_class")).rpartition(".")[2]
     if label_class not in LABELS:
         what = f"{file}: label class {label_class!r} is unknown"
         raise ConversionError(what, f"known are: {', '.join(LABELS)}")
