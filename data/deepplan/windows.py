@@ -237,6 +237,11 @@ def _judge(
     peak = np.zeros(num_tracks)
     np.maximum.at(peak, recording.track[rows], speed[rows])
     covering = (recording.frame[runs.first] <= first) & (recording.frame[runs.last] >= last)
+    # where frames are missing at an end of the window, nobody is known to be there
+    longest = config.max_hole_s + recording.period + _EPS
+    begin, end = recording.clock[[min(first, len(recording.clock) - 1), max(last, 0)]].tolist()
+    covering &= begin - span.start_s <= longest
+    covering &= span.start_s + span.length_s - end <= longest
     run = np.full(num_tracks, -1, np.int64)
     run[runs.track[covering]] = np.flatnonzero(covering)
     hit = np.full(num_tracks, -1, np.int64)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.store.tables import MANIFEST, digest, read_manifest
+from shiftsim.data.store.tables import MANIFEST, REPORTS, digest, read_manifest
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -71,7 +71,8 @@ def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
     known = {MANIFEST, *files}
     for path in sorted(store.rglob("*")):
         name = path.relative_to(store).as_posix()
-        beside = path.relative_to(store).parts[0] in _BESIDE
+        top = path.relative_to(store).parts[0]
+        beside = top in _BESIDE or (top == REPORTS and path.suffix == ".png")
         if path.is_file() and not beside and name not in known:
             yield Problem(name, f"the file is not listed in {MANIFEST}", is_error=False)
 

@@ -19,6 +19,7 @@ from shiftsim.files import below, whole_file, write_text
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
 REVIEW = "review/review.jsonl"
+REPORTS = "reports"  # folder; pictures may be there before the store is
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
 _SHA256 = re.compile("[0-9a-f]{64}")
@@ -39,7 +40,12 @@ def map_file(store: Path, city: str) -> Path:
 
 def report_file(store: Path, city: str) -> Path:
     """File of what is known about the conversion of a city."""
-    return below(store, f"reports/{file_name(city)}.json")
+    return below(store, f"{REPORTS}/{file_name(city)}.json")
+
+
+def picture_file(store: Path, city: str, recording: str) -> Path:
+    """Picture of a recording on its map, beside the report; no part of the store's content."""
+    return below(store, f"{REPORTS}/{file_name(city)}_{file_name(recording)}.png")
 
 
 def recording_folder(store: Path, recording: str) -> Path:

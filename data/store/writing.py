@@ -54,7 +54,8 @@ class StoreWriter:
             self._cities = {row["recording"]: row["city"] for row in self._rows.values()}
         self.path.mkdir(parents=True, exist_ok=True)
         is_partial = (self.path / tables.PARTIAL).is_dir()
-        if not self._files and not is_partial and any(self.path.iterdir()):
+        others = {path.name for path in self.path.iterdir()} - {tables.REPORTS}
+        if not self._files and not is_partial and others:
             raise DataError(
                 f"{self.path}: the folder is not empty and not a store",
                 hint="give a new folder, or a store to add to",
@@ -116,16 +117,21 @@ class StoreWriter:
 
         What the store has of it is replaced; `rows` are the `window_row` of its scenarios.
         """
-        target = tables.recording_folder(self.path, log_name)
-        below = f"{self._name(target)}/"
-        self._files = {n: d for n, d in self._files.items() if not n.startswith(below)}
-        self._rows = {t: row for t, row in self._rows.items() if row["recording"] != log_name}
-        shutil.rmtree(target, ignore_errors=True)
+        target = self.forget_recording(log_name)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(folder, target)
         for path in sorted(target.iterdir()):
             self._note(path)
         self._rows |= {row["token"]: row for row in rows}
+
+    def forget_recording(self, log_name: str) -> Path:
+        """Remove a recording with all its scenarios, if there is one; the folder it had or will."""
+        target = tables.recording_folder(self.path, log_name)
+        below = f"{self._name(target)}/"
+        self._files = {n: d for n, d in self._files.items() if not n.startswith(below)}
+        self._rows = {t: row for t, row in self._rows.items() if row["recording"] != log_name}
+        shutil.rmtree(target, ignore_errors=True)
+        return target
 
     def add_report(self, city: str, content: dict[str, Any]) -> None:
         """Write what is to be known about the conversion of a city."""

@@ -15,10 +15,10 @@ import pyarrow.compute as pc
 import shapely
 
 from shiftsim.arrays import FloatArray
+from shiftsim.data.lanes.map import build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource, clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
-from shiftsim.data.tracks.lane_map import build_lane_map
-from shiftsim.data.tracks.pieces import LanePiece, MapSource, clean_line
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import REPAIR, Scene
 from shiftsim.data.tracks.tables import numbers, read_columns

@@ -81,7 +81,7 @@ def make_samples(
         raise ConversionError(
             f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
         )
-    track_ids, track = _numbered(ids)
+    track_ids, track = numbered(ids)
     if (np.diff(track) < 0).any() or ((np.diff(track) == 0) & (np.diff(time_us) <= 0)).any():
         order = np.lexsort((time_us, track))
         time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
@@ -89,7 +89,7 @@ def make_samples(
             None if part is None else part[order] for part in (headings, velocities, sizes)
         )
         _refuse_twice(name, track_ids, track, time_us)
-    stamps, frame = _frames(time_us)
+    stamps, frame = numbered(time_us)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[np.diff(track) == 0]
     period = float(np.median(step)) if len(step) else ROW_S
@@ -150,9 +150,16 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
     )
 
 
-def _numbered(ids: NDArray[Any]) -> tuple[NDArray[Any], IntArray]:
-    """Distinct ids, ascending, and (A,) the number of each row's among them."""
-    encoded = pa.array(ids).dictionary_encode()  # far faster than sorting texts
+def numbered(ids: Any) -> tuple[NDArray[Any], IntArray]:
+    """Distinct ids, ascending, and (A,) the number of each row's among them.
+
+    `ids` (A,) are integers or texts, as an array of numpy or pyarrow.
+    """
+    encoded = ids if isinstance(ids, pa.ChunkedArray | pa.Array) else pa.array(ids)
+    if not pa.types.is_dictionary(encoded.type):
+        encoded = encoded.dictionary_encode()  # far faster than sorting texts
+    encoded = pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
+    encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
     names = encoded.dictionary.to_numpy(zero_copy_only=False)
     order = np.argsort(names, kind="stable")
     rank = np.empty(len(order), np.int64)
@@ -170,16 +177,6 @@ def _refuse_twice(name: str, ids: NDArray[Any], track: IntArray, time_us: IntArr
             f"{name}: {one} {when}",
             "leave one of them out, or give two objects with one id ids of their own",
         )
-
-
-def _frames(time_us: IntArray) -> tuple[IntArray, IntArray]:
-    """Distinct time stamps, and the number of each row's among them; one sort of the distinct."""
-    encoded = pa.array(time_us).dictionary_encode()
-    stamps = encoded.dictionary.to_numpy()
-    order = np.argsort(stamps)
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    return stamps[order], rank[encoded.indices.to_numpy()]
 
 
 def _kinds(

@@ -14,11 +14,11 @@ import shapely
 from lxml import etree
 
 from shiftsim.arrays import FloatArray
+from shiftsim.data.lanes.map import build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, clean_line
 from shiftsim.data.opendrive.areas import drivable_tiles
 from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.tracks.build import make_samples
-from shiftsim.data.tracks.lane_map import build_lane_map
-from shiftsim.data.tracks.pieces import LanePiece, MapSource, StopArea, clean_line
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import REPAIR, LightStates, Scene
 from shiftsim.errors import ConversionError

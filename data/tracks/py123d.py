@@ -14,10 +14,10 @@ import pyarrow as pa
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.lanes.map import PieceMap, build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
-from shiftsim.data.tracks.lane_map import PieceMap, build_lane_map
-from shiftsim.data.tracks.pieces import LanePiece, MapSource, StopArea, clean_line
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import LightStates, Scene
 from shiftsim.data.tracks.tables import numbers, read_columns

@@ -63,7 +63,8 @@ def make_scenarios(
 
 
 def write_converted(writer: StoreWriter, converted: Converted) -> None:
-    """Add a recording and its scenarios to a store that has the map."""
+    """Put a recording and its scenarios into a store that has the map, for those it had."""
+    writer.forget_recording(converted.recording.log_name)
     writer.add_recording(converted.recording)
     for ego in converted.egos:
         writer.add_ego(ego)

@@ -22,10 +22,10 @@ from shiftsim.data.deepplan.convert import Progress, Spread, one_by_one
 from shiftsim.data.deepplan.parts import Broken, alone_in
 from shiftsim.data.deepplan.recording import Converted
 from shiftsim.data.deepplan.windows import ConversionConfig
+from shiftsim.data.lanes.map import PieceMap
 from shiftsim.data.store.schema import VERSION
 from shiftsim.data.store.tables import digest
 from shiftsim.data.store.writing import StoreWriter
-from shiftsim.data.tracks.lane_map import PieceMap
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenarios import make_scenarios, write_converted
 from shiftsim.errors import ConversionError, DataError

@@ -1,4 +1,4 @@
-"""Commands that make scenario stores: convert nuplan, dsc3d, av2, py123d, commonroad."""
+"""Commands that make scenario stores: convert nuplan, convert dsc3d, convert tracks."""
 
 import shlex
 import sys
@@ -12,15 +12,16 @@ from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say,
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
+    from shiftsim.data.deepplan.recording import Converted, RecordingSummary
     from shiftsim.data.deepplan.windows import ConversionConfig
-    from shiftsim.data.tracks.scenes import Reader
+    from shiftsim.data.tracks.convert import Looked
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
-_PARTIAL, _INTERRUPTED = 3, 130
+_DATA, PARTIAL, _INTERRUPTED = 2, 3, 130
 
 
 Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
-_MAX_NAMED = 20
+MAX_NAMED = 20
 
 
 @app.command()
@@ -67,14 +68,14 @@ def nuplan(
     else:
         for flaw, count in report.flaws.items():
             say(f" tolerated: {flaw} ({count})")
-        for token, reason in list(report.failed.items())[:_MAX_NAMED]:
+        for token, reason in list(report.failed.items())[:MAX_NAMED]:
             say(f" failed: {token}: {reason}")
         say(
             f" {plural(len(report.converted), 'scenario')} converted, "
             f"{len(report.unchanged)} unchanged, {len(report.failed)} failed → {folder}"
         )
     if report.failed:
-        raise typer.Exit(_PARTIAL)
+        raise typer.Exit(PARTIAL)
 
 
 def _token_list(text: str) -> list[str]:
@@ -164,7 +165,7 @@ def dsc3d(
                 spread=partial(map_unordered, workers=count),
             )
         except KeyboardInterrupt:
-            raise _interrupted() from None
+            raise interrupted() from None
     if as_json:
         from dataclasses import asdict
 
@@ -176,10 +177,104 @@ def dsc3d(
         say(f" {plural(report.accepted, 'scenario')} → {folder}")
         say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
     if report.skipped:
-        raise typer.Exit(_PARTIAL)
+        raise typer.Exit(PARTIAL)
 
 
-def _interrupted() -> typer.Exit:
+@app.command()
+def tracks(
+    source: Annotated[
+        Path, typer.Argument(metavar="TRACKS", help="CSV or Parquet, a row per object and time.")
+    ],
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="OpenDRIVE file (.xodr).")],
+    store: Store,
+    hz: Annotated[
+        float | None, typer.Option(help="Frames per second, where time is given in frames.")
+    ] = None,
+    ego: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID|all", help="Objects that become the ego; repeatable. [all]"),
+    ] = None,
+    columns: Annotated[
+        Path | None, typer.Option(help="Names, units and kinds of the columns in TOML.")
+    ] = None,
+    city: Annotated[str | None, typer.Option(help="Name of the map. [name of MAP]")] = None,
+    window_s: Annotated[
+        float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
+    ] = None,
+    overlap_s: Annotated[float | None, typer.Option(help="Overlap of windows [s]. [6]")] = None,
+    history_s: Annotated[
+        float | None, typer.Option(help="Part of a window before iteration 0 [s]. [3]")
+    ] = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Convert tracks of any source: a table with one row per object and time, and its map.
+
+    Columns are known by their usual names. Wrong units, axes and origins are recognised and named;
+    the picture beside the report shows tracks and map. Recordings shorter than a window become one
+    scenario each, with 2 s of history.
+    """
+    from shiftsim.data.store.tables import picture_file
+    from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
+    from shiftsim.errors import ConversionError
+    from shiftsim.files import read_toml, store_path
+
+    flags = {"window_s": window_s, "overlap_s": overlap_s, "history_s": history_s}
+    config = tracks_config(**{name: value for name, value in flags.items() if value is not None})
+    said = read_toml(columns) if columns else {}
+    egos = None if ego is None or "all" in ego else ego
+    folder = store_path(store)
+    looked = look_at(source, map_path, city=city, said=said, hz=hz, config=config)
+    picture = picture_file(folder, looked.road.name, looked.table.name)
+    try:
+        report, made = convert_tracks(looked, folder, egos=egos, config=config)
+    except ConversionError:
+        for doubt in looked.doubts.found:
+            say(f" wrong: {doubt.what}")
+            say(f"   remedy: {doubt.remedy}")
+        _draw_tracks(picture, looked, None)
+        if not looked.doubts.found:
+            raise
+        typer.echo(
+            f"error: {source}: {plural(len(looked.doubts.found), 'thing')} cannot be right",
+            err=True,
+        )
+        raise typer.Exit(_DATA) from None
+    if as_json:
+        from dataclasses import asdict
+
+        say_json(asdict(report))
+    else:
+        say(f"map {report.city}: {report.lanes} lanes and connectors")
+        for name, count in report.map_warnings.items():
+            say(f" map: {name} ({count})")
+        say(f" columns: {', '.join(f'{ours} = {name}' for ours, name in report.columns.items())}")
+        _show_recording(report.summary)
+        for note in looked.doubts.notes:
+            say(f" unusual: {note.what}")
+            say(f"   remedy: {note.remedy}")
+    _draw_tracks(picture, looked, made)
+    if not as_json:
+        say(f" {plural(report.summary.accepted, 'scenario')} → {folder}")
+        say(f" next: shiftsim check {store}, then shiftsim run --planner idm --store {store}")
+
+
+def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None:
+    """The picture of map and tracks; without matplotlib a line that says how to get it."""
+    from shiftsim.errors import MissingExtraError
+    from shiftsim.view.tracks import save_tracks_picture
+
+    try:
+        save_tracks_picture(path, looked, made)
+    except MissingExtraError as error:
+        typer.echo(f" no picture: {error} ({error.hint})", err=True)
+    else:
+        typer.echo(f" picture: {path}", err=True)
+
+
+def interrupted() -> typer.Exit:
+    """What ends a conversion that was stopped by hand."""
     again = shlex.join(["shiftsim", *sys.argv[1:]])
     typer.echo("error: interrupted", err=True)
     typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
@@ -216,139 +311,20 @@ def _show_dsc3d(report: "ConversionReport") -> None:
     for name, count in report.map_warnings.items():
         say(f" map: {name} ({count})")
     for summary in report.recordings:
-        say(
-            f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "
-            f"{plural(summary.windows, 'window')}, {plural(summary.candidates, 'candidate')}, "
-            f"{summary.accepted} accepted"
-        )
-        for rule, count in summary.rejected.items():
-            say(f"   not accepted by rule {rule}: {count}")
-        for name, count in summary.warnings.items():
-            say(f"   repaired: {name} ({count})")
+        _show_recording(summary)
     for name, reason in report.skipped.items():
         say(f" skipped: {name}: {reason}")
     if report.kept:
         say(f" {plural(report.kept, 'recording')} kept from before")
 
 
-Source = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the data set.")]
-Egos = Annotated[
-    str, typer.Option(help="recorded: the recording car; vehicles: each vehicle that drives.")
-]
-
-
-@app.command()
-@cli.with_settings("workers")
-def av2(
-    folder: Source,
-    store: Store,
-    egos: Egos = "recorded",
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Convert scenes of Argoverse 2 motion forecasting, train or val.
-
-    A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
-    on when it is started again. That holds for py123d and commonroad as well.
-    """
-    from shiftsim.data.tracks.av2 import Av2Reader
-
-    _convert_scenes(Av2Reader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
-
-
-@app.command()
-@cli.with_settings("workers")
-def py123d(
-    folder: Source,
-    store: Store,
-    egos: Egos = "recorded",
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
-
-    FOLDER holds logs/ and, for data sets with one map per city, maps/.
-    """
-    from shiftsim.data.tracks.py123d import Py123dReader
-
-    _convert_scenes(Py123dReader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
-
-
-@app.command()
-@cli.with_settings("workers")
-def commonroad(
-    folder: Source,
-    store: Store,
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-    debug: Debug = False,
-) -> None:
-    """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
-
-    The files have no recording car: each vehicle that drives is an ego.
-    """
-    from shiftsim.data.tracks.commonroad import CommonRoadReader
-
-    reader = CommonRoadReader()
-    _convert_scenes(reader, folder, store, "vehicles", settings, quiet=quiet, as_json=as_json)
-
-
-def _convert_scenes(
-    reader: "Reader",
-    source: Path,
-    store: str,
-    egos: str,
-    settings: cli.Settings,
-    *,
-    quiet: bool,
-    as_json: bool,
-) -> None:
-    from functools import partial
-
-    from shiftsim.data.tracks.scenes import convert_scenes
-    from shiftsim.errors import one_of
-    from shiftsim.files import store_path
-    from shiftsim.runs.config import default_workers
-    from shiftsim.runs.workers import map_unordered
-
-    vehicles = one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
-    folder = store_path(store)
-    count = settings.get("workers") or default_workers()
-    with progress_bar(quiet=quiet or as_json) as advance:
-        try:
-            report = convert_scenes(
-                reader,
-                source,
-                folder,
-                vehicles=vehicles,
-                progress=advance,
-                spread=partial(map_unordered, workers=count),
-            )
-        except KeyboardInterrupt:
-            raise _interrupted() from None
-    if as_json:
-        from dataclasses import asdict
-
-        say_json(asdict(report))
-    else:
-        for title, counts in (("not an ego by rule", report.rejected), ("note", report.warnings)):
-            for name, number in sorted(counts.items()):
-                say(f" {title}: {name} ({number})")
-        for name, reason in list(report.failed.items())[:_MAX_NAMED]:
-            say(f" failed: {name}: {reason}")
-        say(
-            f" {plural(report.scenes, 'scene')} converted, {report.without} of them without a "
-            f"scenario, {report.kept} kept from before, {len(report.failed)} failed"
-        )
-        say(f" {plural(report.scenarios, 'new scenario')} → {folder}")
-        say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
-    if report.failed:
-        raise typer.Exit(_PARTIAL)
+def _show_recording(summary: "RecordingSummary") -> None:
+    say(
+        f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "
+        f"{plural(summary.windows, 'window')}, {plural(summary.candidates, 'candidate')}, "
+        f"{summary.accepted} accepted"
+    )
+    for rule, count in summary.rejected.items():
+        say(f"   not accepted by rule {rule}: {count}")
+    for name, count in summary.warnings.items():
+        say(f"   repaired: {name} ({count})")

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -98,7 +99,9 @@ class DataSet:
     def _part(self, duration: str) -> tuple["DataSet", BoolArray]:
         chosen = np.array([name in (duration, "") for name in self.durations], np.bool_)
         columns = ("tokens", "cities", "recordings", "types", "durations")
-        kept = {name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns}
+        kept: dict[str, Any] = {
+            name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns
+        }
         return replace(self, label=f"{self.label}, {duration}", **kept), chosen
 
 

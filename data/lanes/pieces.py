@@ -1,7 +1,7 @@
 """Lane pieces, as readers of data sets with maps hand them over, and their geometry.
 
 A piece is what a data set calls a lane, lane segment or lanelet: two borders in the direction of
-travel and what follows it. `lanes.py` makes lanes and connectors of pieces, `lane_map.py` the map.
+travel and what follows it. `graph.py` makes lanes and connectors of pieces, `map.py` the map.
 """
 
 from collections.abc import Sequence

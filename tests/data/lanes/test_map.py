@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from shiftsim.data.lanes.map import build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource
 from shiftsim.data.opendrive.check import check_map
-from shiftsim.data.tracks.lane_map import build_lane_map
-from shiftsim.data.tracks.pieces import LanePiece, MapSource
 from shiftsim.errors import MapError
 
 WIDTH = 3.5

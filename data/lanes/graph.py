@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from shiftsim.data.lanes.pieces import LanePiece, Part, split_parts
 from shiftsim.data.opendrive.graph import MAX_GAP, SEAM_LENGTH, SEAM_SHARE
 from shiftsim.data.polygons import shared_areas
-from shiftsim.data.tracks.pieces import LanePiece, Part, split_parts
 from shiftsim.errors import MapError
 
 _MIN_OVERLAP, _OVERLAP_SHARE = 1.0, 0.1  # m², and share of the smaller piece: forks and merges

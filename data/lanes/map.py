@@ -9,13 +9,13 @@ from typing import TypeVar
 import numpy as np
 import shapely
 
+from shiftsim.data.lanes.graph import Connector, build_graph
+from shiftsim.data.lanes.pieces import MapSource, Part, baseline, joined_borders
 from shiftsim.data.opendrive.areas import drivable_tiles, linked_groups, merge_areas, merge_closed
 from shiftsim.data.opendrive.map import LIGHT_KIND, PASS_THROUGH, turn_type
 from shiftsim.data.opendrive.overlaps import subtract_overlaps
 from shiftsim.data.opendrive.shapes import BASELINE_STEP, bend_ends, lane_polygon
 from shiftsim.data.polygons import largest_part, shared_areas
-from shiftsim.data.tracks.lanes import Connector, build_graph
-from shiftsim.data.tracks.pieces import MapSource, Part, baseline, joined_borders
 from shiftsim.errors import MapError
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap

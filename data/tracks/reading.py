@@ -1,0 +1,293 @@
+"""Tracks from CSV or Parquet: one row per object and time, in SI units afterwards."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.data.dsc3d.recording import normalise_category
+from shiftsim.data.tracks.build import numbered
+from shiftsim.data.tracks.columns import Columns, recognise
+from shiftsim.errors import ConfigError, ConversionError
+
+_REPAIR = "repair the file, or name other columns with --columns"
+_DELIMITERS = ",;\t|"
+
+
+@dataclass(frozen=True)
+class TrackTable:
+    """Rows of a file, sorted by object and time. A rows."""
+
+    name: str  # name of the recording
+    columns: Columns  # where they come from
+    hz: float | None  # frames per second, where time was given in frames
+    time_us: IntArray  # (A,) [us]
+    track: IntArray  # (A,) index into `track_ids`
+    track_ids: NDArray[Any]  # (N,) integers or texts, ascending
+    category: IntArray  # (A,) index into `categories`
+    categories: tuple[str, ...]  # normalised names
+    xy: FloatArray  # (A, 2) [m]
+    headings: FloatArray | None  # (A,) [rad]
+    velocities: FloatArray | None  # (A, 2) [m/s]
+    sizes: FloatArray | None  # (A, 2) length, width [m]
+
+    def at(self, rows: IntArray) -> "TrackTable":
+        """Some rows, in the order given."""
+        parts = ("time_us", "track", "category", "xy", "headings", "velocities", "sizes")
+        kept: dict[str, Any] = {
+            n: None if (v := getattr(self, n)) is None else v[rows] for n in parts
+        }
+        return replace(self, **kept)
+
+
+def read_tracks(
+    path: Path, *, said: Mapping[str, Any] | None = None, hz: float | None = None
+) -> TrackTable:
+    """The rows of a CSV or Parquet file.
+
+    Args:
+        path: The file; `*Meta.csv` files of levelXdata beside it are read too.
+        said: Names, units and kinds that the user gives (`columns.recognise`).
+        hz: Frames per second, for time given in frames.
+
+    Raises:
+        ConversionError: The file cannot be read, a column is missing or holds something else.
+        ConfigError: What was said does not fit the file.
+    """
+    if not path.is_file():
+        raise ConversionError(f"{path} does not exist", "check the path")
+    is_csv = path.suffix.lower() not in (".parquet", ".pq")
+    options = _csv_options(path) if is_csv else None
+    names = _names(path, options)
+    said, meta = dict(said or {}), None
+    stem = path.stem.removesuffix("_tracks")
+    if stem != path.stem:  # levelXdata: kinds and rate are in files beside the tracks
+        said, meta = _beside(path.with_name(f"{stem}_"), said, names)
+    columns = recognise(names, said, str(path))
+    table = _read(path, columns, options)
+    if not len(table):
+        raise ConversionError(f"{path} has no rows", "export the tracks again")
+    numbers = {
+        role: _numbers(table, role, columns, path)
+        for role in ("x", "y", "heading", "length", "width", "vx", "vy", "speed")
+        if role in columns.found
+    }
+    time_us, rate = _times(table, columns, hz, path)
+    track_ids, track = numbered(_ids(table, columns.found["id"].name, path))
+    category, categories = _categories(table, columns, track_ids, track, meta)
+    order = np.lexsort((time_us, track))
+    heading = numbers.get("heading")
+    velocity = None
+    if "vx" in numbers and "vy" in numbers:
+        velocity = np.column_stack([numbers["vx"], numbers["vy"]])
+    elif "speed" in numbers and heading is not None:
+        velocity = numbers["speed"][:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+    size = None
+    if "length" in numbers and "width" in numbers:
+        size = np.column_stack([numbers["length"], numbers["width"]])
+    xy = np.column_stack([numbers["x"], numbers["y"]]) + np.array(columns.shift)
+    if columns.reference in ("front", "rear"):
+        if heading is None or size is None:
+            raise ConfigError(
+                f"reference = {columns.reference!r} needs heading and length of the objects",
+                "name these columns",
+            )
+        back = -0.5 if columns.reference == "front" else 0.5
+        xy += back * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
+    out = TrackTable(
+        path.name.partition(".")[0],
+        columns,
+        rate,
+        time_us,
+        track,
+        track_ids,
+        category,
+        categories,
+        xy,
+        heading,
+        velocity,
+        size,
+    )
+    return out if (np.diff(order) == 1).all() else out.at(order)
+
+
+def _csv_options(path: Path) -> tuple[pc.ReadOptions, pc.ParseOptions, str]:
+    """How a CSV file is written: its delimiter and its decimal point, from the first two lines."""
+    try:
+        with pa.input_stream(str(path), compression="detect") as stream:
+            start = stream.read(1 << 16)
+        lines = start.decode("utf-8-sig").splitlines()[:2]
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise ConversionError(f"{path}: not readable as CSV ({error})", _REPAIR) from error
+    if not lines:
+        raise ConversionError(f"{path} is empty", "export the tracks again")
+    delimiter = max(_DELIMITERS, key=lines[0].count)
+    point = "," if delimiter != "," and "," in lines[-1] and "." not in lines[-1] else "."
+    return pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter), point
+
+
+def _names(path: Path, options: Any) -> list[str]:
+    try:
+        if options is None:
+            return list(pq.read_schema(path).names)
+        with pc.open_csv(path, read_options=options[0], parse_options=options[1]) as stream:
+            return list(stream.schema.names)
+    except (OSError, pa.ArrowException) as error:
+        raise ConversionError(f"{path}: not readable ({error})", _REPAIR) from error
+
+
+def _read(path: Path, columns: Columns, options: Any) -> pa.Table:
+    """The columns that are needed."""
+    texts = {columns.found[role].name for role in ("kind",) if role in columns.found}
+    try:
+        if options is None:
+            return pq.read_table(path, columns=columns.names, use_threads=False)
+        read, parse, point = options
+        floats = [
+            column.name
+            for role, column in columns.found.items()
+            if role not in ("id", "kind", "time") and column.name
+        ]
+        convert = pc.ConvertOptions(
+            include_columns=columns.names,
+            column_types={
+                **{name: pa.float64() for name in floats},
+                **{name: pa.dictionary(pa.int32(), pa.string()) for name in texts if name},
+            },
+            decimal_point=point,
+        )
+        return pc.read_csv(path, read_options=read, parse_options=parse, convert_options=convert)
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise ConversionError(f"{path}: not readable ({error})", _REPAIR) from error
+
+
+def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatArray:
+    """One of our columns in SI units; NaN only where kinds or positions can make up for it."""
+    column = columns.found[role]
+    if not column.name:
+        try:
+            return np.full(len(table), float(column.constant) * column.factor(role))
+        except ValueError:
+            what = f"column {role!r} is {column.constant!r} for all rows"
+            raise ConfigError(what, f"{role} = '=NUMBER'") from None
+    try:
+        values = table[column.name].cast(pa.float64()).to_numpy().astype(np.float64, copy=True)
+    except (pa.ArrowException, ValueError) as error:
+        what = f"{path}: column {column.name!r} is {table[column.name].type}, need numbers"
+        raise ConversionError(what, _REPAIR) from error
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad) and role in ("x", "y", "heading"):
+        raise ConversionError(
+            f"{path}: column {column.name!r} holds {len(bad)} values that are empty or not finite,"
+            f" the first in data row {bad[0] + 1}",
+            "leave these rows out of the file",
+        )
+    values *= column.factor(role)
+    return np.pi / 2 - values if column.unit == "compass" else values
+
+
+def _times(
+    table: pa.Table, columns: Columns, hz: float | None, path: Path
+) -> tuple[IntArray, float | None]:
+    """(A,) time stamps [us], and the frames per second, where they are given in frames."""
+    rate = hz or columns.hz
+    role = "frame" if "frame" in columns.found and (rate or "time" not in columns.found) else "time"
+    column = columns.found[role]
+    if role == "frame" and not rate:
+        raise ConversionError(
+            f"{path}: time is given in frames ({column.name!r}) only",
+            "say how many there are per second: --hz 25",
+        )
+    if role == "frame" and not 0.0 < float(rate or 0.0) < np.inf:
+        raise ConfigError(f"hz is {rate!r}", "--hz 25")
+    values = table[column.name] if column.name else None
+    if values is None:
+        raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
+    try:
+        if pa.types.is_timestamp(values.type):
+            values = values.cast(pa.timestamp("us")).cast(pa.int64())
+            column = replace(column, unit="us")
+        exact = values.cast(pa.float64()).to_numpy()
+        stamps = exact * 1e6 / rate if role == "frame" and rate else exact * column.factor(role)
+    except (pa.ArrowException, ValueError) as error:
+        what = f"{path}: column {column.name!r} is {values.type}, need times"
+        raise ConversionError(what, _REPAIR) from error
+    bad = np.flatnonzero(~(np.abs(stamps) < 2.0**55))
+    if len(bad):
+        raise ConversionError(
+            f"{path}: column {column.name!r} holds {len(bad)} values that are no times, the first"
+            f" in data row {bad[0] + 1}",
+            "check its unit: [units] time = 's', 'ms', 'us' or 'ns'; leave empty rows out",
+        )
+    return np.rint(stamps).astype(np.int64), rate if role == "frame" else None
+
+
+def _ids(table: pa.Table, name: str, path: Path) -> pa.ChunkedArray:
+    """Integers or texts."""
+    column = table[name]
+    if column.null_count:
+        raise ConversionError(
+            f"{path}: column {name!r} is empty in {column.null_count} rows", "give objects ids"
+        )
+    if pa.types.is_floating(column.type):
+        values = column.to_numpy()
+        if (values == np.rint(values)).all():
+            return pa.chunked_array([values.astype(np.int64)])
+    return column if pa.types.is_integer(column.type) else column.cast(pa.string())
+
+
+def _categories(
+    table: pa.Table,
+    columns: Columns,
+    track_ids: NDArray[Any],
+    track: IntArray,
+    meta: Mapping[int, str] | None,
+) -> tuple[IntArray, tuple[str, ...]]:
+    """(A,) codes, and the names that they mean, of known categories where the user has mapped."""
+    column = columns.found["kind"]
+    if meta is not None and column.constant == "meta":
+        names, codes = [meta.get(one, "") for one in track_ids.tolist()], track
+    elif not column.name:
+        names, codes = [column.constant], np.zeros(len(table), np.int64)
+    else:
+        values = table[column.name]
+        if not pa.types.is_dictionary(values.type):
+            values = values.cast(pa.string()).dictionary_encode()
+        encoded = values.unify_dictionaries().combine_chunks()
+        encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
+        names = [str(name) for name in encoded.dictionary.to_pylist()]
+        codes = encoded.indices.fill_null(len(names)).to_numpy().astype(np.int64)
+        names.append("")
+    plain = [normalise_category(name) for name in names]
+    plain = [columns.kinds.get(name, name) for name in plain]
+    distinct = sorted(set(plain))
+    place = np.array([distinct.index(name) for name in plain])
+    return place[codes], tuple(distinct)
+
+
+def _beside(
+    prefix: Path, said: dict[str, Any], names: list[str]
+) -> tuple[dict[str, Any], dict[int, str] | None]:
+    """Rate and kinds from the files of levelXdata beside the tracks; the user's word goes first."""
+    meta = None
+    rates, kinds = (prefix.with_name(f"{prefix.name}{n}Meta.csv") for n in ("recording", "tracks"))
+    try:
+        if os.path.isfile(rates) and "hz" not in said:
+            found = pc.read_csv(rates).to_pydict()
+            said["hz"] = float(found["frameRate"][0])
+        if os.path.isfile(kinds) and not {"class", "kind"} & {name.lower() for name in names}:
+            found = pc.read_csv(kinds).to_pydict()
+            number = "trackId" if "trackId" in found else "id"
+            meta = dict(zip(found[number], map(str, found["class"]), strict=True))
+            said["columns"] = {"kind": "=meta"} | said.get("columns", {})
+    except (OSError, pa.ArrowException, KeyError, ValueError, IndexError, TypeError) as error:
+        raise ConversionError(f"{prefix}*Meta.csv: not readable ({error!r})", _REPAIR) from error
+    return said, meta

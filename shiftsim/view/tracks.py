@@ -1,0 +1,127 @@
+"""A picture of a recording on its map: whether frame, units and axes fit is seen at once."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.data.deepplan.recording import Converted
+from shiftsim.data.tracks.columns import KINDS
+from shiftsim.data.tracks.convert import Looked
+from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.report.palette import new_figure, save_picture
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import AgentKind
+
+_COLOURS = {
+    AgentKind.VEHICLE: "#3b6ea5",
+    AgentKind.PEDESTRIAN: "#a8791e",
+    AgentKind.BICYCLE: "#8a5f9e",
+}
+_OTHER, _EGO, _ROAD, _LINE = "#8f8f8f", "#c23b22", "#dcdcd8", "#b8b8b2"
+_MARGIN = 0.05  # of the extent
+_MAX_POINTS = 300_000
+_MAX_EGOS = 40
+
+
+def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> None:
+    """Draw map, tracks and, if scenarios were made, their egos.
+
+    Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    road, table = looked.road, looked.table
+    bounds = road.edges.polygons.bounds
+    whole = np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
+    own = np.concatenate([*np.percentile(table.xy, (0.1, 99.9), axis=0)])
+    inside = (own[:2] >= whole[:2] - 100.0).all() and (own[2:] <= whole[2:] + 100.0).all()
+    alone = not inside or (own[2:] - own[:2]).max() < 0.2 * (whole[2:] - whole[:2]).max()
+    figure = new_figure(figsize=(14.0 if alone else 9.0, 8.0))
+    panels = figure.subplots(1, 2 if alone else 1, squeeze=False)[0]
+    both = np.concatenate([np.minimum(whole[:2], own[:2]), np.maximum(whole[2:], own[2:])])
+    _panel(panels[0], looked, made, both if inside else whole)
+    panels[0].set_title("map and tracks" if inside else "the map: the tracks are elsewhere")
+    if alone:
+        _panel(panels[1], looked, made, own)
+        panels[1].set_title("where the tracks are")
+    words = [f"{road.name}, {table.name}: {len(table.track_ids)} objects"]
+    if made is not None:
+        words.append(f"{len(made.windows)} scenarios, {len(made.egos)} egos")
+    words += [doubt.what for doubt in (*looked.doubts.found, *looked.doubts.notes)]
+    figure.suptitle("\n".join(words).replace("$", r"\$"), fontsize=9, wrap=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_picture(figure, path)
+
+
+def _panel(axes: Any, looked: Looked, made: Converted | None, extent: FloatArray) -> None:
+    low, high = extent[:2], extent[2:]
+    pad = _MARGIN * max(float((high - low).max()), 10.0)
+    _draw_road(axes, looked.road, np.concatenate([low - pad, high + pad]))
+    _draw_tracks(axes, looked.table)
+    if made is not None:
+        _draw_egos(axes, made)
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(low[1] - pad, high[1] + pad)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.tick_params(labelsize=7)
+    if axes.get_legend_handles_labels()[0]:
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.07), "ncols": 5}
+        axes.legend(fontsize=8, frameon=False, **place)
+
+
+def _draw_road(axes: Any, road: VectorMap, box: FloatArray) -> None:
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    bounds = road.edges.polygons.bounds
+    near = (bounds[:, :2] <= box[2:]).all(axis=1) & (bounds[:, 2:] >= box[:2]).all(axis=1)
+    rings = [
+        np.array(road.drivable_areas.shape(index).exterior.coords)
+        for index in range(len(road.drivable_areas))
+    ]
+    edges = np.flatnonzero(near).tolist()
+    rings += [np.array(road.edges.shape(edge).exterior.coords) for edge in edges]
+    fill: dict[str, Any] = {"facecolors": _ROAD, "edgecolors": "none", "zorder": 1}
+    axes.add_collection(PolyCollection(rings, **fill), autolim=False)
+    lines = [road.baselines.at(edge) for edge in edges]
+    thin: dict[str, Any] = {"colors": _LINE, "linewidths": 0.5, "zorder": 2}
+    axes.add_collection(LineCollection(lines, **thin), autolim=False)
+    for line in lines[:: max(1, len(lines) // 200)]:  # which way the lanes lead
+        middle = len(line) // 2
+        if 0 < middle < len(line) - 1:
+            ends = line[middle - 1], line[middle + 1]
+            style = {"arrowstyle": "->", "color": "#8c8c86", "linewidth": 0.7}
+            axes.annotate("", xy=ends[1], xytext=ends[0], arrowprops=style, annotation_clip=True)
+
+
+def _draw_tracks(axes: Any, table: TrackTable) -> None:
+    """One line per object, broken between objects."""
+    kinds = np.array([KINDS.get(name, -1) for name in table.categories])[table.category]
+    every = max(1, len(table.xy) // _MAX_POINTS)
+    for kind in np.unique(kinds).tolist():
+        rows = np.flatnonzero(kinds == kind)[::every]
+        breaks = np.flatnonzero(np.diff(table.track[rows])) + 1
+        xy = np.insert(table.xy[rows], breaks, np.nan, axis=0)
+        known = AgentKind(kind) if kind >= 0 else None
+        colour = _OTHER if known is None else _COLOURS.get(known, _OTHER)
+        name = known.name.lower().replace("_", " ") if known is not None else "unknown kind"
+        axes.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=0.6, zorder=3, label=name)
+
+
+def _draw_egos(axes: Any, made: Converted) -> None:
+    for number, ego in enumerate(made.egos):
+        x, y = ego.states[:, 0], ego.states[:, 1]
+        label = "egos, from dot to arrow" if not number else None
+        axes.plot(x, y, color=_EGO, linewidth=1.3, zorder=4, label=label)
+        if number < _MAX_EGOS:
+            axes.plot(x[0], y[0], "o", color=_EGO, markersize=4, zorder=5)
+            heading = ego.states[-1, 2]
+            to = x[-1] + 6.0 * np.cos(heading), y[-1] + 6.0 * np.sin(heading)
+            style = {"arrowstyle": "-|>", "color": _EGO}
+            axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
+            axes.annotate(ego.name, (x[0], y[0]), fontsize=6, color=_EGO, zorder=6)

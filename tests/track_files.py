@@ -1,0 +1,40 @@
+"""Tables of tracks for tests: a recording of a demo town as CSV and its map, right or spoilt."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+
+from shiftsim.data.demo.files import write_demo
+from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
+
+
+def export_town(folder: Path, town: str):
+    """Columns of a demo recording at 12.5 Hz by name, and its map; `folder` is made if needed."""
+    if not folder.exists():
+        write_demo(folder)
+    site = open_site(folder / town)
+    found = read_recording(site, site.recordings[0])
+    track = found.track
+    columns = {
+        "frame": found.frame,
+        "time_s": found.time,
+        "track": found.track_ids[track],
+        "kind": np.array(found.categories)[track],
+        "x_m": found.centers[:, 0],
+        "y_m": found.centers[:, 1],
+        "heading_rad": found.raw_headings,
+        "vx_mps": found.velocities[:, 0],
+        "vy_mps": found.velocities[:, 1],
+        "length_m": found.sizes[track, 0],
+        "width_m": found.sizes[track, 1],
+    }
+    return columns, find_map(site)
+
+
+def write_tracks(path: Path, columns, **changed) -> Path:
+    """Write a table with some columns changed; None leaves one out."""
+    kept = {n: v for n, v in {**columns, **changed}.items() if v is not None}
+    pc.write_csv(pa.table(kept), path)
+    return path
