@@ -21,7 +21,7 @@ from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import REPAIR, Scene
-from shiftsim.data.tracks.tables import numbers, read_columns
+from shiftsim.data.tracks.tables import naming, numbers, read_columns
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind
@@ -86,9 +86,13 @@ class Av2Reader:
         """One scene."""
         path, map_path = self.files(path)
         name = path.stem.removeprefix("scenario_")
+        with naming(path):
+            samples = _read_tracks(path)
+        with naming(map_path):
+            lanes = build_lane_map(read_map(map_path, f"av2-{name}"))
         return Scene(
-            samples=_read_tracks(path),
-            map=build_lane_map(read_map(map_path, f"av2-{name}")),
+            samples=samples,
+            map=lanes,
             egos=(EGO,),
             left_out_s=_SQUEEZED_S,
             metadata={**_METADATA, "scenario_id": name},

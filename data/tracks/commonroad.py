@@ -6,6 +6,7 @@ planning problem has no recorded track, so every car that drives is an ego.
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import REPAIR, LightStates, Scene
+from shiftsim.data.tracks.tables import naming
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind, LightStatus
@@ -66,10 +68,13 @@ class CommonRoadReader:
         file = _File(path, root)
         name = root.get("benchmarkID") or path.stem
         step_s = file.number(root.get("timeStepSize", ""), "step length", "'timeStepSize'")
-        samples = file.tracks(step_s)
+        with naming(path):
+            lanes = build_lane_map(file.map(f"commonroad-{name}"))
+            samples = file.tracks(step_s)
+        warnings = {**samples.warnings, **file.warnings}
         return Scene(
-            samples=samples,
-            map=build_lane_map(file.map(f"commonroad-{name}")),
+            samples=replace(samples, warnings=warnings),
+            map=lanes,
             egos=None,
             lights=file.lights(step_s, samples.duration),
             metadata={

@@ -20,7 +20,7 @@ from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenes import LightStates, Scene
-from shiftsim.data.tracks.tables import numbers, read_columns
+from shiftsim.data.tracks.tables import naming, numbers, read_columns
 from shiftsim.errors import ConversionError, MissingExtraError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind, LightStatus
@@ -115,9 +115,13 @@ class Py123dReader:
         lit = frozenset() if lights is None else frozenset(lights.names)
         map_path = _map_path(path, notes)
         city = path.name if map_path.parent == path else str(notes.get("location", ""))
+        with naming(path / "box_detections_se3.arrow"):
+            samples = _read_tracks(path)
+        with naming(map_path):
+            lanes = _read_map(map_path, f"{dataset}-{city}", lit)
         return Scene(
-            samples=_read_tracks(path),
-            map=_read_map(map_path, f"{dataset}-{city}", lit),
+            samples=samples,
+            map=lanes,
             egos=(EGO,),
             lights=lights,
             metadata={

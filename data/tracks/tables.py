@@ -1,6 +1,7 @@
 """Columns of Parquet and Arrow files: of the type expected, or refused with the place."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.arrays import FloatArray
-from shiftsim.errors import ConversionError
+from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.ranges import OPEN_DATA, require
 
 _MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 8_000_000
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of what is made of a file name it."""
+    try:
+        yield
+    except DataError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}", error.hint) from error
 
 
 def read_columns(path: Path, wanted: Mapping[str, pa.DataType], hint: str) -> pa.Table:

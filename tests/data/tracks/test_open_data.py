@@ -213,7 +213,23 @@ def test_a_fault_of_a_map_of_argoverse_is_named(tmp_path, message):
     found = json.loads(map_path.read_text())
     AV2_MAP_FAULTS[message](found)
     map_path.write_text(json.dumps(found))
-    refused(Av2Reader(), path, "av2-" if "no lane" in message else map_path, message)
+    refused(Av2Reader(), path, map_path, message)
+
+
+def test_an_obstacle_that_is_no_rectangle_is_left_out_and_counted(tmp_path):
+    path = write_commonroad(tmp_path)
+    text = path.read_text()
+    box = text[text.index("<rectangle>") : text.index("</rectangle>") + 12]
+    path.write_text(text.replace(box, "<circle><radius>1</radius></circle>", 1))
+    scene = CommonRoadReader().read(path)
+    assert scene.samples.warnings["obstacle that is no rectangle, left out"] == 1
+    assert len(scene.samples.track_ids) == len(demo_content()["tracks"])
+
+
+def test_two_rows_of_one_object_at_one_time_are_refused(tmp_path):
+    path = write_av2(tmp_path)
+    changed_table(path, lambda table: pa.concat_tables([table, table.slice(0, 1)]))
+    refused(Av2Reader(), path, path, "object 'AV' has two rows")
 
 
 XML_FAULTS = {
