@@ -12,9 +12,13 @@ from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
 
 def export_town(folder: Path, town: str):
     """Columns of a demo recording at 12.5 Hz by name, and its map; `folder` is made if needed."""
-    if not folder.exists():
-        write_demo(folder)
-    site = open_site(folder / town)
+    if not (folder / town).exists():
+        write_demo(folder, town)
+    return table_of(open_site(folder / town))
+
+
+def table_of(site):
+    """Columns of the first recording of a site by name, and its map."""
     found = read_recording(site, site.recordings[0])
     track = found.track
     columns = {

@@ -6,12 +6,16 @@ scenarios than any real recording of that length has.
 """
 
 import json
+import os
 import resource
+import subprocess
+import sys
 from pathlib import Path
 from time import perf_counter, process_time
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -63,11 +67,11 @@ def write_crowd(folder: Path, duration: float) -> Path:
     return folder
 
 
-def _boxes(count: int) -> pa.Table:
+def _boxes(count: int, period: float = PERIOD) -> pa.Table:
     track = np.arange(2 * ROADS * PER_LANE)
     frame, track = (part.ravel() for part in np.meshgrid(np.arange(count), track, indexing="ij"))
     road, side, place = track // 10, np.where(track % 2, 1.0, -1.0), track // 2 % PER_LANE
-    time = frame * PERIOD
+    time = frame * period
     kind = np.array([0] * 5 + [1] * 3 + [2] * 2)[track // 2 % 10]  # drives, parks, walks
     moves = kind != 1
     speed = moves * (0.6 + 0.6 * np.sin(0.4 * time + track))
@@ -114,3 +118,50 @@ def test_conversion_of_ten_crowded_minutes(crowd, duration, tmp_path):
     print(f", peak {peak:.2f} GB", end="")
     assert report.accepted == (4900 if duration == DURATION else 200)
     assert peak <= 2.0
+
+
+def write_table(folder: Path, duration: float, hz: float = 25.0) -> Path:
+    """The same crowd as a CSV file with a row per object and frame, and its map beside it."""
+    write_crowd(folder, 1.0)
+    boxes = _boxes(round(duration * hz) + 1, 1.0 / hz)
+    names = {
+        "track_id": "trackId",
+        "category": "class",
+        "translation_x": "xCenter",
+        "translation_y": "yCenter",
+        "rotation_z": "heading",
+        "dimension_x": "length",
+        "dimension_y": "width",
+        "velocity_x": "xVelocity",
+        "velocity_y": "yVelocity",
+    }
+    columns = {"frame": boxes["frame_id"].to_numpy() // 2}
+    columns |= {theirs: boxes[ours] for ours, theirs in names.items()}
+    pc.write_csv(pa.table(columns).cast(_plain(columns)), folder / "crowd.csv")
+    return folder
+
+
+def _plain(columns) -> pa.Schema:
+    """Names as text, numbers as they are."""
+    kinds = {
+        name: pa.array(values[:1]).type if name == "frame" else values.type
+        for name, values in columns.items()
+    }
+    return pa.schema({**kinds, "class": pa.string()})
+
+
+@pytest.mark.parametrize("ego", ["0", "all"])
+def test_conversion_of_ten_minutes_of_tracks(ego, duration, tmp_path):
+    """200 tracks at 25 Hz as a command of its own: seconds and memory of one process."""
+    folder = write_table(tmp_path / "crowd", duration)
+    words = [sys.executable, "-m", "shiftsim", "convert", "tracks", folder / "crowd.csv"]
+    words += [folder / "map/map.xodr", "--hz", "25", "--ego", ego, "--store", tmp_path / "store"]
+    began = perf_counter()
+    child = subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE)
+    shown = child.stdout.read().decode()
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    peak = used.ru_maxrss / 1024**2
+    print(f"\n--ego {ego}: {perf_counter() - began:.1f} s", end="")
+    print(f", by CPU time {used.ru_utime + used.ru_stime:.1f} s, peak {peak:.2f} GB", end="")
+    assert child.returncode == 0, shown

@@ -95,10 +95,6 @@ def resample(
     kept = np.flatnonzero(last >= first)
     kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
     lengths = last[kept] - first[kept] + 1
-    column = np.repeat(np.arange(len(kept)), lengths)
-    step = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    row = first[kept][column] + step
-    samples = sample_runs(recording, runs, kept[column], row * ROW_S)
     kinds = recording.kinds[runs.track[kept]]
     tracks = Tracks(
         np.zeros((num_rows, len(kept)), np.bool_),
@@ -108,13 +104,16 @@ def resample(
         kinds,
         tuple(run_token(recording, runs, run) for run in kept.tolist()),
     )
-    row = row + padding
-    tracks.valid[row, column] = True
-    tracks.poses[row, column] = samples.poses
-    tracks.poses[row, column, :2] += offset
-    moves = (kinds <= LAST_AGENT_KIND)[column]
-    tracks.velocities[row[moves], column[moves]] = samples.velocities[moves]
-    tracks.sizes[row, column] = recording.sizes[runs.track[kept]][column, :2]
+    for column, run in enumerate(kept.tolist()):  # all at once would need a multiple of the memory
+        row = first[run] + np.arange(lengths[column])
+        samples = sample_runs(recording, runs, np.full(len(row), run), row * ROW_S)
+        here = slice(int(first[run]) + padding, int(last[run]) + 1 + padding)
+        tracks.valid[here, column] = True
+        tracks.poses[here, column] = samples.poses
+        tracks.poses[here, column, :2] += offset
+        if kinds[column] <= LAST_AGENT_KIND:
+            tracks.velocities[here, column] = samples.velocities
+        tracks.sizes[here, column] = recording.sizes[runs.track[run], :2]
     times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
 

@@ -207,14 +207,16 @@ def overlap_partners(
     """
     by_frame = np.lexsort((recording.track, recording.frame))
     frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
-    boxes = np.column_stack(
-        [recording.centers[:, :2], recording.raw_headings, recording.sizes[recording.track, :2]]
-    )[by_frame]
-    asked = candidates[recording.track[by_frame]]
-    found = _first_overlaps(np.ascontiguousarray(boxes), frame_ptr, asked, max_overlap)
-    out = np.full(len(by_frame), -1, np.int64)
-    out[by_frame] = np.where(found >= 0, recording.track[by_frame[found]], -1)
-    return out
+    return _first_overlaps(
+        recording.centers,
+        recording.raw_headings,
+        np.ascontiguousarray(recording.sizes[:, :2]),
+        recording.track,
+        by_frame,
+        frame_ptr,
+        candidates,
+        max_overlap,
+    )
 
 
 def _judge(
@@ -268,25 +270,40 @@ def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:
 
 @kernel
 def _first_overlaps(
-    boxes: FloatArray, frame_ptr: IntArray, asked: BoolArray, max_overlap: float
+    centers: FloatArray,
+    headings: FloatArray,
+    sizes: FloatArray,
+    track: IntArray,
+    by_frame: IntArray,
+    frame_ptr: IntArray,
+    asked: BoolArray,
+    max_overlap: float,
 ) -> IntArray:
-    """(A,) first row of the same frame whose box shares more than `max_overlap` with the row's."""
-    out = np.full(len(boxes), -1, np.int64)
-    radius = 0.5 * np.hypot(boxes[:, 3], boxes[:, 4])
+    """(A,) first track in the same frame whose box shares more than `max_overlap` with the row's.
+
+    Boxes are centers (A, 2 or 3), headings (A,) and the sizes (N, 2) of their tracks (A,);
+    `by_frame` (A,) are the rows sorted by frame, `asked` (N,) the tracks looked at.
+    """
+    out = np.full(len(track), -1, np.int64)
+    radius = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
     ring, other = np.empty((4, 2)), np.empty((4, 2))
     for frame in range(len(frame_ptr) - 1):
-        for i in range(frame_ptr[frame], frame_ptr[frame + 1]):
-            if not asked[i]:
+        for first in range(frame_ptr[frame], frame_ptr[frame + 1]):
+            i = by_frame[first]
+            a = track[i]
+            if not asked[a]:
                 continue
-            for j in range(frame_ptr[frame], frame_ptr[frame + 1]):
-                dx, dy = boxes[j, 0] - boxes[i, 0], boxes[j, 1] - boxes[i, 1]
-                reach = radius[i] + radius[j]
+            for second in range(frame_ptr[frame], frame_ptr[frame + 1]):
+                j = by_frame[second]
+                b = track[j]
+                dx, dy = centers[j, 0] - centers[i, 0], centers[j, 1] - centers[i, 1]
+                reach = radius[a] + radius[b]
                 if j == i or dx * dx + dy * dy > reach * reach:
                     continue
-                box_corners(0.0, 0.0, boxes[i, 2], boxes[i, 3], boxes[i, 4], ring)
-                box_corners(dx, dy, boxes[j, 2], boxes[j, 3], boxes[j, 4], other)
+                box_corners(0.0, 0.0, headings[i], sizes[a, 0], sizes[a, 1], ring)
+                box_corners(dx, dy, headings[j], sizes[b, 0], sizes[b, 1], other)
                 if shared_area(ring, other) > max_overlap:
-                    out[i] = j
+                    out[i] = b
                     break
     return out
 

@@ -19,10 +19,14 @@ _GROUND = 512.0  # m, altitude of everything
 _FLOATS = ("rotation", "dimension", "velocity", "angular_velocity", "acceleration")
 
 
-def write_demo(folder: Path) -> None:
-    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes."""
+def write_demo(folder: Path, only: str = "") -> None:
+    """Write the recordings of the demo, one DSC3D folder per town, always the same bytes.
+
+    All towns are written, or the one named.
+    """
     for site in demo_sites():
-        _write_site(folder / site.name, site)
+        if only in ("", site.name):
+            _write_site(folder / site.name, site)
 
 
 def _write_site(folder: Path, site: DemoSite) -> None:

@@ -170,6 +170,12 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     return states
 
 
+def whole_ego(table: Table) -> tuple[int, FloatArray]:
+    """Row of the recording of the first state, and all states (R, 11) of an ego."""
+    start = int(_footer(table, {"first_row": int})["first_row"])
+    return start, ego_states(table, start, start + table.num_rows)
+
+
 def _rows(table: Table, first: int, last: int) -> pa.Table:
     low, high = first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK
     if high >= table.num_blocks:

@@ -47,6 +47,7 @@ def make_samples(
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
     trusts_velocities: bool = False,
+    derived: FloatArray | None = None,
     kind_of: Mapping[str, AgentKind] = CATEGORIES,
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
@@ -64,6 +65,7 @@ def make_samples(
         sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
             NaN or 0. A track gets the median.
         trusts_velocities: Whether velocities are kept where they contradict the positions.
+        derived: (A, 2) `fitted_velocities` of rows sorted by id and time, where they are known.
         kind_of: AgentKind by name of a category.
 
     Raises:
@@ -89,12 +91,14 @@ def make_samples(
             None if part is None else part[order] for part in (headings, velocities, sizes)
         )
         _refuse_twice(name, track_ids, track, time_us)
+        derived = None
     stamps, frame = numbered(time_us)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[np.diff(track) == 0]
     period = float(np.median(step)) if len(step) else ROW_S
     named, kinds = _kinds(name, category, categories, kind_of, track, warnings)
-    derived = fitted_velocities(xy, time, track, period)
+    if derived is None:
+        derived = fitted_velocities(xy, time, track, period)
     speeds = believed(velocities, derived, time, track, warnings, trusts=trusts_velocities)
     raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
     samples = TrackSamples(

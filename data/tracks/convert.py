@@ -141,6 +141,7 @@ def convert_tracks(
         headings=table.headings,
         velocities=table.velocities,
         sizes=table.sizes,
+        derived=doubts.derived,
         kind_of=KINDS,
     )
     made = make_scenarios(samples, road, egos=egos, config=config or tracks_config())

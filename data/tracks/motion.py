@@ -14,7 +14,7 @@ _HALF_WINDOW = 0.25  # s on each side of a fit
 _EPS = 1e-6  # s
 _SLOW = 0.3  # m/s, below which a direction of motion tells nothing
 _END = 1.0  # s at both ends of a track, where trackers settle
-_MAX_SHARE, _LEAST_ERROR = 0.1, 0.3  # of the speed; m/s that noise of positions may cause
+MAX_SHARE, _LEAST_ERROR = 0.1, 0.3  # of the speed; m/s that noise of positions may cause
 
 
 def fitted_velocities(
@@ -29,13 +29,13 @@ def fitted_velocities(
     return _fit(np.ascontiguousarray(xy), time, ends, half)
 
 
-def contradicting(
+def contradiction(
     stored: FloatArray, derived: FloatArray, time: FloatArray, track: IntArray
-) -> BoolArray:
-    """(N,) whether the stored velocities of a track are not those of its positions.
+) -> tuple[BoolArray, FloatArray]:
+    """(N,) whether the stored velocities of a track contradict its positions; (N,) by what share.
 
-    The median over the track differs by more than 10 % of the speed and 0.3 m/s; the first and the
-    last second are left out of tracks that are longer.
+    They do where the median over the track differs by more than 10 % of the median speed and 0.3
+    m/s; the first and the last second are left out of tracks that are longer.
     """
     ends = np.searchsorted(track, np.arange(int(track[-1]) + 2))
     first, last = time[ends[:-1]][track], time[ends[1:] - 1][track]
@@ -43,12 +43,13 @@ def contradicting(
     used = inner | (last - first <= 3.0 * _END)
     error = np.hypot(*(stored - derived)[used].T)
     speed = np.hypot(*derived[used].T)
-    wrong = np.zeros(len(ends) - 1, np.bool_)
+    wrong, share = np.zeros(len(ends) - 1, np.bool_), np.zeros(len(ends) - 1)
     if used.any():
         seen, part = np.unique(track[used], return_inverse=True)
-        limit = np.maximum(_LEAST_ERROR, _MAX_SHARE * track_medians(speed, part))
-        wrong[seen] = ~(track_medians(error, part) <= limit)
-    return wrong
+        errors, speeds = track_medians(error, part), track_medians(speed, part)
+        wrong[seen] = ~(errors <= np.maximum(_LEAST_ERROR, MAX_SHARE * speeds))
+        share[seen] = errors / np.maximum(speeds, _SLOW)
+    return wrong, share
 
 
 def believed(
@@ -71,7 +72,7 @@ def believed(
     lacking = np.zeros(num_tracks, np.bool_)
     lacking[track[~np.isfinite(stored).all(axis=1)]] = True
     warnings["tracks without stored velocity (derived)"] += int(lacking.sum())
-    wrong = contradicting(stored, derived, time, track) & ~lacking & (not trusts)
+    wrong = contradiction(stored, derived, time, track)[0] & ~lacking & (not trusts)
     warnings["tracks whose stored velocity does not fit (derived)"] += int(wrong.sum())
     return np.where((lacking | wrong)[track][:, None], derived, stored)
 

@@ -9,10 +9,14 @@ from shiftsim import cli
 from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from shiftsim.data.store.check import Problem, RecordingRow
     from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.runs.filter import Verdicts
 
 _DATA, _PARTIAL = 2, 3
+_MAX_SHOWN = 20  # problems of one kind
 export = new_app("Write scenarios in the formats of others.", no_args_is_help=True)
 
 Store = Annotated[str, typer.Argument(metavar="STORE", help="Store, by name or folder.")]
@@ -23,25 +27,55 @@ def check(
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
-    """Validate a store: schemas, hashes, units, links to the map; lists every problem."""
-    from shiftsim.data.store.check import check_store
+    """Validate a store: files, units, motion, maps and routes; lists every problem.
+
+    At the end comes what was found in each recording.
+    """
+    from shiftsim.data.store.check import survey_store
     from shiftsim.files import store_path
 
     path = store_path(store)
-    problems = check_store(path)
-    num_errors = sum(problem.is_error for problem in problems)
+    found = survey_store(path)
+    num_errors = sum(problem.is_error for problem in found.problems)
     if as_json:
         from dataclasses import asdict
 
-        say_json([asdict(problem) for problem in problems])
+        say_json([asdict(problem) for problem in found.problems])
     else:
-        for problem in problems:
-            kind = "error" if problem.is_error else "unusual"
-            say(f" {kind}: {problem.where}: {problem.what}")
-        unusual = len(problems) - num_errors
+        _show_problems(found.problems)
+        _show_recordings(found.recordings)
+        unusual = len(found.problems) - num_errors
         say(f"{path}: {plural(num_errors, 'error')}, {unusual} unusual")
     if num_errors:
         raise typer.Exit(_DATA)
+
+
+def _show_problems(problems: "Sequence[Problem]") -> None:
+    """The first of every kind, errors before what is only unusual."""
+    from collections import Counter
+
+    shown: Counter[tuple[bool, str]] = Counter()
+    for problem in sorted(problems, key=lambda problem: not problem.is_error):
+        word, group = "error" if problem.is_error else "unusual", (problem.is_error, problem.kind)
+        shown[group] += 1
+        if shown[group] <= _MAX_SHOWN:
+            remedy = f" ({problem.remedy})" if problem.remedy else ""
+            say(f" {word}: {problem.where}: {problem.what}{remedy}")
+    for (is_error, kind), count in shown.items():
+        if count > _MAX_SHOWN:
+            word = "errors" if is_error else "unusual"
+            say(f" {word}: {count - _MAX_SHOWN} more of {kind or 'files'}: --json lists them")
+
+
+def _show_recordings(rows: "Sequence[RecordingRow]") -> None:
+    if not rows:
+        return
+    width = max(9, *(len(row.recording) for row in rows))
+    say(f" {'recording':{width}}  length s  tracks  scenarios  errors  unusual  found")
+    for row in rows:
+        kinds = ", ".join(f"{kind} {count}" for kind, count in row.found.items()) or "nothing"
+        counts = f"{row.tracks:6d}  {row.scenarios:9d}  {row.errors:6d}  {row.unusual:7d}"
+        say(f" {row.recording:{width}}  {row.duration_s:8.1f}  {counts}  {kinds}")
 
 
 @cli.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")

@@ -39,10 +39,14 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
     own = np.concatenate([*np.percentile(table.xy, (0.1, 99.9), axis=0)])
     inside = (own[:2] >= whole[:2] - 100.0).all() and (own[2:] <= whole[2:] + 100.0).all()
     alone = not inside or (own[2:] - own[:2]).max() < 0.2 * (whole[2:] - whole[:2]).max()
-    figure = new_figure(figsize=(14.0 if alone else 9.0, 8.0))
-    panels = figure.subplots(1, 2 if alone else 1, squeeze=False)[0]
     both = np.concatenate([np.minimum(whole[:2], own[:2]), np.maximum(whole[2:], own[2:])])
-    _panel(panels[0], looked, made, both if inside else whole)
+    shown = [both if inside else whole, *([own] if alone else [])]
+    width = 7.0 if alone else 9.0
+    tall = max(float((box[3] - box[1]) / max(box[2] - box[0], 1e-9)) for box in shown)
+    height = width * min(max(tall, 0.3), 1.2) + 1.6
+    figure = new_figure(figsize=(width * len(shown), height))
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    _panel(panels[0], looked, made, shown[0])
     panels[0].set_title("map and tracks" if inside else "the map: the tracks are elsewhere")
     if alone:
         _panel(panels[1], looked, made, own)
@@ -51,6 +55,8 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
     if made is not None:
         words.append(f"{len(made.windows)} scenarios, {len(made.egos)} egos")
     words += [doubt.what for doubt in (*looked.doubts.found, *looked.doubts.notes)]
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     figure.suptitle("\n".join(words).replace("$", r"\$"), fontsize=9, wrap=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_picture(figure, path)
@@ -70,9 +76,6 @@ def _panel(axes: Any, looked: Looked, made: Converted | None, extent: FloatArray
     axes.set_ylabel("y [m]")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
-    if axes.get_legend_handles_labels()[0]:
-        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.07), "ncols": 5}
-        axes.legend(fontsize=8, frameon=False, **place)
 
 
 def _draw_road(axes: Any, road: VectorMap, box: FloatArray) -> None:

@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 from doc_pages import (
@@ -30,12 +29,11 @@ from doc_pages import (
     shiftsim_calls,
     table_below,
 )
+from track_files import table_of, write_tracks
 
 from shiftsim.benchmarks import load_track
-from shiftsim.data.deepplan.states import resample
-from shiftsim.data.deepplan.windows import find_runs
 from shiftsim.data.demo import store as synthetic
-from shiftsim.data.dsc3d.recording import find_map, open_site, read_recording
+from shiftsim.data.dsc3d.recording import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
@@ -102,17 +100,9 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_tracks(folder: Path, recording: Path) -> None:
     """A CSV and a map of docs/own_scenarios.md."""
-    site = open_site(recording)
-    (folder / "map.xodr").write_bytes(find_map(site).read_bytes())
-    source = read_recording(site, site.recordings[0])
-    runs = find_runs(source, 0.5)
-    tracks = resample(source, runs, log_name="", city="", offset=np.zeros(2)).tracks
-    row, column = np.nonzero(tracks.valid[:200])
-    values = (tracks.poses, tracks.velocities, tracks.sizes)
-    columns = [row, column, tracks.kinds[column], *(array[row, column] for array in values)]
-    header = "row,track,kind,x_m,y_m,heading_rad,vx_mps,vy_mps,length_m,width_m"
-    table = np.column_stack(columns)
-    np.savetxt(folder / "tracks.csv", table, delimiter=",", header=header, comments="")
+    columns, map_path = table_of(open_site(recording))
+    (folder / "map.xodr").write_bytes(map_path.read_bytes())
+    write_tracks(folder / "tracks.csv", columns, frame=None)
 
 
 @pytest.fixture

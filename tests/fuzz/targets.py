@@ -189,10 +189,10 @@ def _open_data(folder: Path) -> None:
 
 
 def _read_open_data(folder: Path) -> Any:
-    from shiftsim.data.tracks.av2 import Av2Reader
-    from shiftsim.data.tracks.commonroad import CommonRoadReader
-    from shiftsim.data.tracks.py123d import Py123dReader
-    from shiftsim.data.tracks.scenes import convert_scene
+    from shiftsim.data.open_data.av2 import Av2Reader
+    from shiftsim.data.open_data.commonroad import CommonRoadReader
+    from shiftsim.data.open_data.py123d import Py123dReader
+    from shiftsim.data.open_data.scenes import convert_scene
 
     readers = {"*.parquet": Av2Reader(), "*.xml": CommonRoadReader(), "*.arrow": Py123dReader()}
     reader = next(r for pattern, r in readers.items() if any(folder.rglob(pattern)))

@@ -4,37 +4,27 @@ py123d itself is not needed: its files are Arrow tables whose objects are packed
 have no version of their own, so every column is checked; tested with files of py123d 0.7.0.
 """
 
-from collections import defaultdict
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.lanes.map import PieceMap, build_lane_map
-from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, clean_line
-from shiftsim.data.polygons import largest_part
+from shiftsim.data.open_data.py123d_map import HINT, need_msgpack, read_map, unpack
+from shiftsim.data.open_data.scenes import LightStates, Scene
+from shiftsim.data.open_data.tables import naming, numbers, read_columns
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.data.tracks.scenes import LightStates, Scene
-from shiftsim.data.tracks.tables import naming, numbers, read_columns
-from shiftsim.errors import ConversionError, MissingExtraError
+from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind, LightStatus
 
-TESTED = "0.7.0"  # version of py123d
 EGO = "ego"
-_HINT = f"convert the log again with py123d {TESTED}"
-_VEHICLE, _BICYCLE, _PEDESTRIAN = AgentKind.VEHICLE, AgentKind.BICYCLE, AgentKind.PEDESTRIAN
-_CONE, _BARRIER, _SIGN = AgentKind.TRAFFIC_CONE, AgentKind.BARRIER, AgentKind.CZONE_SIGN
-_GENERIC = AgentKind.GENERIC_OBJECT
 
 
 def _codes(count: int, **groups: str) -> dict[int, AgentKind]:
-    out = dict.fromkeys(range(count), _GENERIC)
+    out = dict.fromkeys(range(count), AgentKind.GENERIC_OBJECT)
     for kind, codes in groups.items():
         out |= dict.fromkeys(map(int, codes.split()), AgentKind[kind.upper()])
     return out
@@ -72,9 +62,6 @@ _LICENCES = {
     "nuscenes": "CC BY-NC-SA 4.0",
     "wod": "Waymo Open Dataset License Agreement for Non-Commercial Use",
 }
-_LANE, _GROUP, _INTERSECTION, _CROSSWALK, _WALKWAY, _CAR_PARK, _DRIVABLE, _STOP = range(8)
-_BIKE_LANE = 3
-_STOP_KINDS = (5, 2, 1, 4, 0, 3)  # nuPlan's type of a stop polygon, by py123d's
 _LIGHTS = (LightStatus.GREEN, LightStatus.YELLOW, LightStatus.RED)  # others: unknown
 
 
@@ -88,7 +75,7 @@ class Py123dReader:
 
     def find(self, folder: Path) -> list[Path]:
         """Folders of the logs, sorted."""
-        _msgpack()
+        need_msgpack()
         found = sorted(path.parent for path in folder.rglob("ego_state_se3.arrow"))
         if not found:
             raise ConversionError(
@@ -118,7 +105,7 @@ class Py123dReader:
         with naming(path / "box_detections_se3.arrow"):
             samples = _read_tracks(path)
         with naming(map_path):
-            lanes = _read_map(map_path, f"{dataset}-{city}", lit)
+            lanes = read_map(map_path, f"{dataset}-{city}", lit)
         return Scene(
             samples=samples,
             map=lanes,
@@ -134,41 +121,12 @@ class Py123dReader:
         )
 
 
-def _msgpack() -> Any:
-    try:
-        import msgpack
-    except ImportError as error:
-        raise MissingExtraError(
-            "logs of py123d need msgpack", "pip install 'shiftsim[py123d]'"
-        ) from error
-    return msgpack
-
-
-def _unpack(data: bytes, place: str) -> dict[Any, Any]:
-    """What msgpack packed: plain values and arrays of float64, nothing else."""
-    try:
-        found = _msgpack().unpackb(data, raw=False, strict_map_key=False, object_hook=_array)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ConversionError(f"{place}: cannot be unpacked ({error})", _HINT) from error
-    if not isinstance(found, dict):
-        raise ConversionError(f"{place}: is {type(found).__name__}, need a map", _HINT)
-    return found
-
-
-def _array(found: dict[Any, Any]) -> Any:
-    if b"__ndarray__" not in found:
-        return found
-    if found[b"dtype"] != "<f8":
-        raise ValueError(f"an array of {found[b'dtype']!r}, need '<f8'")
-    return np.frombuffer(found[b"data"], "<f8").reshape(found[b"shape"])
-
-
 def _notes(path: Path) -> dict[Any, Any]:
     """The `metadata` in the schema of a file."""
-    packed = (read_columns(path, {}, _HINT).schema.metadata or {}).get(b"metadata")
+    packed = (read_columns(path, {}, HINT).schema.metadata or {}).get(b"metadata")
     if packed is None:
-        raise ConversionError(f"{path}: the schema has no 'metadata'", _HINT)
-    return _unpack(packed, f"{path}: 'metadata'")
+        raise ConversionError(f"{path}: the schema has no 'metadata'", HINT)
+    return unpack(packed, f"{path}: 'metadata'")
 
 
 def _map_path(log: Path, notes: dict[Any, Any]) -> Path:
@@ -191,12 +149,12 @@ def _read_tracks(path: Path) -> TrackSamples:
         "label": pa.list_(pa.uint16()),
         "velocity_3d": _vectors(3, listed=True),
     }
-    table = read_columns(file, {f"{prefix}.{n}": kind for n, kind in wanted.items()}, _HINT)
+    table = read_columns(file, {f"{prefix}.{n}": kind for n, kind in wanted.items()}, HINT)
     lists = {name: table[f"{prefix}.{name}"].combine_chunks() for name in list(wanted)[1:]}
     counts = {n: lists[n].value_lengths().fill_null(0).to_numpy() for n in lists}
     for name, count in counts.items():
         if (count != counts["label"]).any():
-            raise ConversionError(f"{file}: {name!r} and 'label' differ in length", _HINT)
+            raise ConversionError(f"{file}: {name!r} and 'label' differ in length", HINT)
     stamps = numbers(table, f"{prefix}.timestamp_us", "time", file).astype(np.int64)
     label_class = str(_notes(file).get("box_detection_label_class")).rpartition(".")[2]
     if label_class not in LABELS:
@@ -205,7 +163,7 @@ def _read_tracks(path: Path) -> TrackSamples:
     labels = lists["label"].flatten().to_numpy().astype(np.int64)
     kinds = LABELS[label_class]
     for label in sorted(set(labels.tolist()) - set(kinds)):
-        raise ConversionError(f"{file}: label {label} of {label_class} is unknown", _HINT)
+        raise ConversionError(f"{file}: label {label} of {label_class} is unknown", HINT)
     boxes = _rows(lists["bounding_box_se3"].flatten(), 10)
     _check_boxes(boxes, file)
     velocities = _rows(lists["velocity_3d"].flatten(), 3)[:, :2]
@@ -232,7 +190,7 @@ def _ego_boxes(file: Path) -> tuple[IntArray, FloatArray]:
     """
     poses_of = "ego_state_se3.imu_se3"
     wanted = {"ego_state_se3.timestamp_us": pa.int64(), poses_of: _vectors(7, listed=False)}
-    table = read_columns(file, wanted, _HINT)
+    table = read_columns(file, wanted, HINT)
     notes = _notes(file)
     stamps = numbers(table, "ego_state_se3.timestamp_us", "time", file).astype(np.int64)
     poses = _rows(table[poses_of].combine_chunks(), 7)
@@ -240,7 +198,7 @@ def _ego_boxes(file: Path) -> tuple[IntArray, FloatArray]:
         to_center = np.array(notes["center_to_imu_se3"], np.float64).reshape(7)
         size = np.array([notes["length"], notes["width"]], np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise ConversionError(f"{file}: 'metadata' lacks {error}", _HINT) from error
+        raise ConversionError(f"{file}: 'metadata' lacks {error}", HINT) from error
     _check_boxes(np.column_stack([poses, np.broadcast_to([*size, 1.0], (len(poses), 3))]), file)
     heading = _yaws(poses[:, 3:])
     cos, sin = np.cos(heading), np.sin(heading)
@@ -279,7 +237,7 @@ def _read_lights(file: Path) -> LightStates | None:
     prefix = "traffic_light_detections"
     wanted = {"timestamp_us": pa.int64(), "lane_id": pa.list_(pa.int32())}
     wanted["status"] = pa.list_(pa.uint8())
-    table = read_columns(file, {f"{prefix}.{n}": kind for n, kind in wanted.items()}, _HINT)
+    table = read_columns(file, {f"{prefix}.{n}": kind for n, kind in wanted.items()}, HINT)
     stamps = numbers(table, f"{prefix}.timestamp_us", "time", file).astype(np.int64)
     lanes, codes = (table[f"{prefix}.{n}"].to_pylist() for n in ("lane_id", "status"))
     names = sorted({lane for row in lanes for lane in row or ()})
@@ -290,93 +248,3 @@ def _read_lights(file: Path) -> LightStates | None:
             status[row, column[lane]] = _LIGHTS[code] if code < 3 else LightStatus.UNKNOWN
     order = np.argsort(stamps, kind="stable")
     return LightStates(tuple(map(str, names)), stamps[order], status[order])
-
-
-@lru_cache(maxsize=1)  # logs of one city follow each other
-def _read_map(path: Path, name: str, lit: frozenset[str]) -> PieceMap:
-    wanted = {"object_id": pa.int64(), "map_layer": pa.int8()}
-    wanted |= {"features": pa.binary(), "wkb": pa.binary()}
-    table = read_columns(path, wanted, _HINT)
-    objects: dict[int, list[tuple[str, bytes, bytes]]] = defaultdict(list)
-    for number, layer, features, wkb in zip(*(table[n].to_pylist() for n in wanted), strict=True):
-        objects[layer].append((str(number), features or b"", wkb or b""))
-    groups = {n: _unpack(f, f"{path}: lane group {n}") for n, f, _ in objects[_GROUP]}
-    inside = {n for n, group in groups.items() if group.get("intersection_id") is not None}
-    lanes = {n: _unpack(f, f"{path}: lane {n}") for n, f, _ in objects[_LANE]}
-    areas = {layer: _areas(objects[layer], path) for layer in range(_GROUP, _STOP + 1)}
-    drivable = [a for layer in (_GROUP, _INTERSECTION, _CAR_PARK, _DRIVABLE) for a in areas[layer]]
-    stops = [
-        StopArea(area, _stop_kind(_unpack(f, f"{path}: stop zone {n}")))
-        for (n, f, _), area in zip(objects[_STOP], areas[_STOP], strict=True)
-    ]
-    return build_lane_map(
-        MapSource(
-            name=name,
-            pieces=[
-                _piece(n, lane, inside, lit, f"{path}: lane {n}")
-                for n, lane in lanes.items()
-                if lane.get("lane_type") != _BIKE_LANE
-            ],
-            drivable_areas=drivable if areas[_DRIVABLE] else (),  # Waymo has none
-            stop_areas=stops,
-            crosswalks=areas[_CROSSWALK],
-            walkways=areas[_WALKWAY],
-            car_parks=areas[_CAR_PARK],
-        )
-    )
-
-
-def _piece(
-    name: str, lane: dict[Any, Any], inside: set[str], lit: frozenset[str], place: str
-) -> LanePiece:
-    limit = lane.get("speed_limit_mps")
-    if limit is not None:
-        require(OPEN_DATA, "speed limit", limit, place, error=ConversionError)
-    return LanePiece(
-        id=name,
-        left=_line(lane, "left_boundary", place),
-        right=_line(lane, "right_boundary", place),
-        center=_line(lane, "centerline", place),
-        successors=tuple(map(str, lane.get("successor_ids") or ())),
-        left_neighbor=_name(lane.get("left_lane_id")),
-        right_neighbor=_name(lane.get("right_lane_id")),
-        is_connector=_name(lane.get("lane_group_id")) in inside,
-        speed_limit=limit,
-        light=name if name in lit else None,
-    )
-
-
-def _name(value: Any) -> str | None:
-    return None if value is None else str(value)
-
-
-def _stop_kind(zone: dict[Any, Any]) -> int:
-    kind = zone.get("stop_zone_type")
-    if not isinstance(kind, int) or not 0 <= kind < len(_STOP_KINDS):
-        return _STOP_KINDS[0]
-    return _STOP_KINDS[kind]
-
-
-def _line(item: dict[Any, Any], key: str, place: str) -> FloatArray:
-    points = item.get(key)
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 2:
-        raise ConversionError(f"{place}: {key!r} is no line of points", _HINT)
-    line = np.ascontiguousarray(points[:, :2])
-    require(OPEN_DATA, "position", line, f"{place}: {key!r} as", error=ConversionError)
-    return clean_line(line)
-
-
-def _areas(objects: list[tuple[str, bytes, bytes]], path: Path) -> list[shapely.Polygon]:
-    """Polygons of a layer."""
-    out = []
-    for name, _, wkb in objects:
-        try:
-            shape = shapely.force_2d(shapely.from_wkb(wkb))
-        except (shapely.errors.GEOSException, TypeError) as error:
-            raise ConversionError(f"{path}: wkb of {name}: {error}", _HINT) from error
-        if shape is None or shape.geom_type != "Polygon" or shape.is_empty:
-            raise ConversionError(f"{path}: wkb of {name} is no polygon", _HINT)
-        place = f"{path}: wkb of {name} as"
-        require(OPEN_DATA, "position", shapely.get_coordinates(shape), place, error=ConversionError)
-        out.append(largest_part(shape))
-    return out

@@ -17,11 +17,11 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import LanePiece, MapSource, clean_line
+from shiftsim.data.open_data.scenes import REPAIR, Scene
+from shiftsim.data.open_data.tables import naming, numbers, read_columns
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.data.tracks.scenes import REPAIR, Scene
-from shiftsim.data.tracks.tables import naming, numbers, read_columns
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind

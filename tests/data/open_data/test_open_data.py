@@ -21,13 +21,13 @@ from open_data_files import (
     write_py123d,
 )
 
+from shiftsim.data.open_data.av2 import Av2Reader
+from shiftsim.data.open_data.commonroad import CommonRoadReader
+from shiftsim.data.open_data.py123d import Py123dReader
+from shiftsim.data.open_data.scenes import convert_scene, convert_scenes
 from shiftsim.data.opendrive.check import check_map
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.tracks.av2 import Av2Reader
-from shiftsim.data.tracks.commonroad import CommonRoadReader
-from shiftsim.data.tracks.py123d import Py123dReader
-from shiftsim.data.tracks.scenes import convert_scene, convert_scenes
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.state import center_poses
 

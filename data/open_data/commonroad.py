@@ -17,12 +17,12 @@ from lxml import etree
 from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, clean_line
+from shiftsim.data.open_data.scenes import REPAIR, LightStates, Scene
+from shiftsim.data.open_data.tables import naming
 from shiftsim.data.opendrive.areas import drivable_tiles
 from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.data.tracks.scenes import REPAIR, LightStates, Scene
-from shiftsim.data.tracks.tables import naming
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind, LightStatus

@@ -7,11 +7,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import shiftsim
+from shiftsim.data.open_data.av2 import Av2Reader
+from shiftsim.data.open_data.commonroad import CommonRoadReader
+from shiftsim.data.open_data.scenes import convert_scenes
 from shiftsim.data.opendrive.check import check_map
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.tracks.av2 import Av2Reader
-from shiftsim.data.tracks.commonroad import CommonRoadReader
-from shiftsim.data.tracks.scenes import convert_scenes
 from shiftsim.world.state import AgentKind, center_poses
 
 READERS = {"av2": Av2Reader(), "commonroad": CommonRoadReader()}
