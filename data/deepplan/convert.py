@@ -63,7 +63,8 @@ class _Done(NamedTuple):
     death: str = ""
 
 
-def _one_by_one(make: Make, tasks: Sequence[str]) -> Iterator[_Done]:
+def one_by_one(make: Make, tasks: Sequence[str]) -> Iterator[_Done]:
+    """What `Spread` means, in this process."""
     function = make()
     yield from (_Done(task, function(task)) for task in tasks)
 
@@ -96,7 +97,7 @@ def convert_dsc3d(
     map_path: Path | None = None,
     options: ConversionConfig | None = None,
     progress: Progress | None = None,
-    spread: Spread = _one_by_one,
+    spread: Spread = one_by_one,
 ) -> ConversionReport:
     """Convert a DSC3D download to scenarios in a store.
 

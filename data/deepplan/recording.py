@@ -13,7 +13,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.route import find_route, nearest_lane
-from shiftsim.data.deepplan.states import ego_trace, resample, sample_runs
+from shiftsim.data.deepplan.states import ROW_US, ego_trace, resample, sample_runs
 from shiftsim.data.deepplan.windows import (
     EGO,
     LANE,
@@ -27,6 +27,7 @@ from shiftsim.data.deepplan.windows import (
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import FULL_DURATION, duration_class
 from shiftsim.world.state import rear_poses
 
 SCENARIO_TYPE = "deepplan"
@@ -217,6 +218,7 @@ class _Conversion:
                 "size_m": source.sizes[track].tolist(),
                 "driven_blocks": route.num_driven,
                 "padded_history_s": max(0.0, config.padding_s - start_s),
+                **_duration_note(end - start),
             },
         )
 
@@ -225,3 +227,9 @@ class _Conversion:
         low, high = bounds[:, :2].min(axis=0) - _MAP_MARGIN, bounds[:, 2:].max(axis=0) + _MAP_MARGIN
         xy = self.source.centers[:, :2] + self.offset
         return int(((xy < low) | (xy > high)).any(axis=1).sum())
+
+
+def _duration_note(rows: int) -> dict[str, object]:
+    """What the metadata of a scenario of so many rows says of its duration, if it is short."""
+    found = duration_class(np.arange(0, rows, 2) * ROW_US)
+    return {} if found == FULL_DURATION else {"duration_class": found}

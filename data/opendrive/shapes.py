@@ -80,7 +80,7 @@ class Shapes:
     def joined_borders(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
         """Borders of a chain of pieces; ends that nearly meet become one vertex."""
         left, right = zip(*map(self.borders, pieces), strict=True)
-        return _join(left), _join(right)
+        return join_lines(left), join_lines(right)
 
     def centers(self, piece: Piece, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
@@ -109,7 +109,7 @@ class Shapes:
             shifts[0] = (start - firsts[0][0], shifts[0][1])
         if end is not None:
             shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
-        return _divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
+        return divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
 
     def _without_steps(self, piece: Piece) -> list[Piece]:
         """The piece, cut where the middle of the lane jumps."""
@@ -145,7 +145,7 @@ class Shapes:
         return out[0], out[1]
 
 
-def _divide(dense: FloatArray) -> FloatArray:
+def divide(dense: FloatArray) -> FloatArray:
     """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
     steps = np.diff(dense, axis=0)
     lengths = np.hypot(*steps.T)
@@ -212,7 +212,8 @@ def _ramp(x: FloatArray) -> FloatArray:
     return 1.0 - x**3 * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _join(lines: Sequence[FloatArray]) -> FloatArray:
+def join_lines(lines: Sequence[FloatArray]) -> FloatArray:
+    """One line of lines (K, 2) that follow each other; ends that nearly meet become one vertex."""
     out = [lines[0]]
     for line in lines[1:]:
         if np.hypot(*(out[-1][-1] - line[0])) < CHORD_ERROR:

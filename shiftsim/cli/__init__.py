@@ -231,7 +231,7 @@ _COMMANDS = {
     "stats": "stores:show_stats",
     "split": "stores:make_split",
     "planners": "planners:app",
-    "convert": "convert:app",
+    "convert": "open_data:app",
     "export": "stores:export",
     "checkpoint": "planners:checkpoint",
 }

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from shiftsim.data.tracks.convert import Looked
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
-_DATA, _PARTIAL, _INTERRUPTED = 2, 3, 130
+_DATA, PARTIAL, _INTERRUPTED = 2, 3, 130
 
 
 Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
-_MAX_NAMED = 20
+MAX_NAMED = 20
 
 
 @app.command()
@@ -68,14 +68,14 @@ def nuplan(
     else:
         for flaw, count in report.flaws.items():
             say(f" tolerated: {flaw} ({count})")
-        for token, reason in list(report.failed.items())[:_MAX_NAMED]:
+        for token, reason in list(report.failed.items())[:MAX_NAMED]:
             say(f" failed: {token}: {reason}")
         say(
             f" {plural(len(report.converted), 'scenario')} converted, "
             f"{len(report.unchanged)} unchanged, {len(report.failed)} failed → {folder}"
         )
     if report.failed:
-        raise typer.Exit(_PARTIAL)
+        raise typer.Exit(PARTIAL)
 
 
 def _token_list(text: str) -> list[str]:
@@ -165,10 +165,7 @@ def dsc3d(
                 spread=partial(map_unordered, workers=count),
             )
         except KeyboardInterrupt:
-            again = shlex.join(["shiftsim", *sys.argv[1:]])
-            typer.echo("error: interrupted", err=True)
-            typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
-            raise typer.Exit(_INTERRUPTED) from None
+            raise interrupted() from None
     if as_json:
         from dataclasses import asdict
 
@@ -180,7 +177,7 @@ def dsc3d(
         say(f" {plural(report.accepted, 'scenario')} → {folder}")
         say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
     if report.skipped:
-        raise typer.Exit(_PARTIAL)
+        raise typer.Exit(PARTIAL)
 
 
 @app.command()
@@ -274,6 +271,14 @@ def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None
         typer.echo(f" no picture: {error} ({error.hint})", err=True)
     else:
         typer.echo(f" picture: {path}", err=True)
+
+
+def interrupted() -> typer.Exit:
+    """What ends a conversion that was stopped by hand."""
+    again = shlex.join(["shiftsim", *sys.argv[1:]])
+    typer.echo("error: interrupted", err=True)
+    typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
+    return typer.Exit(_INTERRUPTED)
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:

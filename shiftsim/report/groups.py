@@ -7,7 +7,9 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +21,7 @@ from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.tables import Estimate
 from shiftsim.runs.results import Run
 from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.world.scenario import FULL_DURATION
 
 COLUMNS = {"cls": "CLS"} | {n: short for n, short in SHORT_NAMES.items() if n != "score"}
 TRAFFIC = {"nonreactive": "NR", "reactive": "R"}
@@ -51,6 +54,7 @@ class DataSet:
     cities: tuple[str, ...]  # (N,) city of each, empty where no rollout finished
     recordings: tuple[str, ...]  # (N,) recording of each
     types: tuple[str, ...]  # (N,) type of each
+    durations: tuple[str, ...]  # (N,) class of duration of each
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -80,6 +84,25 @@ class DataSet:
     def within(self, city: str) -> BoolArray:
         """(N,) scenarios of a city, and those that could be because nothing is known of them."""
         return np.array([name in (city, "") for name in self.cities], np.bool_)
+
+    def parts(self) -> list[tuple["DataSet", BoolArray]]:
+        """The scenarios of each class of duration, as a set of its own, and (N,) which they are.
+
+        Scores of short scenarios are others (`docs/open_data.md`). One of unknown duration belongs
+        to each part, so that no part of an incomplete set looks complete.
+        """
+        classes = sorted(set(self.durations) - {""}, key=lambda name: (len(name), name))
+        if not set(classes) - {FULL_DURATION}:
+            return [(self, np.ones(len(self.tokens), np.bool_))]
+        return [self._part(name) for name in classes]
+
+    def _part(self, duration: str) -> tuple["DataSet", BoolArray]:
+        chosen = np.array([name in (duration, "") for name in self.durations], np.bool_)
+        columns = ("tokens", "cities", "recordings", "types", "durations")
+        kept: dict[str, Any] = {
+            name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns
+        }
+        return replace(self, label=f"{self.label}, {duration}", **kept), chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +251,9 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
             row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
             values[row_seeds, places[rows].astype(np.int64)] = table[rows]
             mode, name = TRAFFIC.get(traffic, traffic), labels.get(planner, planner)
-            yield Group(run, data, mode, name, noise, tuple(seeds.tolist()), values)
+            for part, chosen in data.parts():
+                part_values = values[:, chosen]
+                yield Group(run, part, mode, name, noise, tuple(seeds.tolist()), part_values)
 
 
 def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:
@@ -266,6 +291,7 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
         controller=str(determining["controller"]),
         tokens=tokens,
         cities=_of_tokens(run.scores, "city", tokens),
+        durations=_of_tokens(run.scores, "duration_class", tokens),
         recordings=_of_tokens(run.scores, "log_name", tokens),
         types=_of_tokens(run.tasks, "scenario_type", tokens),
     )

@@ -203,6 +203,7 @@ def summary(run: Run) -> dict[str, Any]:
         "counts": manifest["counts"],
         "scores": [
             {
+                "set": group.data.label,
                 "planner": row.labels[0],
                 "noise": row.labels[1],
                 "scenarios": row.num_scenarios,
@@ -213,7 +214,8 @@ def summary(run: Run) -> dict[str, Any]:
                 "std_over_seeds": row.deviations if row.is_complete else None,
                 "partial_mean": None if row.is_complete else row.means,
             }
-            for row in score_rows(run)
+            for group in read_groups([run])
+            for row in _score_rows(group, None)
         ],
         "failures": failures(run),
     }

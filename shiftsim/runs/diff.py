@@ -15,6 +15,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
 _KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
@@ -68,7 +69,8 @@ class Difference:
     worse: int  # rollouts that are worse in it
     only_first: int  # rollouts that finished in the first run alone
     only_second: int  # rollouts that finished in the second run alone
-    means: tuple[float, float]  # mean score of the common rollouts in both runs
+    # mean score of the common rollouts in both runs; None where their durations differ
+    means: tuple[float, float] | None
     changes: tuple[Change, ...]  # the rollouts that changed most
 
     def to_dict(self) -> dict[str, Any]:
@@ -112,6 +114,7 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
         _change(first, second, common[i], names[common[i].planner], ours, paired)
         for i in changed[:limit]
     ]
+    durations = {ours[task]["duration_class"] or FULL_DURATION for task in common}
     before_by, after_by = (run.manifest["determining"] for run in (first, second))
     settings = sorted({*before_by, *after_by})
     return Difference(
@@ -121,19 +124,22 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
         worse=int(np.sum(after < before)),
         only_first=len(ours) - len(common),
         only_second=len(theirs) - len(common),
-        means=(float(before.mean()), float(after.mean())),
+        means=(float(before.mean()), float(after.mean())) if len(durations) == 1 else None,
         changes=tuple(changes),
     )
 
 
 def diff_lines(found: Difference) -> list[str]:
     """Two runs compared, in words."""
-    before, after = (100.0 * mean for mean in found.means)
+    means = "– (scenarios of different durations)"
+    if found.means is not None:
+        before, after = (100.0 * mean for mean in found.means)
+        means = f"{before:.2f} → {after:.2f}"
     lone = f" · only in one run {found.only_first} and {found.only_second}"
     lines = [
         f" same {found.same} · better {found.better} · worse {found.worse}"
         f"{lone if found.only_first or found.only_second else ''}"
-        f"      CLS of the common ones {before:.2f} → {after:.2f}"
+        f"      CLS of the common ones {means}"
     ]
     if found.settings:
         lines.append(f" settings that differ: {', '.join(found.settings)}")

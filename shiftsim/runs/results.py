@@ -63,6 +63,7 @@ TABLES = {
         {
             **_KEY,
             **dict.fromkeys(("scenario_type", "city", "log_name", "traffic"), _TEXT),
+            "duration_class": _TEXT,
             "cls": _NUMBER,
             **dict.fromkeys((name for name in SHORT_NAMES if name != "score"), _NUMBER),
             "degraded_steps": _WHOLE,
@@ -86,7 +87,7 @@ TABLES = {
         }
     ),
 }
-
+ADDED = {"duration_class"}  # columns that older runs lack
 
 _RANGES = {  # by column
     **dict.fromkeys(("cls", *SHORT_NAMES), "score"),
@@ -243,11 +244,16 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
     try:
         file = pq.ParquetFile(path)
         found = {column.name: column.type for column in file.schema_arrow}
+        lacking = [column for column in ADDED & set(TABLES[path.stem].names) if column not in found]
         for column in TABLES[path.stem]:
+            if column.name in lacking:
+                continue
             if found.get(column.name) != column.type:
                 raise _damaged(path, f"column {column.name!r} is missing or not {column.type}")
         for batch in file.iter_batches(batch_size=4096):
             batch.validate(full=True)  # that texts are UTF-8
+            for name in lacking:
+                batch = batch.append_column(name, pa.nulls(len(batch), _TEXT))
             for name in set(_RANGES) & set(batch.schema.names):
                 values = batch[name].drop_null().to_numpy()
                 require(RUN, _RANGES[name], values, f"{path}: column {name!r} as")
@@ -261,7 +267,9 @@ def _damaged(path: Path, what: str) -> DataError:
 
 
 def _read(path: Path) -> pa.Table:
-    return pa.Table.from_batches(_batches(path), TABLES[path.stem])
+    schema = TABLES[path.stem]
+    batches = (batch.select(schema.names) for batch in _batches(path))
+    return pa.Table.from_batches(batches, schema)
 
 
 def open_run(path: str | Path) -> Run:

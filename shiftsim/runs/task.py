@@ -227,6 +227,7 @@ def score_rollout(
     scores = {
         "scenario_type": scenario.scenario_type,
         "city": scenario.city,
+        "duration_class": scenario.duration_class,
         "log_name": scenario.log_name,
         "traffic": config.traffic,
         "cls": result.score,

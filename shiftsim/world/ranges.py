@@ -125,6 +125,20 @@ DSC3D: Table = {
     **_same("frame_distance", 1, 1e6, "frames"),
 }
 
+# what open data sets say of tracks and lanes, whatever their files call it
+OPEN_DATA: Table = {
+    **_same("position", -1e8, 1e8, "m"),
+    **_same("heading", -1e3, 1e3, "rad"),
+    **_same("rotation", -1.1, 1.1),  # parts of a quaternion
+    **_same("velocity", -1e4, 1e4, "m/s"),  # one that does not fit the positions is not believed
+    **_same("size", 1e-3, 500, "m"),
+    **_same("speed limit", 0, 1e3, "m/s"),
+    **_same("step", -1e9, 1e9),
+    **_same("step length", 1e-3, 1e3, "s"),
+    "time": _TIME,
+    "time_ns": Range(-(2.0**65), 2.0**65, "ns"),
+}
+
 # columns of a nuPlan log; what is outside is a warning
 NUPLAN_LOG: Table = {
     **_same("ego_pose x, ego_pose y, lidar_box x, lidar_box y", -1e8, 1e8, "m"),
@@ -194,6 +208,7 @@ SETTINGS: Table = {
 FORMATS: Mapping[str, Table] = {
     "OpenDRIVE": {**OPENDRIVE, **MAP_EXTENT},
     "DSC3D": DSC3D,
+    "Open data sets": OPEN_DATA,
     "nuPlan log": NUPLAN_LOG,
     "nuPlan map": {**NUPLAN_MAP, **MAP_EXTENT},
     "Store": STORE,

@@ -7,9 +7,24 @@ and learned targets that look into the recorded future.
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from shiftsim.arrays import FloatArray, IntArray, sealed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
+
+FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks
+_FULL_S = 14.9  # s; 150 iterations
+
+
+def duration_class(time_us: IntArray) -> str:
+    """Class of a scenario whose iterations are at these times (T,) [us], such as `8 s`.
+
+    Scores of different classes do not compare: `15 s` and longer, or the whole seconds of a shorter
+    one.
+    """
+    seconds = float(time_us[-1] - time_us[0]) * 1e-6
+    return FULL_DURATION if seconds >= _FULL_S - 0.05 else f"{np.floor(seconds + 0.05):.0f} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +94,11 @@ class Scenario:
     def iteration_times(self) -> IntArray:
         """(T,) time stamps of the iterations [us]."""
         return self.time_us[self.iteration_rows]
+
+    @property
+    def duration_class(self) -> str:
+        """Scenarios of one class may stand in one mean: `15 s`, or shorter, such as `8 s`."""
+        return duration_class(self.iteration_times)
 
     @property
     def expert(self) -> FloatArray:

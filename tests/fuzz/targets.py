@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import dsc3d_writer
 import numpy as np
+import open_data_files
 import opendrive_xml
 from places import GOLDEN
 from stores import write_toy_store
@@ -179,6 +180,24 @@ def _read_site(folder: Path) -> Any:
     short = ConversionConfig(window_s=4.0, overlap_s=1.0, history_s=1.0, min_drivable_share=0.0)
     convert_dsc3d(folder, folder / "store", options=short)
     return site, recordings, _read_store(folder / "store")
+
+
+def _open_data(folder: Path) -> None:
+    open_data_files.write_av2(folder / "av2")
+    open_data_files.write_commonroad(folder / "commonroad")
+    open_data_files.write_py123d(folder / "py123d")
+
+
+def _read_open_data(folder: Path) -> Any:
+    from shiftsim.data.open_data.av2 import Av2Reader
+    from shiftsim.data.open_data.commonroad import CommonRoadReader
+    from shiftsim.data.open_data.py123d import Py123dReader
+    from shiftsim.data.open_data.scenes import convert_scene
+
+    readers = {"*.parquet": Av2Reader(), "*.xml": CommonRoadReader(), "*.arrow": Py123dReader()}
+    reader = next(r for pattern, r in readers.items() if any(folder.rglob(pattern)))
+    made = [convert_scene(reader.read(path)) for path in reader.find(folder)]
+    return [(one.road, one.converted.egos, one.converted.windows) for one in made]
 
 
 def _stores(folder: Path) -> None:
@@ -350,6 +369,7 @@ TARGETS = {
     "nuplan-log": Target(_logs, _read_log),
     "nuplan-map": Target(_packages, _read_package),
     "dsc3d": Target(_sites, _read_site, "*.[jp]*"),
+    "open-data": Target(_open_data, _read_open_data, "*.[ajpx]*"),
     "store": Target(_stores, _read_store),
     "run-folder": Target(_runs, _read_run),
     "checkpoint": Target(_checkpoints, _read_checkpoint),

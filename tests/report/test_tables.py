@@ -4,6 +4,7 @@ import csv
 import io
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from made_runs import random_scores, write_run
 
@@ -13,8 +14,11 @@ from shiftsim.report.build import TABLES, Options, make_tables, write_report
 from shiftsim.report.details import planner_comparison, planning_times, scenario_types
 from shiftsim.report.groups import KnownSet, read_groups, token_digest
 from shiftsim.report.paper import noise_robustness, semantic_shift
+from shiftsim.report.scores import score_table, scores, summary
 from shiftsim.report.tables import Number, Table, shown
 from shiftsim.report.writers import latex_escape, markdown_escape, render
+from shiftsim.runs.diff import diff_lines, diff_runs
+from shiftsim.runs.results import open_run
 
 TOKENS = ("t0", "t1", "t2", "t3")
 
@@ -321,3 +325,51 @@ def test_a_report_is_a_folder_with_a_file_per_format(tmp_path):
         text = (tmp_path / "out" / f"report.{ending}").read_text("utf-8")
         assert "thresholds nuplan" in text
         assert "Noise robustness" in text
+
+
+# --- durations
+
+
+def test_scenarios_of_different_durations_never_share_a_mean(tmp_path):
+    score = random_scores(1)
+    run = write_run(tmp_path / "a", score=score, durations=("15 s", "8 s", "8 s", "15 s"))
+    table = scores(read_groups([run]))
+    values = [100.0 * score("alpha", "none", 0, number) for number in range(4)]
+    full = cells(table, "made-up, 15 s", "NR", "alpha")
+    short = cells(table, "made-up, 8 s", "NR", "alpha")
+    assert full["CLS"] == f"{np.mean([values[0], values[3]]):.2f}"
+    assert short["CLS"] == f"{np.mean(values[1:3]):.2f}"
+    assert len(table.rows) == 2
+    assert [row["set"] for row in summary(run)["scores"]] == ["made-up, 8 s", "made-up, 15 s"]
+
+
+def test_short_scenarios_alone_are_labelled(tmp_path):
+    run = write_run(tmp_path / "a", durations=["8 s"] * 4)
+    assert "split made-up, 8 s (4 scenarios)" in score_table([run])
+
+
+def test_a_rollout_of_unknown_duration_withholds_every_class(tmp_path):
+    durations = ("15 s", "8 s", "8 s", "15 s")
+    lost = {("alpha", "none", 0, "t0")}
+    run = write_run(tmp_path / "a", durations=durations, missing=lost)
+    table = scores(read_groups([run]))
+    assert cells(table, "made-up, 8 s")["CLS"] == "– (2/3 done)"
+    assert cells(table, "made-up, 15 s")["CLS"] == "– (1/2 done)"
+
+
+def test_runs_without_durations_are_read_as_before(tmp_path):
+    run = write_run(tmp_path / "a")
+    path = run.path / "scores.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["duration_class"]), path)
+    old = open_run(run.path)
+    assert old.scores["duration_class"].null_count == 4
+    assert score_table([old]) == score_table([write_run(tmp_path / "b")])
+
+
+def test_a_diff_of_different_durations_gives_no_mean(tmp_path):
+    runs = [
+        write_run(tmp_path / name, durations=("15 s", "8 s", "8 s", "15 s")) for name in ("a", "b")
+    ]
+    found = diff_runs(*runs)
+    assert (found.means, found.same) == (None, 4)
+    assert "CLS of the common ones –" in diff_lines(found)[0]
