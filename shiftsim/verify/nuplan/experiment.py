@@ -152,7 +152,7 @@ def _verify_results(path: Path, challenge: str, find: FindScenario, report: Repo
     runner = _read(path, "runner_report", "scenario_name", report)
     logs, tables = find_simulation_logs(path), {**metrics, **scores, **runner}
     listed: list[Iterable[Key]] = [*tables.values(), logs]
-    left_out, known = set[str](), {*metrics}
+    left_out, known = set[str](), set[str]()
     for token, planner in dict.fromkeys(key for keys in listed for key in keys):
         run, scenario = Run(challenge, token, planner), find(token)
         if scenario is None:
@@ -171,12 +171,13 @@ def _verify_results(path: Path, challenge: str, find: FindScenario, report: Repo
                 report.skip(f"{run}: no simulation log, and a planner that shiftsim has not")
                 continue
             result = judge(measure(rollout, scenario.map))
-            known &= {*result.scores}
+            known |= {*result.scores}
             _compare_result(run, result, metrics, scores, report)
-    for name in sorted({*metrics} - known):
-        report.skip(f"metric {name}: shiftsim has none of this name")
-        del tables[name]
-    _finish(path, tables.values(), left_out, report)
+    if known:  # else no run could be compared, and each is named already
+        for name in sorted({*metrics} - known):
+            report.skip(f"metric {name}: shiftsim has none of this name")
+            del tables[name]
+        _finish(path, tables.values(), left_out, report)
 
 
 def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, Groups]:
@@ -363,8 +364,7 @@ def _finish(path: Path, tables: Collection[Groups], left_out: set[str], report: 
         labels = _LABELS & set(table.table)
         labels |= {name for name in table.table if "_runtimes_" in name or "_stat_" in name}
         table.table.used.update(labels)
-        if any(table[key].num_rows for key in table):
-            table.table.finish()
+        table.table.finish()
     if len(report.not_covered) > count:
         report.note(OTHER_VERSION)
     report.note("tables: names of classes and files; when a run began; times of other planners")

@@ -7,14 +7,14 @@ and named.
 
 import gc
 import lzma
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
 from struct import error as StructError
-from struct import unpack
+from struct import pack, unpack
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,9 @@ class _Record:
 
 def _known_names() -> Callable[[str, str], Any]:
     """All that a log may name; fresh for every log, for it might write into what it is given."""
-    known: dict[str, Any] = {name: type(name, (_Record,), {}) for name in (*_CLASSES, "scalar")}
+    known: dict[str, Any] = {
+        name: type(name, (_Record,), {}) for name in (*_CLASSES, "scalar", "_frombuffer")
+    }
     # the state of a type of NumPy is no table of attributes
     known["dtype"] = type("dtype", (_Record,), {"__setstate__": lambda record, state: None})
     return lambda module, name: (
@@ -193,6 +195,8 @@ def _columns(records: Sequence[Any], paths: Mapping[str, str]) -> dict[str, Any]
 def _egos(states: Sequence[Any]) -> dict[str, Any]:
     """Columns of ego states; what the devkit computes when it is asked for is there in any case."""
     found = _columns(states, _EGO)
+    for name in ("velocity", "acceleration"):
+        _agreeing(_values(states, f"{_MOTION}._rear_axle_{name}_2d"))
     rear = rear_poses(np.column_stack([found[name] for name in CENTER_COLUMNS]))
     found["speed"] = np.hypot(found["vx"], found["vy"])
     found["acceleration"] = np.hypot(found["ax"], found["ay"])
@@ -209,7 +213,7 @@ def _egos(states: Sequence[Any]) -> dict[str, Any]:
 def _objects(samples: Sequence[Any]) -> dict[str, Any]:
     iteration, flat = _flat(samples, "observation.tracked_objects.tracked_objects")
     # agents have another name for it than what stands
-    moves = [vars(one).get("_velocity") or one.velocity for one in flat]
+    moves = _agreeing(vars(one).get("_velocity") or one.velocity for one in flat)
     kinds = [AgentKind(one._tracked_object_type.arguments[0]).name for one in flat]
     columns = {**_columns(moves, {"vx": "_x", "vy": "_y"}), **_columns(flat, _OBJECT)}
     return {"iteration": iteration, "type": np.array(kinds), **columns}
@@ -219,6 +223,15 @@ def _lights(samples: Sequence[Any]) -> dict[str, Any]:
     iteration, flat = _flat(samples, "traffic_light_status")
     status = [LightStatus(one.status.arguments[0]).name for one in flat]
     return {"iteration": iteration, "status": np.array(status), **_columns(flat, _LIGHT)}
+
+
+def _agreeing(vectors: Iterable[Any]) -> list[Any]:
+    """Vectors, each of which is in a log twice."""
+    out = list(vectors)
+    for one, x, y in zip(out, _values(out, "_x"), _values(out, "_y"), strict=True):
+        if isinstance(one._array, _Record) and one._array.arguments[0] != pack("<2d", x, y):
+            raise ValueError(f"a vector has two values, one of which is ({x}, {y})")
+    return out
 
 
 def _flat(samples: Sequence[Any], path: str) -> tuple[IntArray, list[Any]]:
