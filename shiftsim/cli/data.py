@@ -43,5 +43,5 @@ def _lines(found: "Stock") -> Iterator[str]:
         reference = row["reference"] or "missing"
         yield f" {row['track']:15} {row['planner']:18} {reference:16} {own:16} {ready}"
     yield "missing" if missing else "nothing is missing"
-    for what, lack in missing.items():
-        yield f" {what}: {lack['get']} ({lack['page']})"
+    for what, gap in missing.items():
+        yield f" {what}: {gap['get']} ({gap['page']})"
