@@ -39,7 +39,8 @@ ARGS_HINT = "use the args.json that was published with the checkpoint"
 _WRITTEN_HINT = "give the checkpoint that the training wrote"
 # what content of any kind makes code raise that takes it for granted
 MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-_BROKEN = (*MISFIT, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, ImportError, MemoryError)
+# what reading a damaged file raises
+BROKEN = (*MISFIT, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, ImportError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +100,7 @@ def _read_safetensors(path: Path) -> Contents:
         with safe_open(path, framework="pt", device="cpu") as file:
             entries = {name: file.get_tensor(name) for name in file.keys()}
             return Contents("safetensors", entries, dict(file.metadata() or {}))
-    except (SafetensorError, *_BROKEN) as error:
+    except (SafetensorError, *BROKEN) as error:
         raise _damaged(path, error) from error
 
 
@@ -112,7 +113,7 @@ def _read_zip(path: Path) -> Contents:
             return _load(path, "torch zip") or _read_tensors(archive, root, path)
     except CheckpointError:
         raise
-    except (*_BROKEN, OSError) as error:
+    except (*BROKEN, OSError) as error:
         raise _damaged(path, error) from error
 
 
@@ -188,17 +189,19 @@ def _damaged(path: Path, error: BaseException) -> CheckpointError:
     return CheckpointError(f"checkpoint {str(path)!r} is damaged: {text}", hint=_TORCH_HINT)
 
 
-class _Inert(dict[Any, Any]):
+class Inert(dict[Any, Any]):
     """In the place of an object of a foreign class: takes everything, does nothing."""
 
-    def __new__(cls, *_args: object, **_named: object) -> "_Inert":
+    def __new__(cls, *_args: object, **_named: object) -> "Inert":
+        """Another one, whatever it is made with."""
         return dict.__new__(cls)
 
     def __init__(self, *_args: object, **_named: object) -> None:
         super().__init__()
 
-    def __call__(self, *_args: object, **_named: object) -> "_Inert":
-        return _Inert()
+    def __call__(self, *_args: object, **_named: object) -> "Inert":
+        """Another one, as what is in its place may be called."""
+        return Inert()
 
     def _ignore(self, _anything: object) -> None:
         pass
@@ -208,24 +211,36 @@ class _Inert(dict[Any, Any]):
     __eq__ = object.__eq__
 
 
-class _TensorReader(pickle.Unpickler):
-    """Unpickles tensors and plain containers; all that they name is looked up in a short table."""
+class PlainReader(pickle.Unpickler):
+    """Reads a pickle; of what it names only that which is known is there, the rest is inert.
 
-    def __init__(self, file: Any, archive: zipfile.ZipFile, root: str) -> None:
+    Nothing that the file names is imported, and nothing is called but what is known.
+    """
+
+    def __init__(self, file: Any, known: Callable[[str, str], Any]) -> None:
+        """`known` gives what a module and a name stand for, None where they are foreign."""
         super().__init__(file, encoding="utf-8")
         self.foreign: set[str] = set()
-        self._archive = archive
-        self._root = root
-        self._storages: dict[str, Any] = {}
-        self._known = _known_names()
+        self._known = known
 
     def find_class(self, module: str, name: str) -> Any:
         """What a name in the file stands for: something known, or something inert."""
-        known = self._known.get((module, name))
+        known = self._known(module, name)
         if known is None:
             self.foreign.add(f"{module}.{name}")
-            return type("Inert", (_Inert,), {})
+            return type("Inert", (Inert,), {})
         return known
+
+
+class _TensorReader(PlainReader):
+    """Reads tensors and plain containers."""
+
+    def __init__(self, file: Any, archive: zipfile.ZipFile, root: str) -> None:
+        names = _known_names()
+        super().__init__(file, lambda module, name: names.get((module, name)))
+        self._archive = archive
+        self._root = root
+        self._storages: dict[str, Any] = {}
 
     def persistent_load(self, pid: Any) -> Any:
         """A storage as a flat tensor on the CPU, wherever it was saved from."""
@@ -233,7 +248,7 @@ class _TensorReader(pickle.Unpickler):
 
         _, dtype, key, _, count = pid
         if not isinstance(dtype, torch.dtype):
-            return _Inert()
+            return Inert()
         if key not in self._storages:
             info = self._archive.getinfo(f"{self._root}/data/{key}")
             if info.compress_type != zipfile.ZIP_STORED or info.file_size < count * dtype.itemsize:
@@ -263,7 +278,7 @@ def _known_names() -> dict[tuple[str, str], Any]:
 
 
 def _tensor(flat: Any, offset: int, size: Any, stride: Any, *_: object) -> Any:
-    if isinstance(flat, _Inert):
+    if isinstance(flat, Inert):
         return flat
     return flat.as_strided(tuple(size), tuple(stride), offset)
 
@@ -274,7 +289,7 @@ def _first(data: Any, *_: object) -> Any:
 
 def _call_known(function: Callable[..., Any], _kind: object, arguments: Any, _state: object) -> Any:
     """A tensor with attributes: the tensor alone."""
-    return function(*arguments) if function in (_tensor, _first) else _Inert()
+    return function(*arguments) if function in (_tensor, _first) else Inert()
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -224,6 +224,7 @@ _COMMANDS = {
     "check": "stores:check",
     "verify": "doctor:verify",
     "doctor": "doctor:doctor",
+    "data": "data:data",
     "view": "viewing:view",
     "plot": "viewing:plot",
     "inspect": "viewing:inspect",

@@ -20,6 +20,12 @@ _DATA = 2
 
 def verify(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
+    experiment: Annotated[
+        bool, typer.Option("--experiment", help="DIR holds what nuPlan's run_simulation.py wrote.")
+    ] = False,
+    store: Annotated[
+        str | None, typer.Option("--store", "-s", help="Store with the scenarios of --experiment.")
+    ] = None,
     mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
     scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
     maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
@@ -28,7 +34,7 @@ def verify(
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """Compare with reference outputs of nuPlan's own code.
+    """Compare with reference outputs of nuPlan's own code, or with results of your own from nuPlan.
 
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).
@@ -39,7 +45,8 @@ def verify(
 
     if mode is not None:
         one_of("mode", mode, MODES)
-    result = compare(folder, mode=mode, scenes=scenes, maps=maps)
+    kind = "experiment" if experiment else None
+    result = compare(folder, kind=kind, mode=mode, scenes=scenes, maps=maps, store=store)
     for line in result.lines():
         say(line)
     raise typer.Exit(result.exit_code(require_all=require_all))

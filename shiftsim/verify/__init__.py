@@ -25,20 +25,29 @@ KINDS = {  # module of `verify_<kind>`, patterns that must all match something (
     "dsc3d_sample": ("dsc3d", "expected_rows.parquet", "data"),
     "dsc3d_synthetic": ("dsc3d", "**/expected_ego_20hz.parquet"),
     "opendrive": ("opendrive", "*.refline.parquet"),
+    "experiment": ("nuplan.experiment", "**/aggregator_metric|**/simulation_log"),
 }
 
 
 def verify(
-    folder: Path, *, mode: str | None = None, scenes: Path | None = None, maps: Path | None = None
+    folder: Path,
+    *,
+    kind: str | None = None,
+    mode: str | None = None,
+    scenes: Path | None = None,
+    maps: Path | None = None,
+    store: str | None = None,
 ) -> Report:
     """Compare everything in a reference folder with what shiftsim computes.
 
     Args:
         folder: Reference folder.
+        kind: Which of `KINDS` it is; by default it is recognised by its content.
         mode: Only runs of this challenge (`NR`, `R` or `PT`); None for all.
         scenes: Folder with the logs and maps that other folders refer to; by default a folder
             `nuplan` beside `folder`.
         maps: Folder with OpenDRIVE maps; by default a folder `maps` beside the parent of `folder`.
+        store: Store with the scenarios of nuPlan's results, by name, path or URL.
 
     Returns:
         The report.
@@ -48,10 +57,10 @@ def verify(
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
-    options = {"mode": mode, "scenes": scenes, "maps": maps}
-    for kind, (module, *patterns) in KINDS.items():
-        if all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns):
-            part = getattr(import_module(f"shiftsim.verify.{module}"), f"verify_{kind}")
+    options = {"mode": mode, "scenes": scenes, "maps": maps, "store": store}
+    for name, (module, *patterns) in KINDS.items():
+        if name == kind or (kind is None and _holds(folder, patterns)):
+            part = getattr(import_module(f"shiftsim.verify.{module}"), f"verify_{name}")
             report, takes = Report(), signature(part).parameters
             part(folder, report, **{name: options[name] for name in options if name in takes})
             return report
@@ -59,3 +68,7 @@ def verify(
         f"{folder}: not recognised as a folder of reference outputs",
         hint=f"known kinds: {', '.join(KINDS)}",
     )
+
+
+def _holds(folder: Path, patterns: list[str]) -> bool:
+    return all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns)

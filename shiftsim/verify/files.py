@@ -210,14 +210,16 @@ class Groups(dict[tuple[str, ...], Source]):
     A file that does not exist is named as not covered.
     """
 
-    def __init__(self, path: Path, report: Report, key: tuple[str, ...] = RUN_KEY) -> None:
+    def __init__(
+        self, table: Path | Source, report: Report, key: tuple[str, ...] = RUN_KEY
+    ) -> None:
         self._asked: set[tuple[str, ...]] = set()
-        if path.is_file():
-            self.table = read_table(path, report)
-            super().__init__(self.table.groups(*key))
-        else:
-            self.table = Source(path.stem, "column", {}, report)
-            report.skip(f"{path.name} is missing")
+        if isinstance(table, Path) and not table.is_file():
+            self.table = Source(table.stem, "column", {}, report)
+            report.skip(f"{table.name} is missing")
+            return
+        self.table = read_table(table, report) if isinstance(table, Path) else table
+        super().__init__(self.table.groups(*key))
 
     def __getitem__(self, key: tuple[str, ...]) -> Source:
         self._asked.add(key)

@@ -9,11 +9,13 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from doc_pages import (
     PAGES,
@@ -50,6 +52,7 @@ MOST_NOT_RUN = 10
 EXAMPLE = re.compile(r"Example:\n +```python\n(.*?)\n +```", re.S)
 NEEDS = {  # of extras and of the dependency group `docs`
     "learned_planners": ("torch", "safetensors"),
+    "nuplan_results": ("msgpack",),
     "training": ("gymnasium",),
     "run_folder": ("duckdb", "pandas", "polars"),
     **dict.fromkeys(("quickstart", "seeing", "state_drift"), ("matplotlib",)),
@@ -94,12 +97,26 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
     shutil.copytree(REPOSITORY / "shiftsim" / "verify" / "reference", folder / "reference")
+    _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
 
         made = write_published(folder / "downloads", "plantf", state_of("plantf"))
         made.rename(made.with_name("planTF.ckpt"))
     return folder
+
+
+def _write_results(folder: Path, golden: Path) -> None:
+    """A result folder of nuPlan, and the scenes it is about; for docs/nuplan_results.md."""
+    shutil.copytree(golden / "nuplan_experiment", folder / "exp")
+    report = pq.read_table(next((folder / "exp").rglob("runner_report.parquet")))
+    (folder / "tokens.txt").write_text("\n".join(report["scenario_name"].to_pylist()))
+    logs = {f"{name}.db" for name in report["log_name"].to_pylist()}
+    with tarfile.open(golden / "nuplan.tar.xz") as archive:
+        for member in archive.getmembers():
+            _, _, member.name = member.name.partition("/")
+            if member.name.startswith("maps/") or Path(member.name).name in logs:
+                archive.extract(member, folder / "scenes", filter="data")
 
 
 def _write_tracks(folder: Path, recording: Path) -> None:

@@ -18,9 +18,9 @@ from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LightStatus
 
-_POSE = np.array([METRES, METRES, RADIANS])
-_POSES = dict.fromkeys(("mission_goal", "expert_goal_state"), _POSE)
-_TOLERANCES = {
+POSE = np.array([METRES, METRES, RADIANS])
+_POSES = dict.fromkeys(("mission_goal", "expert_goal_state"), POSE)
+LOG_TOLERANCES = {
     **dict.fromkeys(("x", "y", "center_x", "center_y"), METRES),
     **dict.fromkeys(("heading", "center_heading"), RADIANS),
 }
@@ -52,9 +52,9 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
             drawn = sorted(planner[9:] for of, planner in scripts if of == name)  # scripted_…
             _compare_facts(entry, meta.each(name)[0], scene, log, drawn)
             for kind in ("iteration", *_EXCERPTS):
-                ego.match((name, kind), _ego(kind, scene), _TOLERANCES)
-            objects.match((name, "NR", "*"), _objects(scene, log), _TOLERANCES)
-            lights.match((name,), _lights(scene))
+                ego.match((name, kind), _ego(kind, scene), LOG_TOLERANCES)
+            objects.match((name, "NR", "*"), _objects(scene, log), LOG_TOLERANCES)
+            lights.match((name,), light_columns(scene))
     for table in (ego, lights):
         table.finish()
     for source in (meta, *listed):
@@ -172,7 +172,8 @@ def _objects(scene: Scenario, log: Log) -> dict[str, Any]:
     return {**object_columns(tracks, *np.nonzero(tracks.valid)), "height": heights}
 
 
-def _lights(scene: Scenario) -> dict[str, Any]:
+def light_columns(scene: Scenario) -> dict[str, Any]:
+    """Lights of every sample that are listed."""
     sampled, lights = scene.iteration_rows[:-1], scene.traffic_lights
     iteration, connector = np.nonzero(lights.status[sampled] != LightStatus.ABSENT)
     status = lights.status[sampled][iteration, connector]

@@ -26,17 +26,17 @@ _TABLES = {
     "time_series": (*RUN_KEY, "metric"),
 }
 # coordinates near 4e6 are spaced 5e-10
-_RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
+RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
 _CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
 # how the devkit files each metric: the category of those that are not of Planning, and the units
 # of scores that have one
-_CATEGORIES = {
+CATEGORIES = {
     **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
     **dict.fromkeys(("ego_jerk", "ego_lon_jerk", "ego_yaw_acceleration"), "Dynamics"),
     **dict.fromkeys(("ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
     **dict.fromkeys(("ego_yaw_rate", "no_ego_at_fault_collisions"), "Dynamics"),
 }
-_UNITS = {
+UNITS = {
     **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
     **dict.fromkeys(("drivable_area_compliance", "time_to_collision_within_bound"), "bool"),
     **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
@@ -92,8 +92,8 @@ def _measure(
     log = replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
     columns, count = worlds.ego_columns(ego), len(logged) - 1
     ours = {"iteration": np.arange(count), "time_us": times[:count]}
-    ours |= {name: columns[name] for name in _RECORDED}
-    rows.match(" ".join(run), ours, _RECORDED, quantity="recorded")
+    ours |= {name: columns[name] for name in RECORDED}
+    rows.match(" ".join(run), ours, RECORDED, quantity="recorded")
     return measure(log, road)
 
 
@@ -150,7 +150,7 @@ def _compare_profile(
     tables["scores"].match(key, {name: [value] for name, value in row.items()}, SCORE_TOLERANCES)
     tables["metrics"].match_keys(key, [(name,) for name in scores])
     for name, score in scores.items():
-        filed = {"category": [_CATEGORIES.get(name, "Planning")], "unit": [_UNITS.get(name)]}
+        filed = {"category": [CATEGORIES.get(name, "Planning")], "unit": [UNITS.get(name)]}
         atol = {"score": SCORE_TOLERANCES.get(name, EXACT)}
         tables["metrics"].match((*key, name), {**filed, "score": [score]}, atol)
     found = result.statistics

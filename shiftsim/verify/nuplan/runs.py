@@ -23,12 +23,11 @@ from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Trajectory
+from shiftsim.world.state import AgentKind, Tracks, Trajectory
 
 EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
 # m, rad, m/s; the README of the folder allows 1e-3 m
 OBJECT_TOLERANCES = {"x": 1e-4, "y": 1e-4, "heading": 1e-5, "vx": 1e-4, "vy": 1e-4}
-PLAN_COLUMNS = EGO_COLUMNS[:8]
 EVERY = 10  # iterations between recorded plans; the last one is recorded as well
 CHALLENGES = {  # controller and traffic
     "NR": ("lqr", "nonreactive"),
@@ -84,20 +83,26 @@ def _load_planner(name: str, scripts: Path) -> Planner:
     return load_planner(kind.replace("_", "-"), args)
 
 
+def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
+    """Objects of every sample in the order of observation, without heights."""
+    listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
+    orders = [listed(tracks.kinds, row) for row in tracks.valid]
+    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
+    return object_columns(tracks, iteration, np.concatenate(orders))
+
+
 def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
-    """Objects in the order of observation.
+    """Objects that reactive traffic shows.
 
     Heights, which shiftsim does not keep, are of vehicles as in the first frame of the log, of
     others as in the same one.
     """
-    tracks, columns = log.tracks, ("iteration", "track_token", "height")
+    columns = ("iteration", "track_token", "height")
     logged = zip(*(replayed[name].tolist() for name in columns), strict=True)
     heights = {(iteration, token): height for iteration, token, height in logged}
-    orders = [order_observed(tracks.kinds, row) for row in tracks.valid]
-    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
-    track = np.concatenate(orders)
-    ours = object_columns(tracks, iteration, track)
-    first = np.where(tracks.kinds[track] == AgentKind.VEHICLE, 0, iteration).tolist()
+    ours = observed_columns(log.tracks, "R")
+    is_vehicle = np.array(ours["type"]) == AgentKind.VEHICLE.name
+    first = np.where(is_vehicle, 0, ours["iteration"]).tolist()
     pairs = zip(first, ours["track_token"], strict=True)
     return {**ours, "height": [heights.get(pair, np.nan) for pair in pairs]}
 
@@ -121,7 +126,10 @@ def verify_planners(
             if not egos[key].num_rows:
                 raise DataError("no ego states of this run are recorded")
             seen = Seen(scenes[scene], egos[key], objects[key], challenge)
-            _plan_again(" ".join(key), load_planner(spec), seen, plans[key])
+            recorded, last = plans[key]["iteration"].tolist(), len(seen.ego) - 1
+            due = sorted({*range(0, last + 1, EVERY), last})
+            report.compare("plan iterations", " ".join(key), due, sorted(set(recorded)))
+            plan_again(" ".join(key), spec, seen, plans[key])
     plans.finish(mode)
 
 
@@ -144,16 +152,15 @@ class Seen:
         return observe_log(self.scenario, iteration, ego=ego, tracks=tracks, samples=1)
 
 
-def _plan_again(where: str, planner: Planner, seen: Seen, rows: Source) -> None:
-    recorded, last = rows["iteration"], len(seen.ego) - 1
-    due = sorted({*range(0, last + 1, EVERY), last})
-    rows.report.compare("plan iterations", where, due, sorted(set(recorded.tolist())))
+def plan_again(where: str, spec: str, seen: Seen, rows: Source) -> None:
+    """Compare the recorded plans, a row per state, with those of our planner."""
+    recorded, planner = rows["iteration"], load_planner(spec)
     planner.reset(scene_info(seen.scenario, planner=planner))
-    name = rows["planner"][0]
     for iteration in sorted({0, *recorded.tolist()}):
         plan = planner.plan(seen.at(iteration))
         if iteration in recorded and isinstance(plan, Trajectory):
             ours = {"index": np.arange(len(plan.time_us)), "time_us": plan.time_us}
-            ours |= dict(zip(PLAN_COLUMNS, plan.states.T, strict=False))
-            here = rows.at(recorded == iteration)
-            here.match(f"{where} iteration {iteration}", ours, TOLERANCE, quantity=f"{name} plan")
+            columns = dict(zip(EGO_COLUMNS, plan.states.T, strict=True))
+            ours |= {name: values for name, values in columns.items() if name in rows}
+            here, at = rows.at(recorded == iteration), f"{where} iteration {iteration}"
+            here.match(at, ours, TOLERANCE, quantity=f"{spec} plan")
