@@ -234,6 +234,7 @@ _COMMANDS = {
     "convert": "convert:app",
     "export": "stores:export",
     "checkpoint": "planners:checkpoint",
+    "train": "training:app",
 }
 
 

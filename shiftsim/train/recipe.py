@@ -1,0 +1,220 @@
+"""Training CaRL's network by imitation of PDM-Closed, in rounds (DAgger).
+
+A round collects states, first those that PDM-Closed meets under noise, then those that the network
+meets; PDM-Closed labels all of them. It trains on the states of all rounds so far, and drives in
+towns that are left out. What was done is kept at least every two minutes.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import torch
+
+from shiftsim.errors import CheckpointError
+from shiftsim.files import whole_file
+from shiftsim.planners.learned.device import resolve_device
+from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.train.curves import Say, draw_curves, write_table
+from shiftsim.train.jobs import Towns, collect, divide, mean_scores
+from shiftsim.train.learning import BATCH, Learner, draw_batch
+from shiftsim.train.network import State, to_official
+from shiftsim.train.settings import TAUS, Settings, prepare_folder
+from shiftsim.train.states import States, read_part, write_part
+
+_KEPT_EVERY, _SAID_EVERY = 120.0, 10.0  # s
+_NOTED_EVERY = 50  # steps
+_NOBODY = "deterministic:base"  # where the network does not drive
+
+
+@dataclass
+class Course:
+    """How far a training is, with all that it has noted."""
+
+    tau: float = 0.0
+    round: int = 0  # the present one
+    done: int = 0  # steps of it
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    taus: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0  # that it took so far
+
+
+class Training:
+    """One training in its folder."""
+
+    def __init__(self, settings: Settings, say: Say, *, resume: bool = False) -> None:
+        """Begin, or go on where it was kept last.
+
+        Raises:
+            ConfigError: The folder holds another training, or there is no such device.
+            DataError: The store is not there.
+        """
+        self._settings, self._say = settings, say
+        self.device = resolve_device(settings.device)
+        store = open_named_store(settings.store)
+        tokens = find_split(settings.split, store.path, store.tokens).tokens
+        self.towns: Towns = divide(store, tokens, settings.seed)
+        prepare_folder(settings, resume=resume)
+        self.steps = max(1, settings.samples // settings.rounds // BATCH)
+        total = self.steps * settings.rounds
+        self.learner = Learner(self.device, settings.workers, total, settings.seed)
+        self.course = Course()
+        if settings.state.exists():
+            kept = read_state(settings.state)
+            self.course = Course(**kept["course"])
+            self.learner.restore(kept["learner"])
+        self._began = monotonic() - self.course.seconds
+
+    def run(self) -> None:
+        """Do all rounds that are not done yet."""
+        settings, course = self._settings, self.course
+        course.tau = course.tau or settings.tau or self._choose_tau()
+        while course.round < settings.rounds:
+            self._collect()
+            self._train()
+            self._test()
+            course.round, course.done = course.round + 1, 0
+            self._keep()
+
+    def _choose_tau(self) -> float:
+        """The tau with which PDM-Closed drives best through its labels, with and without noise."""
+        for tau in TAUS:
+            show = self._shower(f"tau {tau:g} s")
+            found = mean_scores(
+                self._settings, self.towns, _NOBODY, tau, by_expert=True, show=show
+            )
+            self.course.taus.append({"tau": tau, **found})
+            self._say(f"tau {tau:g} s: {_in_words(found)}")
+        write_table(self._settings.out / "tau.parquet", self.course.taus)
+        best = max(self.course.taus, key=lambda row: sum(row.values()) - row["tau"])
+        return float(best["tau"])
+
+    def _collect(self) -> None:
+        settings, course = self._settings, self.course
+        folder = settings.part(course.round)
+        if folder.exists():
+            return
+        checkpoint = str(settings.network) if course.round else _NOBODY
+        show = self._shower(f"{self._where} collecting")
+        tau, number = course.tau, course.round
+        write_part(folder, collect(settings, self.towns, checkpoint, number, tau, show))
+
+    def _train(self) -> None:
+        settings, course, learner = self._settings, self.course, self.learner
+        parts = [read_part(settings.part(number)) for number in range(course.round + 1)]
+        states = States(parts)
+        self._say(f"{self._where} training on {len(states)} states")
+        said = kept = monotonic()
+        before, noted = course.done, []
+        while course.done < self.steps:
+            key = (settings.seed, 3, course.round, course.done)
+            noted.append(learner.learn(states, draw_batch(states, key)))
+            course.done += 1
+            if course.done % _NOTED_EVERY == 0 or course.done == self.steps:
+                course.curve.append(_noted(course.round, learner.step, noted))
+                noted = []
+                if monotonic() - kept > _KEPT_EVERY:
+                    self._keep()
+                    kept = monotonic()
+            if monotonic() - said > _SAID_EVERY:
+                rate = (course.done - before) * BATCH / (monotonic() - said)
+                said, before = monotonic(), course.done
+                self._report(rate)
+
+    def _report(self, rate: float) -> None:
+        left = (self.learner.total - self.learner.step) * BATCH / rate
+        row = self.course.curve[-1] if self.course.curve else {"loss": float("nan")}
+        self._say(
+            f"{self._where} {self.learner.step * BATCH} of {self.learner.total * BATCH} samples  "
+            f"{rate:.0f} samples/s  loss {row['loss']:.3f}  {left / 60.0:.0f} min of training left"
+        )
+
+    def _test(self) -> None:
+        settings, course = self._settings, self.course
+        state = to_official(self.learner.driving())
+        write_network(settings.network, state)
+        found = mean_scores(
+            settings,
+            self.towns,
+            str(settings.network),
+            course.tau,
+            by_expert=False,
+            show=self._shower(f"{self._where} testing"),
+        )
+        seconds = monotonic() - self._began
+        samples = self.learner.step * BATCH
+        row = {"round": course.round, "samples": samples, **found, "seconds": seconds}
+        before = max((sum_of(row) for row in course.scores), default=-1.0)
+        course.scores.append(row)
+        if sum_of(row) > before:
+            write_network(settings.best, state)
+        self._say(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
+        write_table(settings.out / "scores.parquet", course.scores)
+        write_table(settings.out / "curve.parquet", course.curve)
+        draw_curves(settings.out / "curves.png", course.curve, course.scores)
+
+    def _keep(self) -> None:
+        self.course.seconds = monotonic() - self._began
+        kept = {"course": vars(self.course), "learner": self.learner.state()}
+        with whole_file(self._settings.state) as partial:
+            torch.save(kept, partial)
+
+    @property
+    def _where(self) -> str:
+        return f"round {self.course.round + 1} of {self._settings.rounds}:"
+
+    def _shower(self, what: str) -> Any:
+        said = [monotonic()]
+
+        def show(done: int, total: int) -> None:
+            if monotonic() - said[0] > _SAID_EVERY or done == total:
+                said[0] = monotonic()
+                self._say(f"{what} {done} of {total} jobs")
+
+        return show
+
+
+def sum_of(row: dict[str, Any]) -> float:
+    """What the best network has most of: scores with and without noise."""
+    return float(row["none"] + row["ou-high"])
+
+
+def _noted(number: int, step: int, noted: list[Any]) -> dict[str, Any]:
+    count = len(noted)
+    return {
+        "round": number,
+        "samples": step * BATCH,
+        "loss": sum(one.loss for one in noted) / count,
+        "acceleration_error": sum(one.errors[0] for one in noted) / count,
+        "steering_error": sum(one.errors[1] for one in noted) / count,
+    }
+
+
+def _in_words(found: dict[str, float]) -> str:
+    return "  ".join(f"{noise} {100.0 * score:.1f}" for noise, score in found.items())
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """What a training kept.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    try:
+        kept: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise CheckpointError(
+            f"{str(path)!r} cannot be read: {error}", hint="delete it to begin again"
+        ) from error
+    return kept
+
+
+def write_network(path: Path, state: State) -> None:
+    """Write a network as `--checkpoint carl=PATH` reads it."""
+    from safetensors.torch import save_file
+
+    tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+    with whole_file(path) as partial:
+        save_file(tensors, partial, {"planner": "carl"})
