@@ -14,13 +14,17 @@ app = new_app("Train networks.")
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
     store: Annotated[str, typer.Option(help="Store by name, path or URL.")] = "demo",
-    split: Annotated[str, typer.Option(help="Split of the store; all its scenarios if empty.")] = "",
+    split: Annotated[
+        str, typer.Option(help="Split of the store; all its scenarios if empty.")
+    ] = "",
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or auto.")] = "cpu",
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that drive, threads that train.")] = 2,
     rounds: Annotated[int, typer.Option(help="Of collecting, training and testing.")] = 8,
-    states: Annotated[int, typer.Option(help="Labelled states to collect in all.")] = 480_000,
-    samples: Annotated[int, typer.Option(help="States to train on, each time counted.")] = 1_600_000,
+    states: Annotated[int, typer.Option(help="Labelled states to collect in all.")] = 360_000,
+    samples: Annotated[
+        int, typer.Option(help="States to train on, each time counted.")
+    ] = 1_280_000,
     tau: Annotated[float, typer.Option(help="Of the labels [s]; 0 to choose it.")] = 0.0,
     tests: Annotated[int, typer.Option(help="Scenarios that each round is tested on.")] = 40,
     ppo_samples: Annotated[int, typer.Option(help="Steps of PPO afterwards.")] = 0,

@@ -18,15 +18,15 @@ from shiftsim.arrays import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train.network import (
     MIRRORED_ACTION,
-    MIRRORED_MEASUREMENTS,
     Laid,
     State,
     forward,
     lay_out,
     leaves,
+    mirrored_measurements,
     tensor_of,
 )
-from shiftsim.train.pictures import blocks_of
+from shiftsim.train.pictures import Blocks, blocks_of
 from shiftsim.train.states import States, Values
 
 BATCH, LANES, MICRO = 64, 4, 16  # states of a step; what is summed for itself; computed at once
@@ -36,7 +36,7 @@ AVERAGED = 0.999  # of the running mean of the weights, per step
 SCALES = (0.3, 0.06)  # of errors of acceleration and steering
 CERTAINTY = 0.01  # weight of the likelihood, by which the distribution gets its width
 EDGE = 0.01  # labels are kept so far from the ends of [0, 1], where the density may be 0 or inf
-HIDDEN, MIRRORED = 0.5, 0.5  # shares: of last actions not shown, of states in the mirror
+HIDDEN, MIRRORED = 0.5, 0.25  # shares: of last actions not shown, of states in the mirror
 
 
 class Batch(NamedTuple):
@@ -54,7 +54,7 @@ def draw_batch(states: States, key: Iterable[int], size: int = BATCH) -> Batch:
     indices = states.draw(size, random)
     mirrored, hidden = random.random(size) < MIRRORED, random.random(size) < HIDDEN
     measurements, actions = states.measurements[indices], states.actions[indices]
-    measurements[mirrored] *= MIRRORED_MEASUREMENTS
+    measurements[mirrored] = mirrored_measurements(measurements[mirrored])
     actions[mirrored] *= MIRRORED_ACTION
     measurements[hidden, :2] = 0.0
     return Batch(indices, mirrored, measurements, actions)
@@ -72,8 +72,22 @@ def loss_of(policy: Policy, actions: Tensor) -> tuple[Tensor, Tensor]:
     total = policy.alpha + policy.beta
     mean = (policy.alpha / total).detach()
     label = ((actions + 1.0) / 2.0).clamp(EDGE, 1.0 - EDGE)
-    width = torch.distributions.Beta(mean * total, (1.0 - mean) * total, validate_args=False)
-    return fit - CERTAINTY * width.log_prob(label).sum(), error.detach().abs().sum(0)
+    likely = log_density(mean * total, (1.0 - mean) * total, label)
+    return fit - CERTAINTY * likely.sum(), error.detach().abs().sum(0)
+
+
+def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
+    """Logarithm of the density of beta distributions at x in (0, 1)."""
+    scale = torch.lgamma(alpha + beta) - torch.lgamma(alpha) - torch.lgamma(beta)
+    return scale + (alpha - 1.0) * torch.log(x) + (beta - 1.0) * torch.log1p(-x)
+
+
+class Summed(NamedTuple):
+    """What some states came to."""
+
+    gradients: list[Tensor]  # of the weights that are laid out
+    loss: float
+    errors: Tensor  # (2,)
 
 
 @dataclass
@@ -97,7 +111,7 @@ class Learner:
         plain = [value for value in self._trained if value.dim() != 2 and value.dim() != 4]
         heavy = [value for value in self._trained if value.dim() in (2, 4)]
         groups = [{"params": heavy, "weight_decay": DECAY}, {"params": plain, "weight_decay": 0.0}]
-        self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=(0.9, 0.99))
+        self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=(0.9, 0.99), fused=True)
         self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
 
     @property
@@ -111,15 +125,9 @@ class Learner:
     def learn(self, states: States, batch: Batch) -> Learned:
         """Do one step."""
         laid = lay_out(self.network)
-        ends = leaves(laid)
-        lanes = 1 if self._device != "cpu" else LANES
-        rows = np.array_split(np.arange(len(batch.indices)), lanes)
-        jobs = [self._pool.submit(self._lane, states, batch, part, ends) for part in rows]
-        done = [job.result() for job in jobs]
-        gradients = done[0][0]
-        for other, _, _ in done[1:]:
-            torch._foreach_add_(gradients, other)
-        torch._foreach_div_(gradients, float(len(batch.indices)))
+        gradients, loss, errors = self._gradients(states, batch, leaves(laid))
+        count = len(batch.indices)
+        torch._foreach_div_(gradients, float(count))
         for group in self.optimiser.param_groups:
             group["lr"] = RATE * schedule(self.step / self.total)
         self.optimiser.zero_grad()
@@ -128,30 +136,32 @@ class Learner:
         self.optimiser.step()
         self.step += 1
         self._average()
-        errors = sum(part[2] for part in done) / len(batch.indices)
-        loss = sum(part[1] for part in done) / len(batch.indices)
-        return Learned(float(loss), (float(errors[0]), float(errors[1])))
+        means = (errors / count).tolist()
+        return Learned(loss / count, (means[0], means[1]))
 
-    def _lane(self, states: States, batch: Batch, rows: IntArray, ends: Laid) -> Any:
-        """Gradients, loss and errors summed over some rows of a batch."""
-        micro = MICRO if self._device == "cpu" else len(rows)
-        wanted = list(ends.values())
-        gradients: list[Tensor] = []
-        total, errors = 0.0, torch.zeros(2)
-        for first in range(0, len(rows), micro):
-            part = rows[first : first + micro]
-            rasters = [states.picture(int(index)) for index in batch.indices[part]]
-            pictures = tensor_of(blocks_of(rasters, batch.mirrored[part].tolist()), self._device)
-            measured = torch.from_numpy(batch.measurements[part]).to(self._device)
-            label = torch.from_numpy(batch.actions[part]).to(self._device)
-            loss, error = loss_of(forward(ends, pictures, measured), label)
-            fresh = torch.autograd.grad(loss, wanted)
-            if gradients:
-                torch._foreach_add_(gradients, fresh)
-            else:
-                gradients = list(fresh)
-            total, errors = total + float(loss.detach()), errors + error.cpu()
-        return gradients, total, errors
+    def _gradients(self, states: States, batch: Batch, ends: Laid) -> Summed:
+        """Gradients, loss and errors, summed over a batch."""
+        rows = np.arange(len(batch.indices))
+        if self._device != "cpu":
+            parts = [rows[first : first + MICRO] for first in range(0, len(rows), MICRO)]
+            drawn = list(self._pool.map(lambda part: _blocks(states, batch, part), parts))
+            return self._summed(batch, rows, np.concatenate(drawn), ends)
+        lanes = np.array_split(rows, LANES)
+        done = list(self._pool.map(lambda lane: self._lane(states, batch, lane, ends), lanes))
+        return _sum(done)
+
+    def _lane(self, states: States, batch: Batch, rows: IntArray, ends: Laid) -> Summed:
+        """The same of some rows of a batch, few at once, so that they stay in the cache."""
+        parts = [rows[first : first + MICRO] for first in range(0, len(rows), MICRO)]
+        return _sum(self._summed(batch, part, _blocks(states, batch, part), ends) for part in parts)
+
+    def _summed(self, batch: Batch, rows: IntArray, blocks: Blocks, ends: Laid) -> Summed:
+        measured = torch.from_numpy(batch.measurements[rows]).to(self._device)
+        label = torch.from_numpy(batch.actions[rows]).to(self._device)
+        policy = forward(ends, tensor_of(blocks, self._device), measured)
+        loss, errors = loss_of(policy, label)
+        gradients = list(torch.autograd.grad(loss, list(ends.values())))
+        return Summed(gradients, float(loss.detach()), errors.cpu())
 
     def _average(self) -> None:
         keep = min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
@@ -175,6 +185,20 @@ class Learner:
             self.mean[name].copy_(value)
         self.optimiser.load_state_dict(state["optimiser"])
         self.step = state["step"]
+
+
+def _blocks(states: States, batch: Batch, rows: IntArray) -> Blocks:
+    rasters = [states.picture(int(index)) for index in batch.indices[rows]]
+    return blocks_of(rasters, batch.mirrored[rows].tolist())
+
+
+def _sum(parts: Iterable[Summed]) -> Summed:
+    first, *others = parts
+    loss, errors = first.loss, first.errors
+    for other in others:
+        torch._foreach_add_(first.gradients, other.gradients)
+        loss, errors = loss + other.loss, errors + other.errors
+    return Summed(first.gradients, loss, errors)
 
 
 def schedule(done: float) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,13 +19,14 @@ from shiftsim.planners.learned.carl.network import (
     Policy,
 )
 from shiftsim.train.pictures import NUM_USED, Blocks
+from shiftsim.world.state import PACIFICA
 
 # a measurement of the network is divided by these: last action, velocity and acceleration of the
 # centre [m/s, m/s^2], steering angle and rate [rad, rad/s], yaw rate and acceleration
 UNITS = (1.0, 1.0, 5.0, 0.5, 1.0, 0.5, 0.1, 0.3, 0.2, 0.5)
-# signs of measurements and actions in the mirror
-MIRRORED_MEASUREMENTS = np.array([1, -1, 1, -1, 1, -1, -1, -1, -1, -1], np.float32)
-MIRRORED_ACTION = np.array([1, -1], np.float32)
+MIRRORED_ACTION = np.array([1, -1], np.float32)  # signs in the mirror
+_MIRRORED = np.array([1, -1, 1, -1, 1, -1, -1, -1, -1, -1], np.float32)
+_AX, _YAW_ACCEL = 4, 9  # of the measurements
 _CNN, _STATE = "features_extractor.cnn", "features_extractor.state_linear"
 _HEADS = ("features_extractor.linear", _STATE, "policy_head")
 _DRAWN = [0, 1, 2, 3, 5, 6, 7, 8]  # channels of `pictures.blocks_of`
@@ -45,9 +47,21 @@ def from_official(state: State) -> State:
     return {**state, name: state[name] * torch.tensor(UNITS, device=state[name].device)}
 
 
+def mirrored_measurements(measurements: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(…, 10) measurements of the ego in the mirror.
+
+    The acceleration of the centre holds the yaw acceleration, with its sign.
+    """
+    out = measurements * _MIRRORED
+    turning = PACIFICA.rear_axle_to_center * measurements[..., _YAW_ACCEL]
+    out[..., _AX] -= np.float32(2.0) * turning.astype(np.float32)
+    return out
+
+
 def lay_out(network: CarlNetwork) -> Laid:
     """The weights of a network as `forward` wants them; gradients lead back to the network."""
-    weights, laid = dict(network.named_parameters()), {}
+    weights: Laid = dict(network.named_parameters())
+    laid: Laid = {}
     for layer in range(len(CONVOLUTIONS)):
         conv, norm = f"{_CNN}.{3 * layer}", f"{_CNN}.{3 * layer + 1}"
         weight = weights[f"{conv}.weight"]

@@ -70,7 +70,9 @@ class Training:
     def run(self) -> None:
         """Do all rounds that are not done yet."""
         settings, course = self._settings, self.course
-        course.tau = course.tau or settings.tau or self._choose_tau()
+        if not course.tau:
+            course.tau = settings.tau or self._choose_tau()
+            self._keep()
         while course.round < settings.rounds:
             self._collect()
             self._train()
@@ -82,9 +84,7 @@ class Training:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
         for tau in TAUS:
             show = self._shower(f"tau {tau:g} s")
-            found = mean_scores(
-                self._settings, self.towns, _NOBODY, tau, by_expert=True, show=show
-            )
+            found = mean_scores(self._settings, self.towns, _NOBODY, tau, by_expert=True, show=show)
             self.course.taus.append({"tau": tau, **found})
             self._say(f"tau {tau:g} s: {_in_words(found)}")
         write_table(self._settings.out / "tau.parquet", self.course.taus)
@@ -100,6 +100,7 @@ class Training:
         show = self._shower(f"{self._where} collecting")
         tau, number = course.tau, course.round
         write_part(folder, collect(settings, self.towns, checkpoint, number, tau, show))
+        self._keep()
 
     def _train(self) -> None:
         settings, course, learner = self._settings, self.course, self.learner

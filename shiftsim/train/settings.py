@@ -20,8 +20,8 @@ class Settings:
     split: str = ""  # of the store; all scenarios if empty
     seed: int = 0
     rounds: int = 8  # of collecting, training and testing
-    states: int = 480_000  # labelled states in all
-    samples: int = 1_600_000  # states that the network is trained on in all, each time counted
+    states: int = 360_000  # labelled states in all
+    samples: int = 1_280_000  # states that the network is trained on in all, each time counted
     tau: float = 0.0  # of the labels [s]; 0 to choose it
     tests: int = 40  # scenarios that a round is tested on, of towns that are left out
     ppo_samples: int = 0  # of reinforcement learning afterwards
