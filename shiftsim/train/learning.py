@@ -1,11 +1,6 @@
-"""One step of imitation: a batch of states, the loss, and the optimiser.
-
-The gradients of a batch are summed in an order that does not depend on the number of threads, so
-that the same seed gives the same network.
-"""
+"""One step of imitation: a batch of states, the loss, and the optimiser."""
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +11,7 @@ from torch.nn import functional
 
 from shiftsim.arrays import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
+from shiftsim.train.gradients import Gradients
 from shiftsim.train.network import (
     MIRRORED_ACTION,
     Laid,
@@ -24,12 +20,11 @@ from shiftsim.train.network import (
     lay_out,
     leaves,
     mirrored_measurements,
-    tensor_of,
 )
 from shiftsim.train.pictures import Blocks, blocks_of
 from shiftsim.train.states import States, Values
 
-BATCH, LANES, MICRO = 64, 4, 16  # states of a step; what is summed for itself; computed at once
+BATCH = 64  # states of a step
 RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, share of rising
 DECAY, CLIP = 0.01, 5.0  # of the weights; of the norm of the gradient
 AVERAGED = 0.999  # of the running mean of the weights, per step
@@ -82,14 +77,6 @@ def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
     return scale + (alpha - 1.0) * torch.log(x) + (beta - 1.0) * torch.log1p(-x)
 
 
-class Summed(NamedTuple):
-    """What some states came to."""
-
-    gradients: list[Tensor]  # of the weights that are laid out
-    loss: float
-    errors: Tensor  # (2,)
-
-
 @dataclass
 class Learned:
     """What a step came to."""
@@ -106,13 +93,12 @@ class Learner:
         torch.manual_seed(seed)
         self.network, self.total, self.step = CarlNetwork(), total, 0
         self.network.to(device)
-        self._device = device
         self.mean = {name: value.detach().clone() for name, value in self._parameters.items()}
         plain = [value for value in self._trained if value.dim() != 2 and value.dim() != 4]
         heavy = [value for value in self._trained if value.dim() in (2, 4)]
         groups = [{"params": heavy, "weight_decay": DECAY}, {"params": plain, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=(0.9, 0.99), fused=True)
-        self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+        self._gradients = Gradients(device, threads)
 
     @property
     def _parameters(self) -> dict[str, Tensor]:
@@ -125,8 +111,18 @@ class Learner:
     def learn(self, states: States, batch: Batch) -> Learned:
         """Do one step."""
         laid = lay_out(self.network)
-        gradients, loss, errors = self._gradients(states, batch, leaves(laid))
         count = len(batch.indices)
+
+        def see(rows: IntArray) -> Blocks:
+            rasters = [states.picture(int(index)) for index in batch.indices[rows]]
+            return blocks_of(rasters, batch.mirrored[rows].tolist())
+
+        def judge(ends: Laid, rows: IntArray, pictures: Tensor) -> tuple[Tensor, Tensor]:
+            measured = torch.from_numpy(batch.measurements[rows]).to(pictures.device)
+            label = torch.from_numpy(batch.actions[rows]).to(pictures.device)
+            return loss_of(forward(ends, pictures, measured), label)
+
+        gradients, loss, errors = self._gradients.of(leaves(laid), count, see, judge)
         torch._foreach_div_(gradients, float(count))
         for group in self.optimiser.param_groups:
             group["lr"] = RATE * schedule(self.step / self.total)
@@ -138,30 +134,6 @@ class Learner:
         self._average()
         means = (errors / count).tolist()
         return Learned(loss / count, (means[0], means[1]))
-
-    def _gradients(self, states: States, batch: Batch, ends: Laid) -> Summed:
-        """Gradients, loss and errors, summed over a batch."""
-        rows = np.arange(len(batch.indices))
-        if self._device != "cpu":
-            parts = [rows[first : first + MICRO] for first in range(0, len(rows), MICRO)]
-            drawn = list(self._pool.map(lambda part: _blocks(states, batch, part), parts))
-            return self._summed(batch, rows, np.concatenate(drawn), ends)
-        lanes = np.array_split(rows, LANES)
-        done = list(self._pool.map(lambda lane: self._lane(states, batch, lane, ends), lanes))
-        return _sum(done)
-
-    def _lane(self, states: States, batch: Batch, rows: IntArray, ends: Laid) -> Summed:
-        """The same of some rows of a batch, few at once, so that they stay in the cache."""
-        parts = [rows[first : first + MICRO] for first in range(0, len(rows), MICRO)]
-        return _sum(self._summed(batch, part, _blocks(states, batch, part), ends) for part in parts)
-
-    def _summed(self, batch: Batch, rows: IntArray, blocks: Blocks, ends: Laid) -> Summed:
-        measured = torch.from_numpy(batch.measurements[rows]).to(self._device)
-        label = torch.from_numpy(batch.actions[rows]).to(self._device)
-        policy = forward(ends, tensor_of(blocks, self._device), measured)
-        loss, errors = loss_of(policy, label)
-        gradients = list(torch.autograd.grad(loss, list(ends.values())))
-        return Summed(gradients, float(loss.detach()), errors.cpu())
 
     def _average(self) -> None:
         keep = min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
@@ -185,20 +157,6 @@ class Learner:
             self.mean[name].copy_(value)
         self.optimiser.load_state_dict(state["optimiser"])
         self.step = state["step"]
-
-
-def _blocks(states: States, batch: Batch, rows: IntArray) -> Blocks:
-    rasters = [states.picture(int(index)) for index in batch.indices[rows]]
-    return blocks_of(rasters, batch.mirrored[rows].tolist())
-
-
-def _sum(parts: Iterable[Summed]) -> Summed:
-    first, *others = parts
-    loss, errors = first.loss, first.errors
-    for other in others:
-        torch._foreach_add_(first.gradients, other.gradients)
-        loss, errors = loss + other.loss, errors + other.errors
-    return Summed(first.gradients, loss, errors)
 
 
 def schedule(done: float) -> float:
