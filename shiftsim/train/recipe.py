@@ -15,6 +15,7 @@ import torch
 from shiftsim.errors import CheckpointError
 from shiftsim.files import whole_file
 from shiftsim.planners.learned.device import resolve_device
+from shiftsim.runs.filter import read_verdicts
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
@@ -54,7 +55,9 @@ class Training:
         self._settings, self._say = settings, say
         self.device = resolve_device(settings.device)
         store = open_named_store(settings.store)
-        tokens = find_split(settings.split, store.path, store.tokens).tokens
+        verdicts = read_verdicts(store.path, store.hash)
+        usable = verdicts.accepted if verdicts else store.tokens
+        tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
         prepare_folder(settings, resume=resume)
         self.steps = max(1, settings.samples // settings.rounds // BATCH)
