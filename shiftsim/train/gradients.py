@@ -54,8 +54,9 @@ class Gradients:
 
     def _part(self, ends: Laid, rows: IntArray, blocks: Blocks, judge: Judge) -> Summed:
         loss, numbers = judge(ends, rows, tensor_of(blocks, self.device))
-        gradients = list(torch.autograd.grad(loss, list(ends.values())))
-        return Summed(gradients, float(loss.detach()), numbers.cpu())
+        wanted = list(ends.values())
+        gradients = torch.autograd.grad(loss, wanted, allow_unused=True, materialize_grads=True)
+        return Summed(list(gradients), float(loss.detach()), numbers.cpu())
 
 
 def _parts(rows: IntArray) -> Iterator[IntArray]:

@@ -58,8 +58,11 @@ def mirrored_measurements(measurements: NDArray[np.float32]) -> NDArray[np.float
     return out
 
 
-def lay_out(network: CarlNetwork) -> Laid:
-    """The weights of a network as `forward` wants them; gradients lead back to the network."""
+def lay_out(network: CarlNetwork, *, critic: bool = False) -> Laid:
+    """The weights of a network as `forward` wants them; gradients lead back to the network.
+
+    Those of the critic are left out unless they are asked for.
+    """
     weights: Laid = dict(network.named_parameters())
     laid: Laid = {}
     for layer in range(len(CONVOLUTIONS)):
@@ -73,7 +76,7 @@ def lay_out(network: CarlNetwork) -> Laid:
             turned = weights[f"{norm}.{kind}"].permute(1, 2, 0)
             laid[f"{norm}.{kind}"] = turned.bfloat16().contiguous()
     for name, value in weights.items():
-        if name not in laid and not name.startswith("value_head"):
+        if name not in laid and (critic or not name.startswith("value_head")):
             laid[name] = value
     return laid
 
@@ -128,6 +131,13 @@ def policy_of(laid: Laid, features: Tensor) -> Policy:
         out = functional.linear(hidden, laid[f"{head}.weight"], laid[f"{head}.bias"])
         heads.append(functional.softplus(out) + LEAST)
     return Policy(*heads)
+
+
+def value_of(laid: Laid, features: Tensor, measurements: Tensor) -> Tensor:
+    """(B,) what the critic expects, from features (B, 256) and its own measurements (B, 4)."""
+    hidden = _perceptron(laid, "value_head", torch.cat([features, measurements], dim=1))
+    last = "value_head.6"
+    return functional.linear(hidden, laid[f"{last}.weight"], laid[f"{last}.bias"]).squeeze(1)
 
 
 def forward(laid: Laid, pictures: Tensor, measurements: Tensor) -> Policy:

@@ -10,17 +10,14 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-import torch
-
-from shiftsim.errors import CheckpointError
-from shiftsim.files import whole_file
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.runs.filter import read_verdicts
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
+from shiftsim.train.keeping import read_state, write_network, write_state
 from shiftsim.train.learning import BATCH, Learner, draw_batch
-from shiftsim.train.network import State, to_official
+from shiftsim.train.network import to_official
 from shiftsim.train.settings import TAUS, Settings, prepare_folder
 from shiftsim.train.states import States, read_part, write_part
 
@@ -82,6 +79,21 @@ class Training:
             self._test()
             course.round, course.done = course.round + 1, 0
             self._keep()
+        if settings.ppo_samples:
+            self._reinforce()
+
+    def _reinforce(self) -> None:
+        """Go on with PPO from the best network, and test what comes out."""
+        from shiftsim.planners.learned.checkpoint import load_weights
+        from shiftsim.train.ppo import reinforce
+
+        settings = self._settings
+        state = load_weights(str(settings.best), "carl").state
+        write_network(
+            settings.reinforced, reinforce(settings, self.towns, state, self.device, self._say)
+        )
+        found = self._scores(settings.reinforced, "PPO:")
+        self._say(f"PPO: {_in_words(found)}")
 
     def _choose_tau(self) -> float:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
@@ -139,14 +151,7 @@ class Training:
         settings, course = self._settings, self.course
         state = to_official(self.learner.driving())
         write_network(settings.network, state)
-        found = mean_scores(
-            settings,
-            self.towns,
-            str(settings.network),
-            course.tau,
-            by_expert=False,
-            show=self._shower(f"{self._where} testing"),
-        )
+        found = self._scores(settings.network, self._where)
         seconds = monotonic() - self._began
         samples = self.learner.step * BATCH
         row = {"round": course.round, "samples": samples, **found, "seconds": seconds}
@@ -159,11 +164,14 @@ class Training:
         write_table(settings.out / "curve.parquet", course.curve)
         draw_curves(settings.out / "curves.png", course.curve, course.scores)
 
+    def _scores(self, network: Path, where: str) -> dict[str, float]:
+        settings, tau, show = self._settings, self.course.tau, self._shower(f"{where} testing")
+        return mean_scores(settings, self.towns, str(network), tau, by_expert=False, show=show)
+
     def _keep(self) -> None:
         self.course.seconds = monotonic() - self._began
         kept = {"course": vars(self.course), "learner": self.learner.state()}
-        with whole_file(self._settings.state) as partial:
-            torch.save(kept, partial)
+        write_state(self._settings.state, kept)
 
     @property
     def _where(self) -> str:
@@ -198,27 +206,3 @@ def _noted(number: int, step: int, noted: list[Any]) -> dict[str, Any]:
 
 def _in_words(found: dict[str, float]) -> str:
     return "  ".join(f"{noise} {100.0 * score:.1f}" for noise, score in found.items())
-
-
-def read_state(path: Path) -> dict[str, Any]:
-    """What a training kept.
-
-    Raises:
-        CheckpointError: The file is damaged.
-    """
-    try:
-        kept: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise CheckpointError(
-            f"{str(path)!r} cannot be read: {error}", hint="delete it to begin again"
-        ) from error
-    return kept
-
-
-def write_network(path: Path, state: State) -> None:
-    """Write a network as `--checkpoint carl=PATH` reads it."""
-    from safetensors.torch import save_file
-
-    tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
-    with whole_file(path) as partial:
-        save_file(tensors, partial, {"planner": "carl"})

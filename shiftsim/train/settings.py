@@ -56,6 +56,11 @@ class Settings:
         return self.out / "best.safetensors"
 
     @property
+    def reinforced(self) -> Path:
+        """The network after PPO."""
+        return self.out / "ppo.safetensors"
+
+    @property
     def state(self) -> Path:
         """All that is needed to go on."""
         return self.out / "state.pt"
