@@ -48,7 +48,7 @@ BLOCKS = [block for page in PAGES for block in read_blocks(page)]
 MOST_NOT_RUN = 10
 NEEDS = {  # of extras and of the dependency group `docs`
     "learned_planners": ("torch", "safetensors"),
-    "training": ("gymnasium",),
+    "training": ("gymnasium", "torch", "safetensors"),
     "run_folder": ("duckdb", "pandas", "polars"),
     **dict.fromkeys(("quickstart", "seeing", "state_drift"), ("matplotlib",)),
 }
