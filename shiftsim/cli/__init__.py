@@ -235,6 +235,7 @@ _COMMANDS = {
     "convert": "open_data:app",
     "export": "stores:export",
     "checkpoint": "planners:checkpoint",
+    "train": "training:app",
 }
 
 

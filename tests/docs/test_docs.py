@@ -53,7 +53,7 @@ EXAMPLE = re.compile(r"Example:\n +```python\n(.*?)\n +```", re.S)
 NEEDS = {  # of extras and of the dependency group `docs`
     "learned_planners": ("torch", "safetensors"),
     "nuplan_results": ("msgpack",),
-    "training": ("gymnasium",),
+    "training": ("gymnasium", "torch", "safetensors"),
     "run_folder": ("duckdb", "pandas", "polars"),
     **dict.fromkeys(("quickstart", "seeing", "state_drift"), ("matplotlib",)),
 }

@@ -1,0 +1,163 @@
+"""Drives scenarios in a worker: to collect labelled states, or to score a policy.
+
+Several scenarios go in lock step, so that the network sees them as one batch. Either the network
+drives or PDM-Closed, through the actions that it is imitated with.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from shiftsim.env.episode import Episode
+from shiftsim.errors import ShiftsimError
+from shiftsim.planners.learned.carl.planner import Carl, CarlFeatures, command_of
+from shiftsim.runs.scenarios import open_named_store
+from shiftsim.sim.loop import Setting
+from shiftsim.train.expert import Action, Expert
+from shiftsim.train.network import forward, from_official, lay_out, tensor_of
+from shiftsim.train.pictures import blocks_of, packed
+
+EVERY = 2  # steps of which one is kept: neighbours are nearly the same
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """One scenario to be driven."""
+
+    token: str
+    noise: str
+    seed: int  # of the noise
+    # so many steps PDM-Closed drives before the network takes over; -1 for all of them
+    expert_steps: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What a worker is handed at once."""
+
+    starts: tuple[Start, ...]
+    is_test: bool  # whether scores are wanted, else labelled states
+    tau: float  # of the labels [s]
+
+
+class State(NamedTuple):
+    """A labelled state."""
+
+    picture: bytes  # `pictures.packed`
+    measurements: Action  # (10,) of `CarlFeatures`
+    action: Action  # (2,) what the expert would do
+
+
+class Driven(NamedTuple):
+    """What a job came to."""
+
+    states: list[State]
+    scores: list[float]  # closed-loop score of each scenario that was driven to its end
+    failed: list[str]  # why a scenario was not
+
+
+class Student(Carl):
+    """The network that is trained, as a planner."""
+
+    def __init__(self, checkpoint: str) -> None:
+        super().__init__(checkpoint)
+        network = self.networks[0]
+        network.load_state_dict(from_official(network.state_dict()))
+        with torch.no_grad():
+            self._laid = lay_out(network)
+
+    def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
+        """Actions (2,) in [-1, 1], as the network is trained to."""
+        with torch.inference_mode():
+            blocks = blocks_of([f.pictures for f in features], [False] * len(features))
+            measured = torch.from_numpy(np.stack([f.measurements for f in features]))
+            return list(forward(self._laid, tensor_of(blocks), measured).action.numpy())
+
+    def remember(self, action: Action) -> None:
+        """Take an action that somebody else did as its own last one."""
+        self._last_action = action
+
+
+class Lane:
+    """One scenario under way."""
+
+    def __init__(self, start: Start, job: Job, scenario: Any, student: Student) -> None:
+        self.start, self.job, self.student = start, job, student
+        setting = Setting(start.noise, start.seed)
+        self.episode = Episode(scenario, setting, np.zeros(2, np.float32))
+        student.reset(self.episode.scene)
+        self.expert = Expert(self.episode.scene, job.tau)
+        self.states: list[State] = []
+        self.features: CarlFeatures | None = None  # what the student is asked about
+        self.action: Action | None = None  # what is done in this step
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing is to be learnt from going on."""
+        return self.episode.is_over or (not self.job.is_test and self.episode.infraction != "")
+
+    def look(self) -> None:
+        """Note the state and its label, where it is kept, and who drives."""
+        step, observation = self.episode.iteration, self.episode.observe()
+        is_expert = self.start.expert_steps < 0 or step < self.start.expert_steps
+        is_kept = not self.job.is_test and step % EVERY == 0
+        self.action = self.expert.act(observation) if is_expert or is_kept else None
+        features = self.student.features(observation) if is_kept or not is_expert else None
+        if is_kept and features is not None and self.action is not None:
+            state = State(packed(features.pictures), features.measurements, self.action)
+            self.states.append(state)
+        self.features = None if is_expert else features
+
+    def advance(self, action: Action) -> None:
+        """Drive one step."""
+        self.student.remember(action)
+        ego = self.episode.log.ego[self.episode.iteration]
+        self.episode.advance(command_of(action, ego))
+
+
+class Driver:
+    """Does jobs, one after the other."""
+
+    def __init__(self, store: str, checkpoint: str) -> None:
+        """`checkpoint` is of the network that drives; any where PDM-Closed does."""
+        self._store, self._student = open_named_store(store), Student(checkpoint)
+
+    def __call__(self, job: Job) -> Driven:
+        """Drive all scenarios of a job."""
+        lanes, failed = [], []
+        for start in job.starts:
+            try:
+                scenario = self._store.read(start.token)
+                lanes.append(Lane(start, job, scenario, self._student.fork()))
+            except ShiftsimError as error:
+                failed.append(f"{start.token}: {error}")
+        active = list(lanes)
+        while active := [lane for lane in active if not lane.is_over]:
+            active = _step(active, self._student, failed)
+        states = [state for lane in lanes for state in lane.states]
+        ended = [lane.episode for lane in lanes if job.is_test and lane.episode.is_over]
+        return Driven(states, [episode.scores.get("cls", 0.0) for episode in ended], failed)
+
+
+def _step(lanes: list[Lane], student: Student, failed: list[str]) -> list[Lane]:
+    """Drive all of them one step; those that can go on."""
+    seen = []
+    for lane in lanes:
+        try:
+            lane.look()
+            seen.append(lane)
+        except ShiftsimError as error:  # a scenario in which the expert fails teaches nothing
+            failed.append(f"{lane.start.token}: {error}")
+    asked = [lane for lane in seen if lane.features is not None]
+    if asked:
+        for lane, action in zip(
+            asked, student.infer([lane.features for lane in asked if lane.features]), strict=True
+        ):
+            lane.action = action
+    for lane in seen:
+        if lane.action is not None:
+            lane.advance(lane.action)
+    return seen

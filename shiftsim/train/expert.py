@@ -1,0 +1,47 @@
+"""What PDM-Closed would do, as an action of CaRL's.
+
+The tracker turns its plan into an acceleration and a steering rate; CaRL's action asks for an
+acceleration and a steering angle. The angle is the present one and what the rate adds to it in
+`tau` seconds. CaRL's angle is reached within 0.1 s: a larger `tau` steers harder than the tracker.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import FloatArray
+from shiftsim.planners.learned.carl.planner import MAX_ACCELERATION, MAX_BRAKING, MAX_STEERING
+from shiftsim.planners.pdm.planner import PdmClosed
+from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.state import STEERING
+
+Action = NDArray[np.float32]
+
+
+def encode(acceleration: float, steering_rate: float, steering: float, tau: float) -> Action:
+    """(2,) the action in [-1, 1] that stands for a command at a steering angle.
+
+    `acceleration` [m/s^2], `steering_rate` [rad/s], `steering` [rad], `tau` [s].
+    """
+    most = MAX_ACCELERATION if acceleration >= 0.0 else MAX_BRAKING
+    angle = steering + tau * steering_rate
+    action = np.array([acceleration / most, angle / MAX_STEERING])
+    return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+class Expert:
+    """PDM-Closed in one scenario."""
+
+    def __init__(self, scene: SceneInfo, tau: float) -> None:
+        """`tau` as in `encode`."""
+        self._planner, self._tau = PdmClosed(), tau
+        self._planner.reset(scene)
+
+    def act(self, observation: Observation) -> Action:
+        """What it would do now."""
+        plan = self._planner.plan(observation)
+        ego: FloatArray = observation.history.ego[-1].copy()
+        now = observation.time_us
+        status, acceleration, rate = track(now, ego, plan.time_us, plan.states, NUPLAN)
+        raise_for_status(status, now, plan.time_us)
+        return encode(acceleration, rate, float(ego[STEERING]), self._tau)

@@ -1,0 +1,131 @@
+"""The whole recipe on a tiny store: the same again, after a kill as well, and drivable."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pyarrow.parquet as pq
+import pytest
+
+import shiftsim
+from shiftsim.data.store.reading import open_store
+from shiftsim.errors import CheckpointError, ConfigError
+from shiftsim.train import recipe
+from shiftsim.train.jobs import divide
+from shiftsim.train.recipe import Training
+from shiftsim.train.settings import Settings
+
+
+def curve_of(settings):
+    return pq.read_table(settings.out / "curve.parquet").to_pylist()
+
+
+def train(settings, **options):
+    Training(settings, lambda text: None, **options).run()
+
+
+def test_the_same_seed_gives_the_same_curve_and_network(small, trained):
+    first, _ = trained
+    again, other = small("again"), small("other", seed=6)
+    for settings in (again, other):
+        train(settings)
+    assert curve_of(first) == curve_of(again) != curve_of(other)
+    assert first.network.read_bytes() == again.network.read_bytes()
+
+
+def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monkeypatch):
+    whole, ended = trained[0], small()
+    monkeypatch.setattr(recipe, "_KEPT_EVERY", 0.0)
+    monkeypatch.setattr(recipe, "_NOTED_EVERY", 1)
+    learn, steps = recipe.Learner.learn, []
+
+    def stopping(learner, *batch):
+        steps.append(1)
+        if len(steps) == 5:
+            raise KeyboardInterrupt
+        return learn(learner, *batch)
+
+    monkeypatch.setattr(recipe.Learner, "learn", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        train(ended)
+    train(ended, resume=True)
+    assert len(steps) == 7  # 6 steps, of which the interrupted one was begun twice
+    assert ended.network.read_bytes() == whole.network.read_bytes()
+
+
+def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
+    settings, lines = trained
+    for name in ("best.safetensors", "curves.png", "scores.parquet", "settings.json"):
+        assert (settings.out / name).stat().st_size > 0
+    assert len(pq.read_table(settings.out / "scores.parquet")) == 2
+    assert any("training on" in line for line in lines)
+    assert settings.best.stat().st_size < 8_000_000
+    done = shiftsim.run(
+        "carl",
+        checkpoints=[f"carl={settings.best}"],
+        store=str(toy),
+        workers=1,
+        out=str(tmp_path / "run"),
+    )
+    assert done.is_complete
+
+
+def test_tau_is_chosen_by_driving_the_expert_through_its_labels(small):
+    settings = small(tau=0.0, samples=64, rounds=1)
+    train(settings)
+    rows = pq.read_table(settings.out / "tau.parquet").to_pylist()
+    assert [row["tau"] for row in rows] == [0.2, 0.3, 0.5]
+    assert min(row["none"] for row in rows) > 0.3
+
+
+def test_towns_that_are_tested_on_are_not_trained_on(toy):
+    store = open_store(toy)
+    towns = divide(store, store.tokens, 0)
+    trained = {token for tokens in towns.trained.values() for token in tokens}
+    tested = {token for tokens in towns.tested.values() for token in tokens}
+    assert trained | tested == set(store.tokens)
+    assert not trained & tested
+    assert tested
+
+
+def test_a_folder_holds_one_training(small, tmp_path):
+    settings = small()
+    Training(settings, print)
+    with pytest.raises(ConfigError, match="holds a training already"):
+        Training(settings, print)
+    with pytest.raises(ConfigError, match="seed 5, not 6"):
+        Training(small(seed=6), print, resume=True)
+    settings.state.write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match=r"state\.pt"):
+        Training(settings, print, resume=True)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(ConfigError, match="not empty"):
+        Training(small("full"), print)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rounds": 0}, {"tau": -1.0}, {"seed": -1}, {"workers": 0}, {"samples": 0}]
+)
+def test_numbers_that_make_no_training_are_refused(tmp_path, changes):
+    with pytest.raises(ConfigError):
+        Settings(store="demo", out=tmp_path, **changes)
+
+
+@pytest.mark.thorough
+def test_a_killed_command_goes_on(small, toy):
+    whole, killed = small("whole", samples=12_800), small("killed", samples=12_800)
+    train(whole)
+    words = [*(sys.executable, "-m", "shiftsim", "train", "carl", "--store", str(toy))]
+    words += ["--out", str(killed.out), "--rounds", "2", "--states", "40", "--samples", "12800"]
+    words += ["--tau", "0.3", "--tests", "2", "--workers", "1", "--seed", "5"]
+    process = subprocess.Popen(words)
+    while not killed.network.exists():
+        assert process.poll() is None
+        time.sleep(0.2)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    subprocess.run([*words, "--resume"], check=True)
+    assert killed.network.read_bytes() == whole.network.read_bytes()
