@@ -205,6 +205,7 @@ def _measure_progress(course: Course, x: float, y: float) -> None:
 
 @lean_kernel
 def _is_on_road(course: Course, x: float, y: float) -> bool:
+    # nuPlan rule 365: other drivable areas of the map do not count
     found = containing(course.blocks, x, y, course.found[:1])  # roadblocks come first
     if found > 0 and course.found[0] < course.num_roadblocks:
         return True
