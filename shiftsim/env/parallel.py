@@ -1,8 +1,9 @@
 """Many environments at once, in this process or in several: `gymnasium.make_vec` makes them.
 
-Every process holds a share of the environments. What they see goes into memory that all processes
-see; one message per step and process says that it is there. Observations that somebody still holds
-are never written over: a step takes arrays that have been let go, and copies if there are none.
+Every process, this one included, holds a share of the environments. What they see goes into memory
+that all processes see; one message per step and process says that it is there. Observations that
+somebody still holds are never written over: a step takes arrays that have been let go, and copies
+if there are none.
 """
 
 import pickle
@@ -48,7 +49,7 @@ class _Here:
     """A share in this process."""
 
     def __init__(self, *arguments: Any) -> None:
-        self._share = Share(*arguments)
+        self._share, self._answer = Share(*arguments), None
 
     def ask(self, name: str, *arguments: Any) -> None:
         self._answer = getattr(self._share, name)(*arguments)
@@ -141,7 +142,7 @@ class DrivingVectorEnv(VectorEnv[Any, Any, np.ndarray]):
 
         Args:
             num_envs: Number of environments.
-            num_workers: Number of processes; with 1 everything happens in this one.
+            num_workers: Number of processes that step them, this one included.
             autoreset_mode: When an ended episode is followed by a new one: `NEXT_STEP`, in the
                 step after, which ignores the action, or `SAME_STEP`.
             settings: Those of `DrivingEnv`.
@@ -171,13 +172,13 @@ class DrivingVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._held: list[list[weakref.ref[Any]]] = [[] for _ in range(SETS)]
         self._shares: list[_Holder] = []
         rest = (mode is AutoresetMode.SAME_STEP, self._memory)
-        if num_workers == 1:
-            self._shares.append(_Here(settings, range(num_envs), *rest))
-            return
-        sent = _pickled(settings)
-        for part in np.array_split(np.arange(num_envs), num_workers):
-            places = range(int(part[0]), int(part[-1]) + 1)
+        parts = np.array_split(np.arange(num_envs), num_workers)
+        *others, own = (range(int(part[0]), int(part[-1]) + 1) for part in parts)
+        sent = _pickled(settings) if others else b""
+        for places in others:
             self._shares.append(_Elsewhere(sent, places, *rest))
+        # the last one: it does at once what it is asked for, and meanwhile the others do so too
+        self._shares.append(_Here(settings, own, *rest))
         self._answers()
 
     def reset(
