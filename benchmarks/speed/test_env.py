@@ -69,7 +69,7 @@ def test_processes(note, size, source):
 
     import shiftsim.env
 
-    count = size(16, 2)
+    count = size(32, 2)
     settings = {"num_envs": count, "store": source, "observation": "raster", "noise": "ou-high"}
     make = partial(gymnasium.make_vec, shiftsim.env.ID, terminate=False, **settings)
     made = {
@@ -83,9 +83,9 @@ def test_processes(note, size, source):
         for _ in range(size(10)):
             envs.step(actions)
     best = dict.fromkeys(made, np.inf)
-    for _ in range(size(60)):  # by turns, as a machine is never quiet for long
+    for _ in range(size(30)):  # by turns, as a machine is never quiet for long
         for name, envs in made.items():
-            for _ in range(size(2)):
+            for _ in range(size(5)):
                 began = perf_counter()
                 envs.step(actions)
                 best[name] = min(best[name], (perf_counter() - began) / count)
