@@ -39,7 +39,7 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
     A learned planner without a `checkpoint` takes its published file from the folder of
-    checkpoints.
+    checkpoints, else our own weights where there are any.
 
     Raises:
         ConfigError: The name, the module, the class or an argument is wrong.
@@ -130,7 +130,8 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
     values = _bind(spec, factory, arguments or {})
     learned: dict[str, Any] = {}
     if entry is not None and entry.checkpoint is not None:
-        learned["checkpoint"], values["device"] = factory.fingerprint(**values)
+        learned = factory.fingerprint(**values)
+        values["device"] = learned.pop("device")
         values.pop("checkpoint", None)
     out: dict[str, Any] = {
         "planner": spec,

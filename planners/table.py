@@ -3,8 +3,9 @@
 import importlib.util
 import types
 from dataclasses import dataclass
+from pathlib import Path
 
-from shiftsim.files import checkpoint_folder
+from shiftsim.files import PACKAGE, checkpoint_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,6 +15,20 @@ class Published:
     file: str  # what is published
     project: str  # name of the project that publishes it
     name: str  # file or folder in the folder of checkpoints, where it is found by itself
+    megabytes: int  # of the weights; a file that holds more of the training is larger
+    sha256: str = ""  # of the file, where it is known
+
+    @property
+    def place(self) -> Path:
+        """Where it is found by itself."""
+        return checkpoint_folder() / self.name
+
+    def describe(self) -> str:
+        """What it is and where it is from, in one line."""
+        digest = f", SHA-256 {self.sha256}" if self.sha256 else ""
+        return (
+            f"{self.file} (weights of {self.megabytes} MB{digest}) from the project {self.project}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +42,11 @@ class PlannerEntry:
     arguments: tuple[str, ...] = ()  # names of the arguments it takes
     # what a learned planner loads; it also needs the extra `learned`
     checkpoint: Published | None = None
+    shipped: str = ""  # file of weights of our own, below the package, where they are there
 
 
+OFFICIAL, SHIPPED = "official", "shiftsim"  # words that stand for a checkpoint
+SHIPPED_NOTE = "shiftsim's weights, trained on generated towns; not the paper's"
 _HERE = "shiftsim.planners"
 _NETWORK = ("checkpoint", "device")  # arguments of learned planners
 _IDM = ("min_gap", "headway", "accel_max", "decel_max")
@@ -43,7 +61,9 @@ _ENTRIES = (
             "nuPlan/checkpoints/nuplan_51892_1B/model_best.pth",
             "autonomousvision/CaRL",
             "nuplan_51892_1B",
+            megabytes=8,
         ),
+        "planners/learned/carl/shiftsim.safetensors",
     ),
     PlannerEntry(
         "constant-velocity",
@@ -58,7 +78,10 @@ _ENTRIES = (
         "samples the future of ego and neighbours with a diffusion transformer",
         _NETWORK,
         Published(
-            "model.pth and args.json", "ZhengYinan-AIR/Diffusion-Planner", "diffusion-planner"
+            "model.pth and args.json",
+            "ZhengYinan-AIR/Diffusion-Planner",
+            "diffusion-planner",
+            megabytes=24,
         ),
     ),
     PlannerEntry(
@@ -84,7 +107,7 @@ _ENTRIES = (
         f"{_HERE}.learned.plantf.planner:PlanTF",
         "imitation with a transformer over agents and map",
         _NETWORK,
-        Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt"),
+        Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt", megabytes=8),
     ),
     PlannerEntry(
         "pluto",
@@ -92,7 +115,7 @@ _ENTRIES = (
         f"{_HERE}.learned.pluto.planner:Pluto",
         "imitation with contrastive learning, and a choice among its plans by rules",
         _NETWORK,
-        Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt"),
+        Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt", megabytes=17),
     ),
     PlannerEntry(
         "scripted",
@@ -113,11 +136,20 @@ PLANNERS = types.MappingProxyType({entry.name: entry for entry in _ENTRIES})
 PUBLISHED = {entry.name: entry.checkpoint for entry in _ENTRIES if entry.checkpoint is not None}
 
 
+def shipped_file(planner: str) -> Path | None:
+    """Where our own weights of a planner are; None where there are none."""
+    entry = PLANNERS.get(planner)
+    path = PACKAGE / entry.shipped if entry is not None and entry.shipped else None
+    return path if path is not None and path.is_file() else None
+
+
 def readiness(entry: PlannerEntry) -> str:
     """What is missing to run a planner without further ado, in one line; empty where nothing."""
     if entry.checkpoint is None:
         return ""
     if importlib.util.find_spec("torch") is None:
         return "needs PyTorch: pip install 'shiftsim[learned]'"
-    path = checkpoint_folder() / entry.checkpoint.name
-    return "" if path.exists() else f"no checkpoint: give one, or put it at {path}"
+    path = entry.checkpoint.place
+    if path.exists() or shipped_file(entry.name) is not None:
+        return ""
+    return f"no checkpoint: give one, or put it at {path}"

@@ -1,5 +1,10 @@
 """The environment: a step and a reset, with each observation, in the city scene with 100 agents."""
 
+from functools import partial
+from operator import getitem
+from time import perf_counter
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -12,19 +17,12 @@ RESET_TARGET = 8e-3  # s
 ACTION = np.array([0.1, 0.0], np.float32)
 
 
-class One:
-    """A source of one scenario."""
-
-    def __init__(self, scenario):
-        self._scenario, self.tokens = scenario, (scenario.token,)
-
-    def read(self, token):
-        return self._scenario
-
-
 @pytest.fixture(scope="module")
 def source():
-    return One(bench_scene(100, 0))
+    """A source of one scenario, which can be sent to a process."""
+    scenario = bench_scene(100, 0)
+    read = partial(getitem, {scenario.token: scenario})
+    return SimpleNamespace(tokens=(scenario.token,), read=read)
 
 
 @pytest.fixture
@@ -63,3 +61,40 @@ def test_reset_from_a_store(measure):
     env = DrivingEnv(store="demo")
     env.reset(seed=0)
     measure(env.reset, calls=1, target=RESET_TARGET)
+
+
+def test_processes(note, size, source):
+    """Steps of many environments with rasters: Gymnasium's own way, ours, and two processes."""
+    import gymnasium
+
+    import shiftsim.env
+
+    count = size(32, 2)
+    settings = {"num_envs": count, "store": source, "observation": "raster", "noise": "ou-high"}
+    make = partial(gymnasium.make_vec, shiftsim.env.ID, terminate=False, **settings)
+    made = {
+        "sync": make(vectorization_mode="sync"),
+        "one": make(),
+        "two": make(num_workers=2),
+    }
+    actions = np.tile(ACTION, (count, 1))
+    for envs in made.values():
+        envs.reset(seed=0)
+        for _ in range(size(10)):
+            envs.step(actions)
+    best = dict.fromkeys(made, np.inf)
+    for _ in range(size(30)):  # by turns, as a machine is never quiet for long
+        for name, envs in made.items():
+            for _ in range(size(5)):
+                began = perf_counter()
+                envs.step(actions)
+                best[name] = min(best[name], (perf_counter() - began) / count)
+    for envs in made.values():
+        envs.close()
+    note(**{f"vector_step_{name}": seconds for name, seconds in best.items()})
+    each = ", ".join(f"{name} {1e6 * seconds:.0f} µs" for name, seconds in best.items())
+    faster, ours = best["one"] / best["two"], best["sync"] / best["one"]
+    verdicts = ["met" if ok else "NOT MET" for ok in (faster >= 1.8, ours >= 1.0)]
+    print(f"\nper environment and step: {each}", end="")
+    print(f"; two processes {faster:.2f} times one, target 1.8 {verdicts[0]}", end="")
+    print(f"; one process {ours:.2f} times Gymnasium's, target 1 {verdicts[1]}", end="")

@@ -10,7 +10,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, Self, TypeVar, cast
 
-from shiftsim.planners.learned.checkpoint import checkpoint_fingerprint, load_network
+from shiftsim.planners.learned.checkpoint import (
+    checkpoint_fingerprint,
+    load_network,
+    weights_note,
+)
 from shiftsim.planners.learned.device import require_torch, resolve_device
 from shiftsim.sim.planner import BatchPlanner, Observation, SceneInfo
 from shiftsim.world.state import Command, Trajectory
@@ -31,11 +35,13 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
         self.device = resolve_device(device)
 
     @classmethod
-    def fingerprint(cls, checkpoint: str = "", device: str = "cpu") -> tuple[str, str]:
-        """What tells the weights from others, and the kind of device; arguments as above."""
+    def fingerprint(cls, checkpoint: str = "", device: str = "cpu") -> dict[str, str]:
+        """What tells the weights from others, what to say of them, and the kind of device."""
         require_torch(f"planner {cls.name!r}")
-        weights = checkpoint_fingerprint(checkpoint, cls.name)
-        return weights, resolve_device(device).partition(":")[0]
+        found = {"checkpoint": checkpoint_fingerprint(checkpoint, cls.name)}
+        if note := weights_note(found["checkpoint"], cls.name):
+            found["weights"] = note
+        return {**found, "device": resolve_device(device).partition(":")[0]}
 
     @abstractmethod
     def reset(self, scene: SceneInfo) -> None:

@@ -4,7 +4,9 @@ The authors' own files are read as published: PyTorch-Lightning files (`state_di
 `model.`), Diffusion Planner's `model.pth` (`ema_state_dict`, names with `module.`, `args.json`
 beside it), CaRL's bare state, and safetensors files made of those by `shiftsim checkpoint convert`.
 The words `deterministic:base` and `deterministic:drive` stand for weights made from the names of
-the tensors: good for trying that everything runs; their scores mean nothing.
+the tensors: good for trying that everything runs; their scores mean nothing. `official` is the
+published file in the folder of checkpoints, `shiftsim` our own weights; without any word it is the
+first of the two that is there.
 """
 
 import hashlib
@@ -16,6 +18,7 @@ from typing import Any, NamedTuple
 
 from shiftsim.errors import CheckpointError, nearest
 from shiftsim.files import checkpoint_folder
+from shiftsim.planners import table
 from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
@@ -26,7 +29,7 @@ from shiftsim.planners.learned.reader import (
     read_json_object,
     unreadable,
 )
-from shiftsim.planners.table import PUBLISHED
+from shiftsim.planners.table import OFFICIAL, PUBLISHED, SHIPPED, SHIPPED_NOTE
 from shiftsim.world.ranges import CHECKPOINT
 
 DETERMINISTIC = ("deterministic:base", "deterministic:drive")
@@ -72,7 +75,7 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
 
     Args:
         spec: A file, a folder that holds one, a name in the folder of checkpoints, or one of
-            `DETERMINISTIC`; empty for the published file in the folder of checkpoints.
+            `DETERMINISTIC`; `official`, `shiftsim`, or empty for the first of these two.
         planner: Name of the planner.
         device: Where the tensors go, as in `resolve_device`. Torch is set up for inference there.
 
@@ -101,9 +104,16 @@ def checkpoint_fingerprint(spec: str, planner: str) -> str:
     return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec, planner))
 
 
+def weights_note(fingerprint: str, planner: str) -> str:
+    """What has to be said of weights wherever their scores are; empty for those of others."""
+    shipped = table.shipped_file(planner)
+    own = shipped is not None and file_hash(shipped) in fingerprint.split(",")
+    return SHIPPED_NOTE if own else ""
+
+
 def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
     """The checkpoints of `A,B,C`, or of a folder with one folder for each; else the one given."""
-    path = Path(spec).expanduser() if spec or not planner else _published_path(planner)
+    path = _meant_by(spec, planner) or Path(spec).expanduser()
     members = [] if (path / _MEMBER).exists() else sorted(path.glob(f"*/{_MEMBER}"))
     if members:
         return tuple(str(member) for member in members)
@@ -111,10 +121,9 @@ def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
 
 
 def find_checkpoint(spec: str, planner: str = "") -> Path:
-    """The file that is meant, by default the published one; else a CheckpointError."""
-    given, named = Path(spec).expanduser(), checkpoint_folder() / spec
-    if planner and not spec:
-        given = named = _published_path(planner)
+    """The file that is meant; else a CheckpointError."""
+    meant = _meant_by(spec, planner)
+    given, named = meant or Path(spec).expanduser(), meant or checkpoint_folder() / spec
     for path in (given, named, *(named.with_name(named.name + suffix) for suffix in SUFFIXES)):
         if path.is_file():
             return path
@@ -128,21 +137,33 @@ def find_checkpoint(spec: str, planner: str = "") -> Path:
     )
 
 
-def _published_path(planner: str) -> Path:
-    """Where the published checkpoint lies that is taken where none is given."""
-    path = checkpoint_folder() / PUBLISHED[planner].name
-    if not path.exists():
-        raise CheckpointError(f"planner {planner!r} needs a checkpoint", hint=how_to_get(planner))
-    return path
+def _meant_by(spec: str, planner: str) -> Path | None:
+    """What a word stands for; None where it is none, but the name of a file."""
+    if not planner or spec not in ("", OFFICIAL, SHIPPED):
+        return None
+    official, shipped = PUBLISHED[planner].place, table.shipped_file(planner)
+    if spec != SHIPPED and official.exists():
+        return official
+    if spec != OFFICIAL and shipped is not None:
+        return shipped
+    problem = {
+        "": f"planner {planner!r} needs a checkpoint",
+        OFFICIAL: f"the official checkpoint of planner {planner!r} is not at {str(official)!r}",
+        SHIPPED: f"no weights of shiftsim's own for planner {planner!r} are installed",
+    }[spec]
+    raise CheckpointError(problem, hint=how_to_get(planner))
 
 
 def how_to_get(planner: str) -> str:
     """What to do where a planner has no checkpoint, in one line."""
     if planner not in PUBLISHED:
         return "check the path"
+    published = PUBLISHED[planner]
+    own = f"--checkpoint {planner}={SHIPPED} for {SHIPPED_NOTE}"
+    trial = "to try without: --checkpoint deterministic:drive (scores mean nothing)"
     return (
-        f"get {PUBLISHED[planner].file} from the project {PUBLISHED[planner].project}, then "
-        "--checkpoint PATH; to try without: --checkpoint deterministic:drive (scores mean nothing)"
+        f"get {published.describe()}, and put it at {published.place}, or --checkpoint PATH; "
+        f"{trial if table.shipped_file(planner) is None else own}"
     )
 
 

@@ -33,7 +33,7 @@ def planners(context: typer.Context, as_json: Json = False, debug: Debug = False
 @app.command("list")
 def list_planners(as_json: Json = False, debug: Debug = False) -> None:
     """The planners that come with shiftsim, and whether they are ready to run."""
-    from shiftsim.planners.registry import PLANNERS, readiness
+    from shiftsim.planners.table import PLANNERS, SHIPPED_NOTE, readiness, shipped_file
 
     missing = {name: readiness(entry) for name, entry in PLANNERS.items()}
     if as_json:
@@ -43,8 +43,10 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
     for name, entry in PLANNERS.items():
         say(f" {name:18} {entry.kind:11} {entry.description}")
         if entry.checkpoint is not None:
-            published = f"{entry.checkpoint.file}, of the project {entry.checkpoint.project}"
-            say(f" {'':18} checkpoint  {published}")
+            say(f" {'':18} checkpoint  {entry.checkpoint.describe()}")
+            say(f" {'':18} its place   {entry.checkpoint.place}")
+            if shipped_file(name) is not None:
+                say(f" {'':18} without it  {SHIPPED_NOTE}")
         if entry.arguments:
             say(f" {'':18} arguments   --planner-arg {', '.join(entry.arguments)}")
         if missing[name]:

@@ -3,7 +3,7 @@
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -122,11 +122,16 @@ def _announce(prepared: "Prepared") -> None:
         arguments = prepared.planners[name].arguments
         given = "".join(f"  {key}={value}" for key, value in arguments.items())
         say(f"planner     {name}{given}")
+        if weights := _weights(prepared.planners[name].fingerprint):
+            say(f"weights     {name}, {weights}")
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
     say(
         f"split       {prepared.split}  {found} of {plural(found + missing, 'scenario')} found"
         f"   store {prepared.store}"
     )
+    if prepared.generator:
+        told = (value if k == "name" else f"{k} {value}" for k, value in prepared.generator.items())
+        say(f"data        generated, not recorded: {', '.join(map(str, told))}")
     if prepared.num_dropped:
         say(f"filter      {prepared.num_dropped} dropped scenarios left out (--all keeps them)")
     say(
@@ -150,6 +155,18 @@ def _announce(prepared: "Prepared") -> None:
     if config.resumes:
         say(f"resume      {_BEFORE[prepared.before]}")
     say()
+
+
+def _weights(fingerprint: Mapping[str, Any]) -> str:
+    """Which weights a planner drives with; empty where it has none."""
+    checkpoint = str(fingerprint.get("checkpoint", ""))
+    if not checkpoint:
+        return ""
+    is_name = checkpoint.startswith("deterministic:")
+    said = f"{checkpoint}: made up, the scores mean nothing" if is_name else ""
+    parts = checkpoint.split(",")
+    digest = "" if is_name else f"SHA-256 {' '.join(part[:12] for part in parts)}"
+    return "; ".join(filter(None, (said, str(fingerprint.get("weights", "")), digest)))
 
 
 def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:

@@ -15,4 +15,8 @@ except ModuleNotFoundError as error:
 ID = "shiftsim/Driving-v0"
 
 if ID not in registry:
-    register(ID, entry_point="shiftsim.env.driving:DrivingEnv")
+    register(
+        ID,
+        entry_point="shiftsim.env.driving:DrivingEnv",
+        vector_entry_point="shiftsim.env.parallel:DrivingVectorEnv",
+    )

@@ -5,6 +5,7 @@ infraction: a corner of the ego off the road, or a collision of the moving ego.
 """
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -103,22 +104,20 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
         self._setting = Setting(
             noise=parse_noise(noise) if isinstance(noise, str) else noise,
-            traffic=traffic_name(traffic) if isinstance(traffic, str) else traffic,
+            traffic=traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic),
         )
         if isinstance(traffic, str):
             make_traffic(traffic)
         if isinstance(observation, str):
-            observer = OBSERVATIONS[one_of("observation", observation, OBSERVATIONS)]()
-        else:
-            observer = observation
-        self._observer: Observer = observer
+            observation = OBSERVATIONS[one_of("observation", observation, OBSERVATIONS)]()
+        self.observer = deepcopy(observation)
         self._reward = reward_of(reward)
         self._is_command = one_of("action", action, ACTIONS) == "command"
         self._terminate, self._penalty = terminate, penalty
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(f"render_mode {render_mode!r} unknown", hint="use 'rgb_array'")
         self.render_mode = render_mode
-        self.observation_space = self._observer.space
+        self.observation_space = self.observer.space
         high = np.ones(2) if self._is_command else np.tile([REACH, REACH, np.pi], (POSES, 1))
         self._high = high.astype(np.float32)
         self.action_space = spaces.Box(-self._high, self._high)
@@ -144,6 +143,11 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             ConfigError: There is another option.
             DataError: The store has no scenario of that token.
         """
+        info = self.begin(seed, options)
+        return self.observer.look(self.episode), info
+
+    def begin(self, seed: int | None, options: dict[str, Any] | None) -> dict[str, Any]:
+        """As `reset`, without an observation."""
         super().reset(seed=seed)
         drawn = {
             "token": self._tokens[int(self.np_random.integers(len(self._tokens)))],
@@ -155,9 +159,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         scenario = self._store.read(chosen["token"])
         setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
         self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
-        self._observer.start(episode)
+        self.observer.start(episode)
         info = {"scenario_type": scenario.scenario_type, "log_name": scenario.log_name}
-        return self._observer.look(episode), chosen | info
+        return chosen | info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive one step of 0.1 s.
@@ -165,6 +169,11 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         Raises:
             ConfigError: The episode has ended.
         """
+        driven = self.drive(action)
+        return self.observer.look(self.episode), *driven
+
+    def drive(self, action: Any) -> tuple[float, bool, bool, dict[str, Any]]:
+        """As `step`, without an observation."""
         episode = self.episode
         if episode.is_over:
             raise ConfigError("the episode has ended", hint="call reset()")
@@ -181,7 +190,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             info["error"] = episode.error
         reward = float(self._reward(episode)) + (self._penalty if infraction else 0.0)
         terminated = self._terminate and infraction != ""
-        return self._observer.look(episode), reward, terminated, is_over, info
+        return reward, terminated, is_over, info
 
     def render(self) -> np.ndarray | None:
         """(256, 256, 3) uint8: 128 m around the ego, which drives to the right."""

@@ -69,7 +69,7 @@ class Episode:
     @property
     def infraction(self) -> str:
         """`off_road`, `collision`, or empty: what the last step did wrong."""
-        return "off_road" if self.terms.off_road else "collision" if self.terms.collision else ""
+        return self.terms.infraction
 
     def observe(self) -> Observation:
         """What a planner would see now."""

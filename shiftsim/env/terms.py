@@ -55,6 +55,11 @@ class Terms(NamedTuple):
     collision: bool  # the ego moves and touches a track that it did not touch before
     completion: float  # share of the recorded path that lies behind the ego
 
+    @property
+    def infraction(self) -> str:
+        """`off_road`, `collision`, or empty."""
+        return "off_road" if self.off_road else "collision" if self.collision else ""
+
 
 class Course(NamedTuple):
     """One episode as the kernels see it. K samples, N tracks, T iterations."""
@@ -132,7 +137,11 @@ def make_course(log: SimulationLog, road: VectorMap) -> Course:
 
 def terms_of(course: Course) -> Terms:
     """The terms that `look_back` has written."""
-    out = course.out.tolist()
+    return make_terms(course.out.tolist())
+
+
+def make_terms(out: list[float]) -> Terms:
+    """Terms of nine numbers."""
     return Terms._make([*out[:_OFF_ROAD], out[_OFF_ROAD] > 0.0, out[_COLLISION] > 0.0, out[_DONE]])
 
 
@@ -196,6 +205,7 @@ def _measure_progress(course: Course, x: float, y: float) -> None:
 
 @lean_kernel
 def _is_on_road(course: Course, x: float, y: float) -> bool:
+    # nuPlan rule 365: other drivable areas of the map do not count
     found = containing(course.blocks, x, y, course.found[:1])  # roadblocks come first
     if found > 0 and course.found[0] < course.num_roadblocks:
         return True

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from shiftsim.errors import one_of
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
 from shiftsim.report import data_tables, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import Group, made_up_note
+from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_note
 from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
@@ -29,6 +29,7 @@ TABLES = (
     "data-statistics",
     "benchmark-comparison",
 )
+_ASK = "the run must say --checkpoint PLANNER=shiftsim"
 _ABOUT_DATA = ("data-statistics", "benchmark-comparison")
 _LONG = ("planner-comparison-noise", *_ABOUT_DATA)
 BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
@@ -51,9 +52,20 @@ class Options:
 def make_tables(
     groups: Sequence[Group], published: Published | None = None, options: Options | None = None
 ) -> list[Table]:
-    """The tables of a report, in the order of `TABLES`; without `options` everything is shown."""
+    """The tables of a report, in the order of `TABLES`; without `options` everything is shown.
+
+    Beside published figures stands no planner with weights of our own that nobody asked for.
+
+    Raises:
+        ConfigError: Nothing is left beside them.
+    """
     chosen = options or Options()
     partial = chosen.allow_partial
+    left_out = [group for group in groups if chosen.beside and is_stand_in(group)]
+    groups = [group for group in groups if group not in left_out]
+    stand_ins = weights_note(group.run for group in left_out)
+    if left_out and not groups:
+        raise ConfigError(f"nothing to show beside published figures: {stand_ins}", hint=_ASK)
     beside = published if chosen.beside else None
     statistics = cache(lambda: data_tables.own_statistics(groups))
     makers: dict[str, Callable[[], Sequence[Table | None]]] = {
@@ -71,14 +83,15 @@ def make_tables(
             [data_tables.benchmark_comparison(published, statistics())] if published else []
         ),
     }
-    made_up = made_up_note(group.run for group in groups)
+    runs = [group.run for group in groups]
+    notes = [made_up_note(runs), weights_note(runs), stand_ins and f"left out: {stand_ins}; {_ASK}"]
     out: list[Table] = []
     for name in (name for name in TABLES if name in chosen.tables):
-        note = "" if name in _ABOUT_DATA else made_up
         for table in filter(None, makers[name]()):
-            said = any(note in other for other in table.notes)
-            notes = table.notes if said or not note else (*table.notes, note)
-            out.append(replace(table, name=_unused(table.name, out), notes=notes))
+            of_planners = [] if name in _ABOUT_DATA else filter(None, notes)
+            more = (n for n in of_planners if not any(n in other for other in table.notes))
+            named = _unused(table.name, out)
+            out.append(replace(table, name=named, notes=(*table.notes, *more)))
     return out
 
 

@@ -160,6 +160,31 @@ def made_up_note(runs: Iterable[Run]) -> str:
     return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
 
 
+def weights_note(runs: Iterable[Run]) -> str:
+    """Which planners drove with weights of our own, in place of their authors'."""
+    identities = (run.manifest["determining"]["planners"].items() for run in runs)
+    said = {
+        f"{name}, {identity['weights']}"
+        for items in identities
+        for name, identity in items
+        if isinstance(identity, dict) and identity.get("weights")
+    }
+    return "; ".join(sorted(said))
+
+
+def is_stand_in(group: Group) -> bool:
+    """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
+    manifest = group.run.manifest
+    name = group.planner.partition(" @")[0]
+    identity = manifest["determining"]["planners"].get(name)
+    if not isinstance(identity, dict) or not identity.get("weights"):
+        return False
+    config = manifest["config"]
+    given = [text.partition("=") for text in config.get("checkpoints", ())]
+    named = any(not equals or owner == name for owner, equals, _ in given)
+    return not named and "checkpoint" not in config.get("planner_args", {}).get(name, {})
+
+
 def recording_note(run: Run) -> str:
     """Which planners of a run were given the recording, the future included."""
     planners = run.manifest["determining"]["planners"].items()

@@ -17,7 +17,14 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import one_of
 from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.explain import REASONS
-from shiftsim.report.groups import COLUMNS, Group, made_up_note, read_groups, recording_note
+from shiftsim.report.groups import (
+    COLUMNS,
+    Group,
+    made_up_note,
+    read_groups,
+    recording_note,
+    weights_note,
+)
 from shiftsim.report.tables import Cell, Number, Table, text
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -114,7 +121,8 @@ def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: boo
 def _describe(group: Group) -> str:
     """What stands beside every printed score."""
     data = group.data
-    notes = [note for note in (made_up_note([group.run]), recording_note(group.run)) if note]
+    said = (made_up_note([group.run]), weights_note([group.run]), recording_note(group.run))
+    notes = [note for note in said if note]
     return (
         f"split {data.label} ({len(data.tokens)} scenarios) · "
         f"traffic {group.run.manifest['determining']['traffic']} · controller {data.controller} · "

@@ -111,7 +111,7 @@ class RunConfig:
         (), "Own metric as package.module:function; repeatable.", "--metric"
     )
     checkpoints: tuple[str, ...] = _setting(
-        (), "PATH, or PLANNER=PATH; repeatable.", "--checkpoint"
+        (), "PATH, official or shiftsim; or PLANNER=…; repeatable.", "--checkpoint"
     )
     device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
     batch_size: int = _setting(1, "Scenarios per forward pass of a learned planner. [1]", least=1)

@@ -59,6 +59,7 @@ class Prepared:
     folder: Path  # where the run folder will be
     before: State  # what it holds now
     workers: int  # number of worker processes
+    generator: Mapping[str, Any]  # what made the scenarios up; empty where they were recorded
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -131,6 +132,7 @@ def prepare(
         folder=folder,
         before=before,
         workers=_workers(config, entries, len(batches)),
+        generator=getattr(store, "generator", {}),
     )
 
 

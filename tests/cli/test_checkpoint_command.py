@@ -14,6 +14,7 @@ if importlib.util.find_spec("torch") is None:
 from checkpoint_files import LEARNED, Callback, lightning_entries, save, state_of, write_published
 
 from shiftsim.planners.learned.checkpoint import load_weights
+from shiftsim.planners.table import shipped_file
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow, pytest.mark.thorough]
 
@@ -103,13 +104,15 @@ def test_what_cannot_be_done_is_two_lines(place, words, fact, hint):
 def test_planners_says_what_is_wanted_and_what_is_ready(place):
     done = call(place, "planners")
     assert done.returncode == 0, done.stderr
-    assert "planTF.ckpt, of the project jchengai/planTF" in done.stdout
+    own = shipped_file("carl") is not None
+    wanted = "planTF.ckpt (weights of 8 MB) from the project jchengai/planTF"
+    assert wanted in done.stdout
     assert f"no checkpoint: give one, or put it at {place / 'mine' / 'planTF.ckpt'}" in done.stdout
-    assert "6 of 10 are ready to run" in done.stdout
+    assert f"{6 + own} of 10 are ready to run" in done.stdout
     (place / "mine").mkdir()
     (place / "mine" / "planTF.ckpt").symlink_to(place / "planTF.ckpt")
     rows = {row["name"]: row for row in json.loads(call(place, "planners", "--json").stdout)}
     assert rows["plantf"]["ready"]
-    assert [rows[name]["ready"] for name in LEARNED] == [False, False, True, False]
+    assert [rows[name]["ready"] for name in LEARNED] == [own, False, True, False]
     assert rows["carl"]["checkpoint"]["project"] == "autonomousvision/CaRL"
-    assert "7 of 10 are ready to run" in call(place, "planners", "list").stdout
+    assert f"{7 + own} of 10 are ready to run" in call(place, "planners", "list").stdout

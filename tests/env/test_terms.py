@@ -2,45 +2,30 @@
 
 from dataclasses import replace
 
+import episodes
 import numpy as np
 import pytest
 import shapely
+from episodes import replay
 from worlds import cruise_scenario, standing_tracks, straight_road
 
-from shiftsim.data.demo.store import demo_store
-from shiftsim.data.store.reading import open_store
 from shiftsim.env.driving import DrivingEnv
-from shiftsim.env.episode import REWARDS, Episode, nuplan, regular, survival
+from shiftsim.env.episode import Episode, nuplan, regular, survival
 from shiftsim.env.terms import Terms
-from shiftsim.metrics import measure
 from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import NUPLAN
-from shiftsim.sim.log import as_recorded
 from shiftsim.sim.loop import Setting
 from shiftsim.world.layers import make_layer
 from shiftsim.world.state import AgentKind, Command, center_poses, speeds
 
-REPLAY = Setting(controller="log-playback")
 ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`
 GOOD = Terms(0.01, 1.0, 1.0, 1.0, 1.0, 1.0, False, False, 0.5)
 
 
-def replay(scenario):
-    """The recording as an episode, step by step."""
-    episode = Episode(scenario, REPLAY, np.zeros(2, np.float32))
-    while not episode.is_over:
-        episode.advance(Command(0.0, 0.0))
-        yield episode
-
-
 def totals(scenario):
-    """What the recording earns by reward, and whether it has infractions."""
-    total, bad = dict.fromkeys(REWARDS, 0.0), []
-    for episode in replay(scenario):
-        for name, reward in REWARDS.items():
-            total[name] += reward(episode)
-        bad += [(episode.iteration, episode.infraction)] if episode.infraction else []
-    return total, bad
+    """What the recording earns by reward, and its infractions."""
+    total, account = episodes.totals(scenario)
+    return total, account.off_road + account.collisions
 
 
 def driven(commands, **options):
@@ -235,26 +220,3 @@ def test_speeds_are_those_of_the_rear_axle():
     over = speeds(episode.log.ego[1:101]) - 9.0
     expected = np.clip(1.0 - over / 2.23, 0.0, 1.0)
     np.testing.assert_allclose([t.speed for t in terms], expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-def test_the_recordings_of_the_demo_earn_about_a_hundred(tmp_path):
-    store = open_store(demo_store(tmp_path / "demo"))
-    earned = {}
-    for scenario in store:
-        total, bad = totals(scenario)
-        earned[scenario.token] = total["regular"]
-        last = list(replay(scenario))[-1].terms
-        assert (1, "collision") not in bad
-        if not bad and last.ttc == 1.0:
-            # what is left of the way is driven after the last sample, which for an ego that has
-            # just set off is much of it; a moment off the centre line costs little
-            assert (
-                100.0 * last.completion - 6.0 < total["regular"] <= 100.0 * last.completion + 1e-9
-            )
-        if any(step == 1 for step, _ in bad):
-            area = measure(as_recorded(scenario), scenario.map).drivable
-            assert area.outside[0].any()
-    assert np.median(list(earned.values())) > 99.0
-    assert sorted(earned.values())[len(earned) // 10] > 90.0

@@ -130,3 +130,20 @@ def test_a_request_to_end_keeps_what_is_finished_and_says_how_to_go_on(toy, tmp_
     done = subprocess.run([*command, "--resume"], cwd=tmp_path, env=environment, check=False)
     assert done.returncode == 0
     assert shiftsim.open_run(tmp_path / "run").is_complete
+
+
+def test_a_run_says_where_its_data_was_made_up(toy, capsys, monkeypatch):
+    from dataclasses import replace
+
+    from shiftsim.runs import prepare
+
+    words = ("-p", "constant-velocity", "--store", str(toy), "--dry-run")
+    main_of = prepare.prepare
+    for generator in ({}, {"name": "towns", "seed": 1, "towns": 300}):
+        monkeypatch.setattr(
+            prepare, "prepare", lambda config, g=generator: replace(main_of(config), generator=g)
+        )
+        with pytest.raises(SystemExit):
+            main(["run", *words])
+        line = "data        generated, not recorded: towns, seed 1, towns 300\n"
+        assert (line in capsys.readouterr().out) == bool(generator)

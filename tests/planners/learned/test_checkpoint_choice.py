@@ -49,6 +49,7 @@ def test_a_folder_with_several_is_ambiguous(tmp_path):
     assert "a.ckpt, b.ckpt" in caught.value.hint
 
 
+@pytest.mark.usefixtures("no_weights_of_our_own")
 @pytest.mark.parametrize("planner", LEARNED)
 def test_without_a_checkpoint_the_error_says_where_to_get_it(planner):
     with pytest.raises(CheckpointError, match=f"planner '{planner}' needs a checkpoint") as caught:
