@@ -103,7 +103,7 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         self._traffic.start(scenario, self._tracks, start)
-        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights, start)
+        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
         self._noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
