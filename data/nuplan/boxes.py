@@ -69,7 +69,10 @@ def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
     """The boxes that something can touch, with positive sizes."""
     places, sizes = boxes.values[:, :2], boxes.values[:, 5:7]
     for bad, what in (
-        (np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2]), "a pose that is not finite"),
+        (
+            np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2]),
+            "a pose that is not finite",
+        ),
         (~np.isfinite(sizes).all(axis=1), "no finite length or width"),
     ):
         if bad.any():
@@ -81,7 +84,7 @@ def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
             )
     # nuPlan rule 429
     is_near = STORE["x_m"].holds(places).all(axis=1)
-    is_flat = is_near & (sizes == 0.0).any(axis=1)
+    is_flat = is_near & (np.abs(sizes) < STORE["length_m"].low).any(axis=1)
     is_negative = is_near & ~is_flat & (sizes < 0.0).any(axis=1)
     for odd, what in (
         (is_flat, "boxes without length or width touch nothing and are left out"),
