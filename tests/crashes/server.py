@@ -58,9 +58,10 @@ class Forked:
         if self.pid == 0:
             shim.shim_arm(b"", MODES.index("count"), 0)
             os.setpgid(0, 0)
-            code = 1
+            code, handle = 1, os.dup2(theirs.fileno(), 3)
+            os.closerange(4, os.sysconf("SC_OPEN_MAX"))  # else no end of a socket is the last one
             try:
-                workers.serve(parent, os.dup(theirs.fileno()))
+                workers.serve(parent, handle)
                 code = 0
             finally:
                 os._exit(code)
