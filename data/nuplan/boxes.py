@@ -9,6 +9,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.nuplan.log import Log, as_numbers, note_implausible, read_rows, token_text
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import STORE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
 
 _COLUMNS = {
@@ -34,7 +35,7 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
     """Objects of the rows first … last - 1.
 
     Raises:
-        ConversionError: A category is unknown, a pose is not finite or a box has no extent.
+        ConversionError: A category is unknown, or a pose or a size is no finite number.
     """
     row, rows = read_rows(
         log,
@@ -57,23 +58,46 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
     order = np.lexsort((np.arange(len(rows)), kind, row))
     token = [token_text(rows[i][0], log.path, "track") for i in order.tolist()]
     boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
-    _check_boxes(log, boxes)
     counts = Counter[str]() if flaws is None else flaws
+    boxes = _checked(log, boxes, counts)
     note_implausible(log, "lidar_box", _COLUMNS, boxes.values[:, :7], counts)
     return boxes
 
 
-def _check_boxes(log: Log, boxes: Boxes) -> None:
-    finite, sizes = np.isfinite(boxes.values[:, :3]).all(axis=1), boxes.values[:, 5:7]
-    extended = ((sizes > 0.0) & np.isfinite(sizes)).all(axis=1)
-    for good, what in ((finite, "a pose that is not finite"), (extended, "no length or width")):
-        if not good.all():
-            box = int(np.flatnonzero(~good)[0])
+def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
+    """The boxes that something can touch, with positive sizes."""
+    places, sizes = boxes.values[:, :2], boxes.values[:, 5:7]
+    for bad, what in (
+        (
+            np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2]),
+            "a pose that is not finite",
+        ),
+        (~np.isfinite(sizes).all(axis=1), "no finite length or width"),
+    ):
+        if bad.any():
+            box = int(np.flatnonzero(bad)[0])
             raise ConversionError(
                 f"{log.path}: lidar_box of track {boxes.token[box]!r} at lidar_pc"
                 f" {log.tokens[int(boxes.row[box])]!r} has {what}",
                 hint="leave this scenario out or repair the log",
             )
+    # nuPlan rule 436
+    is_near = STORE["x_m"].holds(places).all(axis=1)
+    is_flat = is_near & (np.abs(sizes) < STORE["length_m"].low).any(axis=1)
+    is_negative = is_near & ~is_flat & (sizes < 0.0).any(axis=1)
+    for odd, what in (
+        (is_flat, "boxes without length or width touch nothing and are left out"),
+        (~is_near, "boxes off the earth touch nothing and are left out"),
+        (is_negative, "boxes of negative length or width cover the same area as positive ones"),
+    ):
+        if odd.any():
+            first = boxes.token[int(np.flatnonzero(odd)[0])]
+            first = log.examples.setdefault(what, first)
+            flaws[f"lidar_box: {what}; first of track {first!r}"] += int(odd.sum())
+    keep = np.flatnonzero(is_near & ~is_flat)
+    values = boxes.values[keep]
+    values[:, 5:7] = np.abs(values[:, 5:7])
+    return Boxes(boxes.row[keep], [boxes.token[i] for i in keep.tolist()], boxes.kind[keep], values)
 
 
 def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tracks:

@@ -60,6 +60,9 @@ class Log:
     scenes: list[bytes]  # R tokens of the scenes
     is_offered: BoolArray  # (R,) whether nuPlan offers the row as a scenario
     row_of: dict[str, int] = field(init=False)  # row by token
+    # the first track that was found with something odd, by what it is: warnings of several parts of
+    # a log name the same one
+    examples: dict[str, str] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.row_of = {token: row for row, token in enumerate(self.tokens)}

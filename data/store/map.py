@@ -61,7 +61,12 @@ SCHEMA = _schema()
 
 
 def write_map(path: Path, road: VectorMap) -> None:
-    """Write a map; equal maps give equal bytes."""
+    """Write a map; equal maps give equal bytes.
+
+    Raises:
+        DataError: A number is outside of its range, or an index of something that is not there.
+    """
+    require_sound(road, str(path))
     values: dict[str, Any] = {}
     for name, kind in _groups().items():
         group = getattr(road, name)

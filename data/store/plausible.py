@@ -1,12 +1,15 @@
 """Is what a store holds usable? Rows of windows, numbers in their ranges, indices that exist."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, read_only
 from shiftsim.data.recording import Window
-from shiftsim.data.store.schema import EGO_COLUMNS, TRACKS
+from shiftsim.data.store.schema import EGO_COLUMNS, SCENARIOS, TRACKS
 from shiftsim.data.store.tables import FRAMES, REPAIR, ego_file
 from shiftsim.data.store.tables import TRACKS as TRACKS_FILE
 from shiftsim.errors import DataError
@@ -14,6 +17,7 @@ from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.ranges import STORE, require
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks, TrafficLights
 
 _BOX = TRACKS.names[2:]  # x, y, heading, velocity, size
 _EGO_LIMITS, _BOX_LIMITS = (
@@ -30,24 +34,70 @@ def require_rows(window: Window, where: str) -> None:
         raise DataError(what, REPAIR)
 
 
+def require_scenarios(table: pa.Table, where: str) -> None:
+    """Refuse a table of scenarios with a number outside of its range."""
+    for field in SCENARIOS:
+        column = table[field.name]
+        if field.name == "goal_pose" and not set(
+            pc.list_value_length(column).unique().to_pylist()
+        ) <= {0, 3}:
+            raise DataError(f"{where} 'goal_pose' holds no pose", REPAIR)
+        if field.name in STORE:
+            flat = column.combine_chunks()
+            values = flat.flatten() if pa.types.is_list(field.type) else flat
+            require(STORE, field.name, values.to_numpy(zero_copy_only=False), where)
+
+
 def require_plausible(scene: Scenario, ego: str, folder: Path) -> None:
     """Refuse a scenario with a number outside of its range; `folder` is that of its recording."""
-    frames, tracks = f"{folder / FRAMES}: column", scene.tracks
-    require(STORE, "time_us", scene.time_us, frames)
-    if (np.diff(scene.time_us) < 0).any() or (np.diff(scene.iteration_times) <= 0).any():
-        raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
-    require(STORE, "light_status", scene.traffic_lights.status, frames)
+    require_recording(scene.time_us, scene.tracks, scene.traffic_lights, folder)
+    if (np.diff(scene.iteration_times) <= 0).any():
+        raise DataError(f"{folder / FRAMES}: column 'time_us' does not increase", REPAIR)
+    require_states(scene.ego, ego_file(folder, ego))
+
+
+def require_states(states: FloatArray, file: Path) -> None:
+    """Refuse ego states (R, 11) with a number outside of its range."""
+    _require(states.ndim == 2 and states.shape[1] == len(EGO_COLUMNS), str(file))
     low, high = _EGO_LIMITS.T
-    if not ((scene.ego >= low) & (scene.ego <= high)).all():
-        for name, values in zip(EGO_COLUMNS, scene.ego.T, strict=True):
-            require(STORE, name, values, f"{ego_file(folder, ego)}: column")
+    if not ((states >= low) & (states <= high)).all():
+        for name, values in zip(EGO_COLUMNS, states.T, strict=True):
+            require(STORE, name, values, f"{file}: column")
+
+
+def require_recording(
+    time_us: IntArray, tracks: Tracks, lights: TrafficLights, folder: Path
+) -> None:
+    """Refuse a recording whose arrays do not fit together, or with a number outside of its range.
+
+    `folder` is where it is, or is to be written.
+    """
+    frames = f"{folder / FRAMES}: column"
+    require(STORE, "time_us", time_us, frames)
+    if (np.diff(time_us) < 0).any():  # they may repeat, nuPlan rule 431
+        raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
+    _require(lights.status.shape == (len(time_us), len(lights.connector_ids)), frames)
+    require(STORE, "light_status", lights.status, frames)
+    boxes = f"{folder / TRACKS_FILE}"
+    shape = (len(time_us), len(tracks.tokens))
+    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], boxes)
+    require(STORE, "kinds", tracks.kinds, f"{boxes}: footer")
     arrays = tracks.poses, tracks.velocities, tracks.sizes
-    row, track = _first_outside(tracks.valid, *arrays, _BOX_LIMITS)
+    for array, width in zip(arrays, (3, 2, 2), strict=True):
+        _require(array.shape == (*shape, width), boxes)
+    poses, velocities, sizes = (_plain(array, np.float64) for array in arrays)
+    valid = _plain(tracks.valid, np.bool_)
+    row, track = _first_outside(valid, poses, velocities, sizes, _BOX_LIMITS)
     if row >= 0:
-        where = f"{folder / TRACKS_FILE}: track {tracks.tokens[track]!r}, row {row}: column"
+        where = f"{boxes}: track {tracks.tokens[track]!r}, row {row}: column"
         values = np.concatenate([array[row, track] for array in arrays])
         for name, value in zip(_BOX, values, strict=True):
             require(STORE, name, value, where, may_be_nan=name in ("vx_mps", "vy_mps"))
+
+
+def _plain(array: Any, kind: Any) -> Any:
+    """As the kernel takes it."""
+    return read_only(np.ascontiguousarray(array, kind))
 
 
 @kernel

@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.plausible import require_plausible, require_rows
+from shiftsim.data.store.plausible import require_plausible, require_rows, require_scenarios
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
 from shiftsim.errors import DataError, beginning
 from shiftsim.world.map import VectorMap
-from shiftsim.world.ranges import STORE, require
 from shiftsim.world.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -60,24 +58,13 @@ class ScenarioStore:
         if self.is_reviewed:
             len(self.reviews)  # a damaged file is noticed now
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
-        self._check_table(f"{path / tables.SCENARIOS}: column")
+        where = f"{path / tables.SCENARIOS}: column"
+        if len(self._row_of) != len(self.tokens):
+            raise DataError(f"{where} 'token' holds one twice", tables.REPAIR)
+        require_scenarios(self._table, where)
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
         self._egos: dict[tuple[str, str], tables.Table] = {}
-
-    def _check_table(self, where: str) -> None:
-        if len(self._row_of) != len(self.tokens):
-            raise DataError(f"{where} 'token' holds one twice", tables.REPAIR)
-        for field in schema.SCENARIOS:
-            column = self._table[field.name]
-            if field.name == "goal_pose" and not set(
-                pc.list_value_length(column).unique().to_pylist()
-            ) <= {0, 3}:
-                raise DataError(f"{where} 'goal_pose' holds no pose", tables.REPAIR)
-            if field.name in STORE:
-                flat = column.combine_chunks()
-                values = flat.flatten() if pa.types.is_list(field.type) else flat
-                require(STORE, field.name, values.to_numpy(zero_copy_only=False), where)
 
     def __repr__(self) -> str:
         return f"<ScenarioStore {self.path.name}: {len(self)} scenarios in {len(self.cities)} maps>"

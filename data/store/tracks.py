@@ -11,6 +11,7 @@ import pyarrow as pa
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.store import schema
+from shiftsim.data.store.plausible import require_recording, require_states
 from shiftsim.data.store.tables import FRAMES, REPAIR, TRACKS, Table, ego_file, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.ranges import STORE, require
@@ -18,8 +19,13 @@ from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
-    """Write frames and tracks of a recording."""
+    """Write frames and tracks of a recording.
+
+    Raises:
+        DataError: Its arrays do not fit together, or hold a number outside of its range.
+    """
     lights = recording.lights
+    require_recording(recording.time_us, recording.tracks, lights, folder)
     offsets = np.arange(len(lights.status) + 1, dtype=np.int32) * lights.status.shape[1]
     status = pa.ListArray.from_arrays(
         pa.array(offsets),
@@ -41,7 +47,12 @@ def write_recording(folder: Path, recording: Recording) -> None:
 
 
 def write_ego(folder: Path, ego: EgoTrace) -> None:
-    """Write the states of one ego."""
+    """Write the states of one ego.
+
+    Raises:
+        DataError: A number is outside of its range.
+    """
+    require_states(ego.states, ego_file(folder, ego.name))
     columns = [pa.array(np.ascontiguousarray(ego.states[:, i])) for i in range(NUM_STATE)]
     table = pa.Table.from_arrays(columns, schema=schema.EGO)
     footer = {"name": ego.name, "first_row": ego.first_row}

@@ -4,6 +4,8 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pyarrow as pa
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import write_map
+from shiftsim.data.store.plausible import require_rows, require_scenarios
 from shiftsim.data.store.reading import window_of
 from shiftsim.data.store.tracks import write_ego, write_recording
 from shiftsim.errors import DataError
@@ -36,10 +39,19 @@ def window_row(window: Window, city: str) -> dict[str, Any]:
     }
 
 
+@contextmanager
+def _to_be_written() -> Iterator[None]:
+    try:
+        yield
+    except DataError as error:
+        raise DataError(str(error), "correct what is given; it is not written") from error
+
+
 class StoreWriter:
     """Writes a store, or adds to one. Use it in a `with` block; it is complete at the end.
 
-    What is added again replaces what is there. Equal content gives equal bytes.
+    What is added again replaces what is there. Equal content gives equal bytes. Numbers are in the
+    ranges in which they can be read (docs/input_ranges.md), or an error says which is not.
     """
 
     def __init__(self, path: str | Path, generator: dict[str, Any] | None = None) -> None:
@@ -83,30 +95,46 @@ class StoreWriter:
         return window_of(self._rows[token])
 
     def add_map(self, road: VectorMap) -> None:
-        """Write a map."""
+        """Write a map.
+
+        Raises:
+            DataError: A number is outside of its range, or an index of something that is not there.
+        """
         path = tables.map_file(self.path, road.name)
-        write_map(path, road)
+        with _to_be_written():
+            write_map(path, road)
         self._note(path)
 
     def add_recording(self, recording: Recording) -> None:
-        """Write a recording."""
+        """Write a recording.
+
+        Raises:
+            DataError: Its arrays do not fit together, or hold a number outside of its range.
+        """
         folder = tables.recording_folder(self.path, recording.log_name)
-        write_recording(folder, recording)
+        with _to_be_written():
+            write_recording(folder, recording)
         self._note(folder / tables.FRAMES)
         self._note(folder / tables.TRACKS)
         self._cities[recording.log_name] = recording.city
 
     def add_ego(self, ego: EgoTrace) -> None:
-        """Write the states of an ego."""
+        """Write the states of an ego.
+
+        Raises:
+            DataError: A number is outside of its range.
+        """
         folder = tables.recording_folder(self.path, ego.log_name)
-        write_ego(folder, ego)
+        with _to_be_written():
+            write_ego(folder, ego)
         self._note(tables.ego_file(folder, ego.name))
 
     def add_window(self, window: Window) -> None:
         """Add a scenario; its recording and ego are added before.
 
         Raises:
-            DataError: The recording or the ego is not in the store.
+            DataError: The recording or the ego is not in the store, or a number is outside of its
+                range.
         """
         folder = tables.recording_folder(self.path, window.log_name)
         for path in (folder / tables.FRAMES, tables.ego_file(folder, window.ego)):
@@ -115,7 +143,12 @@ class StoreWriter:
                     f"scenario {window.token!r}: the store does not have {self._name(path)}",
                     hint="add the recording and the ego before the window",
                 )
-        self._rows[window.token] = window_row(window, self._cities[window.log_name])
+        row, file = window_row(window, self._cities[window.log_name]), self.path / tables.SCENARIOS
+        table = pa.Table.from_pylist([row], schema=schema.SCENARIOS)
+        with _to_be_written():
+            require_rows(window, str(file))
+            require_scenarios(table, f"{file}: scenario {window.token!r}: column")
+        self._rows[window.token] = row
 
     def take_recording(self, folder: Path, log_name: str, rows: list[dict[str, Any]]) -> None:
         """Move a recording that was written elsewhere into the store, with all its scenarios.

@@ -4,12 +4,15 @@ Two steps: `prepare` checks everything that can be checked before the first simu
 `execute` does the tasks.
 """
 
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+import logging
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from threading import get_ident
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from shiftsim.errors import DataError
 from shiftsim.planners.registry import planner_name
@@ -22,9 +25,12 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_named_store, write_bundle
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+from shiftsim.sim.plan_check import SHORT
 
 if TYPE_CHECKING:
     from shiftsim.runs.workers import MakeFunction, Outcome
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +141,14 @@ def record(
     on_progress: Watch,
 ) -> None:
     """Put results on disk as they come, batch by batch, and tell how far the run is."""
+    short = set[str]()
     for results in batches:
         for result in results:
             add(result)
             progress = progress.after(result)
+            if result.is_short and result.task.planner not in short:
+                short.add(result.task.planner)
+                _LOG.warning("planner %s: %s", result.task.planner, SHORT)
         on_progress(progress)
 
 
@@ -165,12 +175,33 @@ def _results(
     config = prepared.config
     make = partial(TaskRunner, config, prepared.store, prepared.planners, prepared.noises)
     if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
-        with closing(make()) as run_batch:
+        with closing(make()) as run_batch, _no_exit():
             for batch in batches:
                 yield run_batch(batch)
         return
     with closing(_outcomes(prepared, make, batches)) as outcomes:
         yield from map(ended, outcomes)
+
+
+@contextmanager
+def _no_exit() -> Iterator[None]:
+    """Have a planner that calls `os._exit` fail its task, as it does where a worker dies of it.
+
+    Else the command would end without a word or a table, and with the code that the planner chose.
+    Other threads, and processes that a planner forks, leave as they like.
+    """
+    leave, here = os._exit, (os.getpid(), get_ident())
+
+    def refuse(status: int) -> NoReturn:
+        if (os.getpid(), get_ident()) != here:
+            leave(status)
+        raise SystemExit(f"os._exit({status})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = leave
 
 
 def _outcomes(

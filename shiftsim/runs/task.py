@@ -25,7 +25,7 @@ from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.loop import Rollout, Setting, simulate, simulate_together
+from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import Planner
 from shiftsim.world.scenario import Scenario
@@ -117,11 +117,12 @@ class TaskRunner:
         with watch("simulate_seconds"):
             planner = self._planner(task)
             try:
-                log = simulate(scenario, planner, self._setting(task))
+                rollout = Rollout(scenario, planner, self._setting(task))
+                log = drive(rollout)
             finally:
                 if planner is not None:
                     self._originals[task.planner].release(planner)
-        return self._scored(task, scenario, log, watch)
+        return self._scored(task, rollout, log, watch)
 
     def _together(self, batch: Batch) -> list[TaskResult]:
         """Several tasks in lock step; each of them fails for itself."""
@@ -138,7 +139,7 @@ class TaskRunner:
         share = (perf_counter() - began) / max(1, len(logs))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
             watches[task].seconds["simulate_seconds"] = share
-            score = partial(self._scored, task, rollout.scenario, log, watches[task])
+            score = partial(self._scored, task, rollout, log, watches[task])
             results[task] = attempt(task, score)
         return [replace(results[task], seconds=watches[task].seconds) for task in batch.tasks]
 
@@ -148,20 +149,27 @@ class TaskRunner:
         return Rollout(scenario, self._planner(task), self._setting(task))
 
     def _scored(
-        self, task: Task, scenario: Scenario, log: SimulationLog | Exception, watch: Stopwatch
+        self, task: Task, rollout: Rollout, log: SimulationLog | Exception, watch: Stopwatch
     ) -> TaskResult:
         if isinstance(log, Exception):
             raise log
+        scenario = rollout.scenario
         watch.seconds.update(planning_times(log))
         with watch("metrics_seconds"):
             scores, metrics = score_rollout(scenario, log, self.config)
         keep = self.config.save_rollouts
-        rollout = b""
+        stored = b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             reactive = self.config.traffic != "nonreactive"
-            rollout = encode_rows(rollout_rows(log, with_tracks=reactive))
+            stored = encode_rows(rollout_rows(log, with_tracks=reactive))
         return TaskResult(
-            task, OK, scenario.scenario_type, scores=scores, metrics=metrics, rollout=rollout
+            task,
+            OK,
+            scenario.scenario_type,
+            scores=scores,
+            metrics=metrics,
+            rollout=stored,
+            is_short=rollout.is_short,
         )
 
     def _setting(self, task: Task) -> Setting:

@@ -87,6 +87,7 @@ class Rollout:
         self.scenario = scenario
         self.planner = planner
         self.iteration = 0
+        self.is_short = False  # whether the tracker was given a first plan of less than 1 s
         # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
         self._times = scenario.iteration_times
@@ -103,7 +104,7 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         self._traffic.start(scenario, self._tracks, start)
-        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights, start)
+        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
         self._noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
@@ -179,8 +180,8 @@ class Rollout:
         if fault is not None:
             raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
         if isinstance(plan, Trajectory):
-            if iteration == 0 and self.setting.controller == "lqr" and is_short(plan):
-                warnings.warn(f"{type(self.planner).__name__}: {SHORT}", stacklevel=2)
+            if iteration == 0 and self.setting.controller == "lqr":
+                self.is_short = is_short(plan)
             time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
             plan = Trajectory(time_us, plain(plan.states))
             sample_poses(plan.time_us, plan.states, now_us, self._plans[iteration])
@@ -227,6 +228,15 @@ def simulate(
         PlannerError: The planner returned something that cannot be executed.
     """
     rollout = Rollout(scenario, planner, setting, **changes)
+    log = drive(rollout)
+    if rollout.is_short:
+        warnings.warn(f"{type(planner).__name__}: {SHORT}", stacklevel=2)
+    return log
+
+
+def drive(rollout: Rollout) -> SimulationLog:
+    """Drive a fresh rollout to its end; errors are those of `simulate`."""
+    planner = rollout.planner
     while not rollout.done:
         plan, seconds = None, 0.0
         if planner is not None:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, sealed
+from shiftsim.arrays import FloatArray, IntArray, opaque, read_only, sealed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -229,42 +229,32 @@ def observe_log(
 class Sight:
     """What a planner is shown of a rollout, in arrays that cannot be written.
 
-    Of the tracks these are copies, made row by row as the rollout gets there: nothing leads from
-    them to what is simulated, nor to what is recorded of later rows.
+    They end with the present row, and nothing leads from them to the rows of the rollout that they
+    are views of.
     """
 
     def __init__(
-        self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights, row: int
+        self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
-        """Arrays of a rollout, whose rows before `row` may be seen at once."""
+        """Arrays of a rollout."""
         self._times = time_us.tolist()
+        # these show nothing of later rows: the times are known, and the ego has not been there
         self._time_us, self._ego = memoryview(sealed(time_us)), memoryview(sealed(ego))
+        arrays = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
+        self._tracks = tuple(map(read_only, arrays))
         self._kinds, self._tokens = sealed(tracks.kinds), tracks.tokens
-        self._rows: list[tuple[memoryview, memoryview, int]] = []
-        views = []
-        for array in (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes):
-            copy = np.zeros_like(array)  # what memory held before may be of this recording
-            copy[:row] = array[:row]
-            views.append(memoryview(sealed(copy)))
-            self._rows.append((_bytes_of(array), _bytes_of(copy), array.nbytes // len(array)))
-        self._tracks = tuple(views)
         self._connectors, self._status = lights.connector_ids, lights.status.tobytes()
         self._listed, self._lights = b"?", TrafficLights.empty(1)
-        self._end = row  # rows before it have been copied
 
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""
-        first, self._end = self._end, row + 1
-        for source, copy, size in self._rows:
-            fresh = slice(first * size, (row + 1) * size)
-            copy[fresh] = source[fresh]
         past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
         valid, poses, velocities, sizes = self._tracks
         tracks = Tracks(
-            _array(valid[past]),
-            _array(poses[past]),
-            _array(velocities[past]),
-            _array(sizes[past]),
+            opaque(valid[past]),
+            opaque(poses[past]),
+            opaque(velocities[past]),
+            opaque(sizes[past]),
             self._kinds,
             self._tokens,
         )
@@ -277,8 +267,4 @@ class Sight:
         return Observation(iteration, self._times[row], history, self._lights)
 
 
-_array: Any = np.asarray  # of a memoryview: `base` is that view, and ends where the array ends
-
-
-def _bytes_of(array: Any) -> memoryview:
-    return memoryview(array.reshape(-1).view(np.uint8))
+_array: Any = np.asarray  # of a memoryview: `base` is that view, and takes the least time

@@ -5,10 +5,11 @@ kernels see one type of array for all of them. Point queries cost one grid look-
 exact point-in-polygon tests; results come in the order of the layer, as nuPlan's tables do.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
@@ -302,10 +303,11 @@ class Layer:
     ids: tuple[str, ...]  # M object ids, in the order of the source
     polygons: Polygons  # their areas
     # position of an id in `ids`
-    index: dict[str, int] = field(init=False, repr=False, compare=False)
+    index: Mapping[str, int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "index", {name: i for i, name in enumerate(self.ids)})
+        index = MappingProxyType({name: i for i, name in enumerate(self.ids)})
+        object.__setattr__(self, "index", index)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -343,9 +345,9 @@ class Layer:
         boxes = enumerate(self.polygons.bounds.tolist())
         return Index((number, box, None) for number, box in boxes)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the tree, which is made again where it is needed."""
-        return {name: value for name, value in vars(self).items() if name != "_tree"}
+    def __reduce__(self) -> tuple[type["Layer"], tuple[tuple[str, ...], Polygons]]:
+        """Pickled without the index and the tree, which are made again."""
+        return Layer, (self.ids, self.polygons)
 
     def nearest(self, x: float, y: float) -> tuple[int, float]:
         """The polygon nearest to a point, the first one on ties, and its distance, 0 inside [m].

@@ -162,7 +162,7 @@ STORE: Table = {
     **_same("vx_mps, vy_mps", -1e6, 1e6, "m/s"),
     **_same("ax_mps2, ay_mps2", -1e8, 1e8, "m/s²"),
     **_same("steering_rate_radps, yaw_rate_radps, yaw_accel_radps2", -1e8, 1e8, "rad/s, rad/s²"),
-    **_same("length_m, width_m", 0, 1e6, "m"),
+    **_same("length_m, width_m", 1e-9, 1e6, "m"),
     "time_us": _TIME,
     **_same("light_status", -1, 3),
     **_same("kinds", 0, 6),

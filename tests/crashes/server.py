@@ -8,6 +8,7 @@ import ctypes
 import json
 import os
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -43,7 +44,39 @@ def answer(shim: ctypes.CDLL, asked: dict) -> dict:
         return {"code": code, "output": text, "calls": calls.read().decode().splitlines()}
 
 
+class Forked:
+    """A worker process of a run, which has everything loaded; not counted, as a fresh one is not.
+
+    Fresh interpreters, as runs start them, would take most of the time.
+    """
+
+    def __init__(self, shim: ctypes.CDLL, theirs: socket.socket) -> None:
+        from shiftsim.runs import workers
+
+        parent = os.getpid()
+        self.pid = os.fork()
+        if self.pid == 0:
+            shim.shim_arm(b"", MODES.index("count"), 0)
+            os.setpgid(0, 0)
+            code, handle = 1, os.dup2(theirs.fileno(), 3)
+            os.closerange(4, os.sysconf("SC_OPEN_MAX"))  # else no end of a socket is the last one
+            try:
+                workers.serve(parent, handle)
+                code = 0
+            finally:
+                os._exit(code)
+
+    def wait(self, timeout: float | None = None) -> int:
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+    def kill(self) -> None:
+        os.kill(self.pid, signal.SIGKILL)
+
+
 def work(shim: ctypes.CDLL, asked: dict, calls: int) -> int:
+    from shiftsim.runs import workers
+
+    workers._start = lambda theirs: Forked(shim, theirs)
     shim.shim_arm(os.fsencode(asked["root"]), MODES.index(asked["mode"]), asked["at"])
     code = command(asked["words"])
     with os.fdopen(calls, "wb") as file:

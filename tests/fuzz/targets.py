@@ -18,11 +18,76 @@ import opendrive_xml
 from places import GOLDEN
 from stores import write_toy_store
 
+from shiftsim.data.store.plausible import require_plausible, require_sound
+from shiftsim.errors import DataError
+from shiftsim.runs.results import _RANGES as RUN_COLUMNS
+from shiftsim.world.map import LAYERS, VectorMap
+from shiftsim.world.ranges import (
+    CHECKPOINT,
+    DSC3D,
+    MAP_EXTENT,
+    OPENDRIVE,
+    RUN,
+    SETTINGS,
+    STORE,
+    Range,
+)
 from shiftsim.world.scenario import Scenario
 
 FORMAT = GOLDEN / "nuplan_format"
-MANY = 1e12  # no range but that of a time has a larger end
-MAY_BE_NAN = ("velocities", "speed_limits")
+ANYTHING = Range(-1e12, 1e12)  # of what is in no table: no range but that of a time is wider
+
+
+def _rows(element: str, names: str = "sOffset a b c d") -> tuple[Range, ...]:
+    return tuple(OPENDRIVE[f"{element} {name}"] for name in names.split())
+
+
+# ranges of what is yielded, by `Class.field`, by key of a dictionary, or by name of a dataclass's
+# field alone; for an array several, one for each column
+EXPECTED: dict[str, Range | tuple[Range, ...]] = {
+    **{f"Geometry.{name}": OPENDRIVE[f"geometry {name}"] for name in ("s", "x", "y", "length")},
+    "Geometry.heading": OPENDRIVE["geometry hdg"],
+    "Lane.widths": _rows("width"),
+    "Lane.borders": _rows("border"),
+    "Road.offsets": _rows("laneOffset", "s a b c d"),
+    "Road.elevation": _rows("elevation", "s a b c d"),
+    "Road.length": OPENDRIVE["road length"],
+    "Road.stated_length": OPENDRIVE["road length"],
+    "LaneSection.s": OPENDRIVE["laneSection s"],
+    "RoadType.s": OPENDRIVE["type s"],
+    "Speed.s": OPENDRIVE["speed sOffset"],
+    "Speed.limit": OPENDRIVE["speed max"],  # in m/s not more than in the units of files
+    "Outline.corners": OPENDRIVE["cornerRoad s"],  # cornerLocal's is narrower
+    **{f"Repeat.{name}": OPENDRIVE[f"repeat {name}"] for name in ("s", "length", "distance")},
+    "Repeat.t_start": OPENDRIVE["repeat tStart"],
+    "Repeat.t_end": OPENDRIVE["repeat tEnd"],
+    **{f"RoadObject.{name}": OPENDRIVE[f"object {name}"] for name in ("s", "t", "length", "width")},
+    "RoadObject.heading": OPENDRIVE["object hdg"],
+    **{f"Signal.{name}": OPENDRIVE[f"signal {name}"] for name in ("s", "t", "value", "width")},
+    "OpenDrive.offset": tuple(OPENDRIVE[f"offset {name}"] for name in ("x", "y", "z", "hdg")),
+    "Site.zone": DSC3D["reference_utm.zone"],
+    "Site.offset": DSC3D["reference_utm.offset"],
+    "Site.frame_rate": DSC3D["frame_rate"],
+    "Site.frame_distance": DSC3D["frame_distance"],
+    "Annotations.start_us": DSC3D["time"],
+    "Annotations.frame": DSC3D["frame_id"],
+    "Annotations.track_ids": DSC3D["track_id"],
+    "Annotations.bottom": DSC3D["translation_x"],
+    # a box rests on its bottom, which may be tilted
+    "Annotations.centers": Range(*(1.01 * end for end in DSC3D["translation_x"][:2])),
+    "Annotations.angles": DSC3D["rotation_x"],
+    "Annotations.sizes": DSC3D["dimension_x"]._replace(low=1e-300),
+    "Annotations.velocities": Range(-200, 200, "m/s"),  # faster ones are not believed
+    **{name: RUN[field] for name, field in RUN_COLUMNS.items()},
+    "ego of a rollout": RUN["state"],
+    "weight": CHECKPOINT["weight"],
+    **{name: allowed for name, allowed in CHECKPOINT.items() if name != "weight"},
+    **SETTINGS,
+    **MAP_EXTENT,
+    **{name: STORE[name] for name in ("duration_s", "offset_s", "subsample_ratio", "goal_pose")},
+    **{name: STORE[name] for name in ("first_row", "last_row", "row_step")},
+}
+MAY_BE_NAN = ("planning_seconds",)
 
 
 class Target(NamedTuple):
@@ -33,46 +98,65 @@ class Target(NamedTuple):
     damaged: str = "*"  # which files below are damaged
 
 
-def implausible(found: Any, where: str = "") -> Iterator[str]:
-    """Numbers, at any depth of what was read, that are not finite or far too large."""
-    if isinstance(found, Scenario):
-        yield from _implausible_scenario(found, where)
-    elif isinstance(found, np.ndarray) and found.dtype.kind == "f":
-        good = np.abs(found) <= MANY
-        if where.rpartition(".")[2] in MAY_BE_NAN:
+def implausible(found: Any, where: str = "", field: str = "") -> Iterator[str]:
+    """Numbers, at any depth of what was read, that are outside of the range of their field."""
+    try:
+        if isinstance(found, Scenario):
+            yield from _implausible_scenario(found, where)
+        elif isinstance(found, VectorMap):
+            require_sound(found, f"{where} map")
+        elif isinstance(found, np.ndarray) and (found.dtype.kind == "f" or field in EXPECTED):
+            yield from _outside(found, where, field)
+        elif isinstance(found, float) or (isinstance(found, int) and field in EXPECTED):
+            yield from _outside(np.array([found], np.float64), where, field)
+        elif isinstance(found, dict):
+            for key, value in found.items():
+                name = key if isinstance(key, str) and key in EXPECTED else field
+                yield from implausible(value, f"{where}[{str(key)[:40]!r}]", name)
+        elif is_dataclass(found):
+            for item in fields(found):
+                name = f"{type(found).__name__}.{item.name}"
+                name = name if name in EXPECTED else item.name
+                yield from implausible(getattr(found, item.name), f"{where}.{item.name}", name)
+        elif isinstance(found, tuple) and isinstance(EXPECTED.get(field), tuple):
+            yield from _outside(np.array([found], np.float64), where, field)
+        elif isinstance(found, list | tuple):
+            for number, value in enumerate(found):
+                yield from implausible(value, f"{where}[{number}]", field)
+    except DataError as error:  # of what a store may hold
+        yield str(error)
+
+
+def _outside(found: np.ndarray, where: str, field: str) -> Iterator[str]:
+    allowed = EXPECTED.get(field, ANYTHING)
+    if isinstance(allowed, Range):
+        good = allowed.holds(found)
+        if field in MAY_BE_NAN:
             good |= np.isnan(found)
         if not good.all():
-            yield f"{where}: {found[~good][0]}"
-    elif isinstance(found, float) and not abs(found) <= MANY:
-        yield f"{where}: {found}"
-    elif isinstance(found, dict):
-        for key, value in found.items():
-            yield from implausible(value, f"{where}[{str(key)[:40]!r}]")
-    elif is_dataclass(found):
-        for item in fields(found):
-            yield from implausible(getattr(found, item.name), f"{where}.{item.name}")
-    elif hasattr(found, "_fields"):
-        for name in found._fields:
-            yield from implausible(getattr(found, name), f"{where}.{name}")
-    elif isinstance(found, list | tuple):
-        for number, value in enumerate(found):
-            yield from implausible(value, f"{where}[{number}]")
+            yield f"{where}: {found[~good][0]} is beyond {allowed}"
+    else:
+        for column, (values, one) in enumerate(zip(found.T, allowed, strict=True)):
+            if not one.holds(values).all():
+                yield f"{where}, column {column}: {values} is beyond {one}"
 
 
 def _implausible_scenario(scene: Scenario, where: str) -> Iterator[str]:
-    tracks, valid = scene.tracks, scene.tracks.valid
-    for name in ("ego", "mission_goal", "mapping"):
-        yield from implausible(getattr(scene, name), f"{where}.{name}")
-    yield from implausible(tracks.poses[valid], f"{where}.poses")
-    yield from implausible(tracks.sizes[valid], f"{where}.sizes")
-    yield from implausible(tracks.velocities[valid], f"{where}.velocities")
-    if (tracks.sizes[valid] < 0).any():
-        yield f"{where}: a negative size"
-    if (np.diff(scene.time_us) <= 0).any():
-        yield f"{where}: time does not increase"
+    require_plausible(scene, "ego", Path(where))
+    names = ("duration_s", "offset_s", "subsample_ratio")
+    values = dict(zip(names, scene.mapping, strict=True)) | {"goal_pose": scene.mission_goal}
+    yield from implausible(values, f"{where}.mapping")
+    yield from implausible(scene.row_step, f"{where}.row_step", "row_step")
     rows = scene.iteration_rows
     if not (0 <= rows.min() and rows.max() < len(scene.time_us)):
         yield f"{where}: iterations beyond the rows"
+
+
+def _extent(road: VectorMap) -> dict[str, float]:
+    """Width or height of all layers of a map [m], as its reader limits them."""
+    boxes = [getattr(road, name).polygons.bounds for name in LAYERS]
+    spans = [box[:, 2:].max(axis=0) - box[:, :2].min(axis=0) for box in boxes if len(box)]
+    return {"extent": float(np.max(spans, initial=0.0))}
 
 
 # --- OpenDRIVE
@@ -121,7 +205,8 @@ def _read_opendrive(folder: Path) -> Any:
     from shiftsim.data.opendrive.reading import read_opendrive
 
     od = read_opendrive(folder / "map.xodr")
-    return od.roads, build_road_map(od, name="x")[0]
+    road = build_road_map(od, name="x")[0]
+    return od, road, _extent(road)
 
 
 # --- nuPlan
@@ -155,7 +240,8 @@ def _packages(folder: Path) -> None:
 def _read_package(folder: Path) -> Any:
     from shiftsim.data.nuplan.map import read_map
 
-    return read_map(folder / "map.gpkg", "x")
+    road = read_map(folder / "map.gpkg", "x")
+    return road, _extent(road)
 
 
 # --- DSC3D and stores
@@ -241,7 +327,8 @@ def _read_run(folder: Path) -> Any:
     for task, place in run.rollout_places.items():
         if place is not None and task.token in store:
             logs.append(run.rollout(task, store.read(task.token)))
-    return run.scores.to_pylist(), run.tasks.to_pylist(), [log.ego for log in logs]
+    egos = {"ego of a rollout": [log.ego for log in logs]}
+    return run.scores.to_pylist(), run.tasks.to_pylist(), egos
 
 
 # --- checkpoints
@@ -275,12 +362,12 @@ def _read_checkpoint(folder: Path) -> Any:
 
     found = open_checkpoint(find_checkpoint(str(folder)))
     if len(found.state) < 10:  # of no planner
-        return found.args
+        return {"args": found.args}
     planner = "diffusion-planner" if (folder / "args.json").exists() else "plantf"
     args = needed_args(found, planner)
     state = checked_state(found, planner, args)
     network_module(planner).build_network(args).load_state_dict(state)
-    return [tensor.numpy() for tensor in state.values()]
+    return {"weight": [tensor.numpy() for tensor in state.values()], "args": args}
 
 
 # --- settings, splits and reviews

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -15,7 +16,9 @@ import pytest
 from fuzz.mutate import damage
 from fuzz.server import CORPUS, run_case
 from fuzz.targets import TARGETS, Target
+from worlds import cruise_scenario, straight_road
 
+from shiftsim.data.opendrive.records import Lane, Speed
 from shiftsim.errors import DataError
 
 SERVER = Path(__file__).with_name("server.py")
@@ -87,6 +90,13 @@ def _fail(_folder):
         (lambda folder: 1 / 0, "traceback"),
         (lambda folder: {"x": [1e13]}, "garbage"),
         (lambda folder: np.array([np.nan]), "garbage"),
+        (lambda folder: Speed(1e6, None), "garbage"),
+        (lambda folder: {"weight": [np.array([2e9])]}, "garbage"),
+        (lambda folder: Lane(1, "", np.full((1, 5), 2e4), np.zeros((0, 5))), "garbage"),
+        (lambda folder: Lane(1, "", np.full((1, 5), 2e3), np.zeros((0, 5))), "ok"),
+        (lambda folder: {"cls": 1.1}, "garbage"),
+        (lambda folder: replace(cruise_scenario(), row_step=2**31), "garbage"),
+        (lambda folder: replace(straight_road(), speed_limits=np.full(1, -1.0)), "garbage"),
         (_fail, "no file named"),
         (lambda folder: 5.0, "ok"),
     ],

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.learned.base import LearnedPlanner
+from shiftsim.world.state import Trajectory
 
 BAD = "0001cafe"
 
@@ -43,6 +44,14 @@ class Sloppy(ConstantVelocity):
 
     def plan(self, observation):
         return [1, 2, 3]
+
+
+class Short(ConstantVelocity):
+    """Plans for half a second."""
+
+    def plan(self, observation):
+        plan = super().plan(observation)
+        return Trajectory(plan.time_us[:6], plan.states[:6], plan.relative)
 
 
 class NoPlan:

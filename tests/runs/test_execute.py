@@ -45,6 +45,19 @@ def test_two_workers_give_the_same_bytes_as_one(clean_run, toy, tmp_path):
     assert same_results(clean_run, other) == [True, True]
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_short_plans_are_warned_of_once_per_run_and_planner(toy, tmp_path, workers, caplog, capfd):
+    planners = ["drivers:Short", "constant-velocity"]
+    for name in ("first", "again"):
+        config = settings(toy, tmp_path / name, planners=planners, workers=workers)
+        assert execute(prepare(config)).is_complete
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    for text in said:
+        assert text.startswith("planner drivers:Short: plans reach less than 1 s ahead")
+    assert "less than 1 s" not in capfd.readouterr().err
+
+
 def test_shuffled_tasks_give_the_same_bytes(clean_run, toy, tmp_path):
     config = settings(
         toy,

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario
 
+from shiftsim import arrays
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.sim.loop import Rollout, simulate
 from shiftsim.sim.planner import observe_log, scene_info
+from shiftsim.world.map import LAYERS
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command, Tracks, Trajectory
 
@@ -69,6 +71,23 @@ def test_no_array_that_a_planner_is_given_can_be_written(scenario):
             array.setflags(write=True)
         with pytest.raises(ValueError, match="WRITEABLE"):
             array.flags.writeable = True
+
+
+def test_the_same_holds_where_numpy_is_too_old_to_do_it(scenario, monkeypatch):
+    monkeypatch.setattr(arrays, "opaque", arrays._behind_door)
+    monkeypatch.setattr("shiftsim.sim.planner.opaque", arrays._behind_door)
+    test_no_array_that_a_planner_is_given_can_be_written(scenario)
+    test_nothing_leads_from_an_observation_to_the_recorded_future(scenario)
+
+
+def test_the_index_of_a_map_cannot_be_written(scenario):
+    road = scene_info(scenario).map
+    for layer in LAYERS:
+        index = getattr(road, layer).index
+        assert list(index) == list(getattr(road, layer).ids)
+        with pytest.raises(TypeError, match="item assignment"):
+            index["new"] = 0
+        assert not hasattr(index, "update")
 
 
 def bases_of(array):
@@ -237,9 +256,7 @@ class Mirrors(ConstantVelocity):
         plan = super().plan(observation)
         seen = observe_log(self.scenario, 0).history
         assert not seen.ego.flags.writeable
-        from shiftsim.arrays import sealed
-
-        return Trajectory(sealed(plan.time_us), sealed(plan.states), relative=True)
+        return Trajectory(arrays.sealed(plan.time_us), arrays.sealed(plan.states), relative=True)
 
 
 def test_read_only_plans_compile_no_second_kernel(scenario):

@@ -11,6 +11,7 @@ import numpy as np
 import places
 import pytest
 
+from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.log import open_log, read_ego
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
@@ -218,7 +219,9 @@ BROKEN = {
     "pose": ("UPDATE ego_pose SET x = NULL", "not finite"),
     "box pose": ("UPDATE lidar_box SET yaw = NULL", "not finite"),
     "text": ("UPDATE lidar_box SET x = 'abc'", "no number"),
-    "zero length": ("UPDATE lidar_box SET length = 0", "no length or width"),
+    "endless box": ("UPDATE lidar_box SET length = 9e999", "no finite length or width"),
+    "box without a length": ("UPDATE lidar_box SET width = NULL", "no finite length or width"),
+    "box without a place": ("UPDATE lidar_box SET x = NULL", "a pose that is not finite"),
     "all stamps equal": ("UPDATE lidar_pc SET timestamp = 1600000000000000", "two iterations at"),
     "unordered": (
         "UPDATE lidar_pc SET next_token = (SELECT token FROM lidar_pc ORDER BY timestamp LIMIT 1)",
@@ -289,6 +292,53 @@ def test_an_implausible_number_is_a_warning(log_path: Path, road: VectorMap) -> 
     assert read(log_path, road, flaws).ego[0, 3] == 999
     assert flaws["lidar_box: vx beyond -150 … 150 m/s"] == 1
     assert flaws["ego_pose: vx beyond -150 … 150 m/s"] == 360
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ("length = 0", "without length or width"),
+        ("width = 0.0", "without length or width"),
+        ("x = 9e999", "off the earth"),
+        ("y = -2e9", "off the earth"),
+    ],
+)
+def test_a_box_that_nothing_can_touch_is_left_out_with_one_warning(
+    log_path: Path, road: VectorMap, change: str, what: str
+) -> None:
+    before = read(log_path, road).tracks
+    with closing(sqlite3.connect(log_path)) as base:
+        token = base.execute(
+            "SELECT track_token, COUNT(*) FROM lidar_box GROUP BY 1 ORDER BY 2 DESC"
+        ).fetchone()[0]
+    edit(log_path, f"UPDATE lidar_box SET {change} WHERE track_token = x'{token.hex()}'")
+    flaws: Counter[str] = Counter()
+    after = read(log_path, road, flaws).tracks
+    (flaw,) = +flaws
+    assert flaw.startswith(f"lidar_box: boxes {what}")
+    assert flaw.endswith(f"; first of track {token.hex()!r}")
+    index = before.tokens.index(token.hex())
+    assert flaws[flaw] == before.valid[:, index].sum() > 1
+    rest = np.arange(before.num_tracks) != index
+    np.testing.assert_array_equal(after.poses, before.select(rest).poses)
+    assert token.hex() not in after.tokens
+
+
+def test_a_box_of_negative_size_is_taken_as_positive(log_path: Path, road: VectorMap) -> None:
+    before = read(log_path, road).tracks
+    edit(log_path, "UPDATE lidar_box SET length = -length")
+    flaws: Counter[str] = Counter()
+    np.testing.assert_array_equal(read(log_path, road, flaws).tracks.sizes, before.sizes)
+    assert [flaw for flaw in +flaws if "negative length" in flaw]
+
+
+def test_a_log_of_many_parts_is_warned_of_once(log_path: Path) -> None:
+    edit(log_path, "UPDATE lidar_box SET length = 0")
+    flaws: Counter[str] = Counter()
+    with open_log(log_path) as log:
+        for first in (0, 100):
+            assert not read_boxes(log, first, first + 100, flaws).token
+    assert len(+flaws) == 1
 
 
 def test_a_number_that_no_store_can_hold_is_refused(log_path: Path, road: VectorMap) -> None:

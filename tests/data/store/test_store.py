@@ -205,7 +205,8 @@ def test_eighteen_seconds_with_100_agents_fit_in_one_and_a_half_megabytes(
 ) -> None:
     recording = make_recording(360, 100, rng)
     recording.tracks.valid[:] = True
-    recording.tracks.poses[np.isnan(recording.tracks.poses)] = 0.1
+    for values in (recording.tracks.poses, recording.tracks.sizes):
+        values[np.isnan(values)] = 0.1
     write_store(tmp_path / "s", road, recording, make_window("a", 0, 360))
     folder = tmp_path / "s" / "recordings" / "drive"
     assert sum(path.stat().st_size for path in folder.iterdir()) <= 1_500_000
@@ -256,6 +257,13 @@ def test_check_finds_changed_missing_and_foreign_files(store: Path) -> None:
     assert not found["notes.txt"].is_error
 
 
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stores are written whatever is in them."""
+    monkeypatch.setattr("shiftsim.data.store.tracks.require_recording", lambda *given: None)
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_check_names_what_is_implausible(
     tmp_path: Path, road: VectorMap, rng: np.random.Generator
 ) -> None:
@@ -338,6 +346,7 @@ def test_columns_carry_their_units(store: Path) -> None:
     assert pa.types.is_float64(tracks.field("x_m").type)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("part", "column"), [("poses", "x_m"), ("velocities", "vx_mps"), ("sizes", "length_m")]
 )
@@ -352,3 +361,86 @@ def test_an_implausible_number_names_file_track_and_column(
     what = f"tracks.parquet: track '.*', row 50: column '{column}': "
     with pytest.raises(DataError, match=what):
         open_store(tmp_path / "s").read("a")
+
+
+def _spoil(name: str, index: object, value: object):
+    def spoil(recording: Recording) -> Recording:
+        recording.tracks.valid[50, 1] = True
+        part = recording if name == "time_us" else recording.tracks
+        array = recording.lights.status if name == "status" else getattr(part, name)
+        array[index] = value
+        return recording
+
+    return spoil
+
+
+UNWRITABLE = {
+    "a pose": (_spoil("poses", (50, 1, 2), np.nan), "row 50: column 'heading_rad': nan is not"),
+    "a size": (_spoil("sizes", (50, 1), 0.0), "row 50: column 'length_m': 0 is beyond 1e-09"),
+    "a speed": (_spoil("velocities", (50, 1), 1e7), "column 'vx_mps'"),
+    "time": (_spoil("time_us", 20, 19 * 50_000), "frames.parquet: column 'time_us' does not incr"),
+    "an age": (_spoil("time_us", 99, 2**60), r"'time_us', row 99: 1.152921505e\+18 is beyond"),
+    "a light": (_spoil("status", (3, 1), 9), "'light_status', row 3: 9 is beyond"),
+    "a kind": (_spoil("kinds", 2, 7), "'kinds', row 2: 7 is beyond"),
+    "names": (
+        lambda r: dataclasses.replace(r, tracks=dataclasses.replace(r.tracks, tokens=("a",))),
+        "tracks.parquet: the arrays do not fit together",
+    ),
+    "lights": (
+        lambda r: dataclasses.replace(r, lights=TrafficLights.empty(7)),
+        "frames.parquet: column: the arrays do not fit together",
+    ),
+    "poses": (
+        lambda r: dataclasses.replace(
+            r, tracks=dataclasses.replace(r.tracks, poses=r.tracks.poses[:, :2])
+        ),
+        "the arrays do not fit together",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNWRITABLE)
+def test_what_could_not_be_read_is_not_written(
+    case: str, tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    spoil, message = UNWRITABLE[case]
+    recording = spoil(make_recording(100, 4, rng))
+    with pytest.raises(DataError, match=message) as caught:
+        write_store(tmp_path / "s", road, recording, make_window("a", 0, 100))
+    assert caught.value.hint == "correct what is given; it is not written"
+    assert not (tmp_path / "s/recordings").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mission_goal": np.array([0.0, np.inf, 0.0])}, "scenario 'a': column 'goal_pose', row 1"),
+        ({"mission_goal": np.zeros(2)}, "'goal_pose' holds no pose"),
+        ({"mapping": (10.0, 0.0, 0.0)}, "'subsample_ratio', row 0: 0 is beyond"),
+        ({"row_step": 0}, "'row_step', row 0: 0 is beyond"),
+        ({"iteration_rows": np.array([4, 4])}, "iteration_rows do not increase"),
+        ({"iteration_rows": np.array([90, 100])}, "iteration_rows do not increase within"),
+    ],
+)
+def test_a_window_that_could_not_be_read_is_not_written(
+    changes: dict, message: str, tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    window = dataclasses.replace(make_window("a", 0, 100), **changes)
+    with pytest.raises(DataError, match=message):
+        write_store(tmp_path / "s", road, make_recording(100, 4, rng), window)
+
+
+def test_an_ego_and_a_map_that_could_not_be_read_are_not_written(
+    tmp_path: Path, road: VectorMap
+) -> None:
+    states = np.zeros((9, 11))
+    states[4, 7] = np.nan
+    far = dataclasses.replace(road, speed_limits=np.full(len(road.edges), 1e9))
+    with StoreWriter(tmp_path / "s") as writer:
+        with pytest.raises(DataError, match="column 'steering_angle_rad', row 4: nan"):
+            writer.add_ego(EgoTrace("drive", "ego", 0, states))
+        with pytest.raises(DataError, match=r"ego-ego\.parquet: the arrays do not fit"):
+            writer.add_ego(EgoTrace("drive", "ego", 0, states[:, :3]))
+        with pytest.raises(DataError, match="'speed_limits', row 0: 1000000000 is beyond"):
+            writer.add_map(far)
+    assert not list((tmp_path / "s").rglob("*ego*"))
