@@ -149,8 +149,8 @@ def check_reference(motion: Motion, out: Doubts) -> None:
         return
     track, fast = table.track[rows], fast[rows]
     angle = np.column_stack([np.cumsum(step[rows]), np.zeros(len(rows))])
-    place = np.unique(track, return_inverse=True)[1]
-    rate = fitted_velocities(angle, motion.time[rows], place, motion.period)[:, 0]
+    numbers = np.unique(track, return_inverse=True)[1]
+    rate = fitted_velocities(angle, motion.time[rows], numbers, motion.period)[:, 0]
     cos, sin = np.cos(table.headings[rows]), np.sin(table.headings[rows])
     sideways = motion.derived[rows, 1] * cos - motion.derived[rows, 0] * sin
     used = fast & (np.abs(rate) > _TURNING)

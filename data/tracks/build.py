@@ -127,6 +127,10 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
     """The same recording with a row every 0.05 s, where objects have times of their own."""
     runs = find_runs(samples, MAX_HOLE_S)
     first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
+    # what is there at an end of the recording is there at its first or last row, too
+    first[samples.time[runs.first] < samples.period] = 0
+    at_end = samples.time[runs.last] > samples.duration - samples.period
+    last[at_end] = int(samples.duration / ROW_S + 1e-9)
     counts = np.maximum(last - first + 1, 0)
     run = np.repeat(np.arange(len(counts)), counts)
     frame = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts)

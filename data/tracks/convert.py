@@ -30,7 +30,8 @@ from shiftsim.data.store.tables import MANIFEST, map_file
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.columns import KINDS
-from shiftsim.data.tracks.doubts import Doubts, find_doubts
+from shiftsim.data.tracks.doubts import find_doubts
+from shiftsim.data.tracks.evidence import Doubts
 from shiftsim.data.tracks.reading import TrackTable, read_tracks
 from shiftsim.data.tracks.scenarios import EGO_CATEGORIES, make_scenarios, write_converted
 from shiftsim.errors import ConversionError
@@ -131,6 +132,7 @@ def convert_tracks(
             "; ".join(doubt.what for doubt in doubts.found),
             "; ".join(doubt.remedy for doubt in doubts.found),
         )
+    _require_same_map(store, road)
     samples = make_samples(
         table.name,
         time_us=table.time_us,
@@ -151,15 +153,13 @@ def convert_tracks(
     report = TracksReport(
         road.name, len(road.edges), made.summary, doubts.figures, found, looked.map_warnings
     )
-    with alone_in(store):
-        _require_same_map(store, road)
-        with StoreWriter(store) as writer:
-            writer.add_map(road)
-            write_converted(writer, made)
-            before = read_report(store, road.name).get("recordings", {})
-            one = asdict(report)
-            content = {name: one.pop(name) for name in ("city", "lanes", "map_warnings")}
-            writer.add_report(road.name, content | {"recordings": before | {table.name: one}})
+    with alone_in(store), StoreWriter(store) as writer:
+        writer.add_map(road)
+        write_converted(writer, made)
+        before = read_report(store, road.name).get("recordings", {})
+        one = asdict(report)
+        content = {name: one.pop(name) for name in ("city", "lanes", "map_warnings")}
+        writer.add_report(road.name, content | {"recordings": before | {table.name: one}})
     return report, made
 
 
