@@ -121,6 +121,7 @@ def test_lights_of_commonroad_govern_what_leaves_their_lanelet(scenes):
     assert set(road.speed_limits.tolist()) == {8.5}  # of the sign
 
 
+@pytest.mark.slow
 def test_a_store_of_all_three_is_sound_and_goes_on_where_it_stopped(tmp_path):
     for name in COMMANDS:
         reader, write = WRITERS[name]
@@ -143,6 +144,7 @@ def test_a_broken_scene_is_skipped_and_named(tmp_path):
     assert "cannot be read" in report.failed[str(bad)]
 
 
+@pytest.mark.slow
 def test_the_command_converts_and_says_what_comes_next(tmp_path):
     write_commonroad(tmp_path / "files")
     done = call(tmp_path, "convert", "commonroad", "files", "--store", "./s", "--workers", "1")
@@ -325,6 +327,7 @@ def test_logs_of_a_city_share_its_map(tmp_path):
 # --- py123d itself
 
 
+@pytest.mark.slow
 def test_a_folder_that_py123d_wrote_is_read_as_ours(tmp_path, scenes):
     python = os.environ.get("SHIFTSIM_PY123D_PYTHON")
     if not python:
