@@ -132,7 +132,7 @@ def prepare(
         folder=folder,
         before=before,
         workers=_workers(config, entries, len(batches)),
-        generator=getattr(store, "generator", {}),
+        generator=store.generator,
     )
 
 
