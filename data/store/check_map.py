@@ -83,11 +83,13 @@ class MapCheck:
         if len(several):
             x, y = points[several[0]]
             pair = " and ".join(repr(ids[lane]) for lane in out[several[0]].tolist())
-            when = _seconds(scene)[several[0] // 5]
+            at = several[0] // 5
+            when = _seconds(scene)[at]
+            fate = "will fail" if at == 0 else "fail if its lane is looked for there"
             yield Finding(
                 "lanes overlap",
                 f"lanes {pair} overlap at ({x:.2f}, {y:.2f}), where the ego is at {when:.1f} s; it"
-                " cannot be assigned to one, so its tasks will fail",
+                f" cannot be assigned to one, so its tasks {fate}",
                 _AGAIN,
             )
             return

@@ -146,6 +146,7 @@ def convert_tracks(
         derived=doubts.derived,
         kind_of=KINDS,
     )
+    doubts.derived = None  # large, and not needed any more
     made = make_scenarios(samples, road, egos=egos, config=config or tracks_config())
     if not made.windows:
         raise ConversionError(*_why_none(made.summary))

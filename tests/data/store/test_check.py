@@ -182,14 +182,15 @@ def _crossing_lanes(low, high):
 
 
 def test_lanes_that_overlap_under_the_ego_are_an_error_and_its_task_fails(tmp_path):
-    scene = cruise_scenario(iterations=LONG, speed=12.0, start=(40.0, 0.0, 0.0))
+    scene = cruise_scenario(iterations=LONG, start=(62.0, 0.0, 0.0))
     path = _write(tmp_path / "s", road=_crossing_lanes(-10, 10), scene=scene, route=("0",))
     problems = {problem.where: problem for problem in check_store(path)}
     found = problems["scenario cafe"]
     assert (found.is_error, found.kind) == (True, "lanes overlap")
     assert "lanes 'a' and 'b' overlap at (" in found.what
+    assert "its tasks will fail" in found.what
     assert not problems["map straight"].is_error
-    scenario = shiftsim.open_store(path).read("cafe")
+    scenario = shiftsim.open_store(str(path)).read("cafe")
     from shiftsim.planners.registry import load_planner
 
     log = shiftsim.simulate(scenario, load_planner("log-future"))
