@@ -9,6 +9,7 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.workers import map_unordered
+from shiftsim.train.curves import Say
 from shiftsim.train.driving import Driven, Driver, Job, Start, State
 from shiftsim.train.settings import Settings
 
@@ -27,6 +28,8 @@ _MIN_GROUPS = 5  # fewer towns are not left out, but recordings, or else scenari
 _EXPECTED = 60  # states of a scenario, before any was driven
 # share of scenarios that PDM-Closed begins, and up to which step
 _BEGUN, _BEGUN_STEPS = 0.5, 75
+
+_SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
 Show = Callable[[int, int], None]
 
@@ -108,7 +111,7 @@ def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list
 
 
 def collect(
-    settings: Settings, towns: Towns, checkpoint: str, number: int, tau: float, show: Show
+    settings: Settings, towns: Towns, checkpoint: str, number: int, tau: float, show: Show, say: Say
 ) -> Iterator[State]:
     """The labelled states of a round; PDM-Closed drives in the first one."""
     random = np.random.default_rng([settings.seed, 2, number])
@@ -118,15 +121,16 @@ def collect(
         expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
         needed = int(np.ceil((wanted - count) / max(expected, 1.0)))
         jobs = collecting_jobs(towns, needed, tau, random, by_expert=number == 0)
-        before = count
+        before, failed = count, list[str]()
         for driven in do(settings, checkpoint, jobs, show):
             jobs_done += 1
             count += len(driven.states)
+            failed += driven.failed
             yield from driven.states
+        if failed:
+            say(f"{len(failed)} scenarios ended early, such as {failed[0]}")
         if count == before:
-            raise DataError(
-                "no state could be collected", hint="see whether `shiftsim run -p pdm-closed` works"
-            )
+            raise DataError(f"no state could be collected: {failed[0]}", hint=_SEE)
 
 
 def mean_scores(
@@ -141,4 +145,7 @@ def mean_scores(
     done = do(settings, checkpoint, jobs, show)
     halves = done[: sizes[0]], done[sizes[0] :]
     scores = [[score for driven in half for score in driven.scores] for half in halves]
+    if not all(scores):
+        failed = [text for driven in done for text in driven.failed]
+        raise DataError(f"no scenario could be driven to its end: {failed[0]}", hint=_SEE)
     return {noise: float(np.mean(found)) for noise, found in zip(TESTED, scores, strict=True)}

@@ -56,7 +56,7 @@ class Training:
         usable = verdicts.accepted if verdicts else store.tokens
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
-        prepare_folder(settings, resume=resume)
+        prepare_folder(settings, store.hash, resume=resume)
         self.steps = max(1, settings.samples // settings.rounds // BATCH)
         total = self.steps * settings.rounds
         self.learner = Learner(self.device, settings.workers, total, settings.seed)
@@ -68,7 +68,16 @@ class Training:
         self._began = monotonic() - self.course.seconds
 
     def run(self) -> None:
-        """Do all rounds that are not done yet."""
+        """Do all rounds that are not done yet, and PPO if it is asked for."""
+        try:
+            self._imitate()
+            if self._settings.ppo_samples:
+                self._reinforce()
+        except KeyboardInterrupt:
+            self._say(f"kept in {str(self._settings.out)!r}; go on with --resume")
+            raise
+
+    def _imitate(self) -> None:
         settings, course = self._settings, self.course
         if not course.tau:
             course.tau = settings.tau or self._choose_tau()
@@ -79,8 +88,6 @@ class Training:
             self._test()
             course.round, course.done = course.round + 1, 0
             self._keep()
-        if settings.ppo_samples:
-            self._reinforce()
 
     def _reinforce(self) -> None:
         """Go on with PPO from the best network, and test what comes out."""
@@ -113,8 +120,9 @@ class Training:
             return
         checkpoint = str(settings.network) if course.round else _NOBODY
         show = self._shower(f"{self._where} collecting")
-        tau, number = course.tau, course.round
-        write_part(folder, collect(settings, self.towns, checkpoint, number, tau, show))
+        number, tau, towns = course.round, course.tau, self.towns
+        states = collect(settings, towns, checkpoint, number, tau, show, self._say)
+        write_part(folder, states)
         self._keep()
 
     def _train(self) -> None:

@@ -70,14 +70,14 @@ class Settings:
         return self.out / "states" / f"round-{number:02d}"
 
 
-def prepare_folder(settings: Settings, *, resume: bool) -> None:
-    """Make the folder of a training, or check that it is the same one.
+def prepare_folder(settings: Settings, store: str, *, resume: bool) -> None:
+    """Make the folder of a training on a store of this hash, or check that it is the same one.
 
     Raises:
         ConfigError: There is one already, or another one.
     """
     place = settings.out / SETTINGS
-    now = json.loads(json.dumps(settings.determining))
+    now = json.loads(json.dumps(settings.determining)) | {"store_hash": store}
     if place.exists():
         before = json.loads(place.read_text("utf-8"))
         differing = sorted(name for name in now if before.get(name) != now[name])
