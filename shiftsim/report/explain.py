@@ -1,42 +1,18 @@
 """Why a rollout has its score: every metric, its value, threshold and first violation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
+from shiftsim.report.words import COLLISIONS, UNITS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.world.state import AgentKind, Tracks
 
-_COLLISIONS = "no_ego_at_fault_collisions"
 _HAS = ("planners", "noise", "seeds")
-REASONS = {
-    "no_ego_at_fault_collisions": "at-fault collision",
-    "drivable_area_compliance": "drivable area",
-    "driving_direction_compliance": "driving direction",
-    "ego_is_making_progress": "no progress",
-    "ego_progress_along_expert_route": "progress",
-    "time_to_collision_within_bound": "time to collision",
-    "speed_limit_compliance": "speed limit",
-    "ego_is_comfortable": "comfort",
-}
-_UNITS = {  # nuPlan's names, shortened
-    "meters": "m",
-    "seconds": "s",
-    "meters_per_second": "m/s",
-    "meters_per_second_squared": "m/s²",
-    "meters_per_second_cubed": "m/s³",
-    "radians_per_second": "rad/s",
-    "radians_per_second_squared": "rad/s²",
-    "count": "",
-    "ratio": "",
-    "boolean": "",
-}
 
 
 def select_tasks(
@@ -161,7 +137,7 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
 
 
 def _metric_line(row: dict[str, Any]) -> str:
-    name, unit = row["metric"], _UNITS.get(row["unit"], row["unit"])
+    name, unit = row["metric"], UNITS.get(row["unit"], row["unit"])
     unit = f" {unit}" if unit else ""
     role = {"multiplier": "×", "weighted": "+"}.get(row["role"], " ")
     weight = "" if row["weight"] is None else f"weight {row['weight']:g}"
@@ -173,22 +149,7 @@ def _metric_line(row: dict[str, Any]) -> str:
         parts.append(f"threshold {row['threshold']:.4g}{unit}")
     if row["first_violation_iteration"] is not None:
         value = f"{row['first_violation_value']:.4g}{unit}"
-        if name == _COLLISIONS:  # its value counts collisions, that of a violation is a speed
+        if name == COLLISIONS:  # its value counts collisions, that of a violation is a speed
             value = f"delta-v {value} m/s"
         parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{_partner(row)}")
     return "  ".join(parts).rstrip()
-
-
-def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
-    """A row of `metrics.parquet` with a violation, as "at-fault collision, pedestrian 17, …"."""
-    words, partner = [REASONS.get(row["metric"], row["metric"])], row["partner_token"]
-    if partner in tracks.tokens:
-        kind = AgentKind(int(tracks.kinds[tracks.tokens.index(partner)]))
-        words.append(f"{kind.name.lower().replace('_', ' ')} {partner}")
-    value, unit = row["first_violation_value"], _UNITS.get(row["unit"], row["unit"])
-    if value is not None and np.isfinite(value):
-        if row["metric"] == _COLLISIONS:  # the speed by which it changes is kept here
-            words.append(f"Δv {value:.1f} m/s")
-        elif unit:
-            words.append(f"{value:.3g} {unit}")
-    return ", ".join(words)

@@ -16,7 +16,6 @@ import pyarrow.compute as pc
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import one_of
 from shiftsim.metrics import MULTIPLIERS
-from shiftsim.report.explain import REASONS
 from shiftsim.report.groups import (
     COLUMNS,
     Group,
@@ -26,6 +25,7 @@ from shiftsim.report.groups import (
     weights_note,
 )
 from shiftsim.report.tables import Cell, Number, Table, text
+from shiftsim.report.words import REASONS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 

@@ -13,8 +13,8 @@ import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
-from shiftsim.report.explain import REASONS, violation_words
 from shiftsim.report.palette import planner_styles
+from shiftsim.report.words import REASONS, violation_words
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer

@@ -10,7 +10,7 @@ def block(kind: str, text: str) -> Block:
 
 @pytest.mark.parametrize(
     "words",
-    [["run", "--planer", "idm"], ["no-such-command"], ["convert", "csv"], ["explain", "RUN"]],
+    [["run", "--planer", "idm"], ["no-such-command"], ["convert", "csv"], ["explain"]],
 )
 def test_a_wrong_command_is_noticed_without_running_it(words: list[str]) -> None:
     with pytest.raises(Exception, match=r"(?i)no such option|no command|missing"):

@@ -51,7 +51,7 @@ BLOCKS = [block for page in PAGES for block in read_blocks(page)]
 MOST_NOT_RUN = 10
 EXAMPLE = re.compile(r"Example:\n +```python\n(.*?)\n +```", re.S)
 NEEDS = {  # of extras and of the dependency group `docs`
-    "learned_planners": ("torch", "safetensors"),
+    **dict.fromkeys(("README", "learned_planners"), ("torch", "safetensors")),
     "nuplan_results": ("msgpack",),
     "training": ("gymnasium", "torch", "safetensors"),
     "run_folder": ("duckdb", "pandas", "polars"),
@@ -369,7 +369,7 @@ def test_checkpoints_are_those_of_the_planners() -> None:
         for entry in PLANNERS.values()
         if entry.checkpoint
     ]
-    assert sorted(row[:4] for row in rows) == sorted(expected)
+    assert sorted([*row[:3], row[4]] for row in rows) == sorted(expected)
 
 
 def test_the_planning_arithmetic_adds_up() -> None:

@@ -378,7 +378,7 @@ UNWRITABLE = {
     "a pose": (_spoil("poses", (50, 1, 2), np.nan), "row 50: column 'heading_rad': nan is not"),
     "a size": (_spoil("sizes", (50, 1), 0.0), "row 50: column 'length_m': 0 is beyond 1e-09"),
     "a speed": (_spoil("velocities", (50, 1), 1e7), "column 'vx_mps'"),
-    "time": (_spoil("time_us", 20, 19 * 50_000), "frames.parquet: column 'time_us' does not incr"),
+    "time": (_spoil("time_us", 20, 18 * 50_000), "frames.parquet: column 'time_us' does not incr"),
     "an age": (_spoil("time_us", 99, 2**60), r"'time_us', row 99: 1.152921505e\+18 is beyond"),
     "a light": (_spoil("status", (3, 1), 9), "'light_status', row 3: 9 is beyond"),
     "a kind": (_spoil("kinds", 2, 7), "'kinds', row 2: 7 is beyond"),
