@@ -116,10 +116,10 @@ def test_numbers_that_make_no_training_are_refused(tmp_path, changes):
 
 @pytest.mark.thorough
 def test_a_killed_command_goes_on(small, toy):
-    whole, killed = small("whole", samples=12_800), small("killed", samples=12_800)
+    whole, killed = small("whole", samples=6_400), small("killed", samples=6_400)
     train(whole)
     words = [*(sys.executable, "-m", "shiftsim", "train", "carl", "--store", str(toy))]
-    words += ["--out", str(killed.out), "--rounds", "2", "--states", "40", "--samples", "12800"]
+    words += ["--out", str(killed.out), "--rounds", "2", "--states", "40", "--samples", "6400"]
     words += ["--tau", "0.3", "--tests", "2", "--workers", "1", "--seed", "5"]
     process = subprocess.Popen(words)
     while not killed.network.exists():
