@@ -177,7 +177,7 @@ def parse_only(words: list[str]) -> tuple[str, ...]:
     rest = words[len(path) :]
     unknown = [word for word in rest[:1] if not word.startswith("-")]
     assert not (hasattr(commands[path], "commands") and unknown), f"no command {words!r}"
-    commands[path].make_context(" ".join(path), rest)
+    commands[path].make_context(" ".join(path), [word for word in rest if word != "--help"])
     return path
 
 

@@ -5,6 +5,7 @@ from boxes import to_frame
 from worlds import standing_tracks
 
 from shiftsim.sim.loop import Rollout
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind
 
 
@@ -25,6 +26,11 @@ def first_sight(scenario, planner):
 def plan_of(planner, scenario):
     """Its first plan."""
     return planner.plan(first_sight(scenario, planner))
+
+
+def recorded_inputs(scenario, count):
+    """The scene, and what a planner sees at so many iterations along the recorded ego."""
+    return scene_info(scenario), [observe_log(scenario, i) for i in range(count)]
 
 
 def in_ego_frame(plan, ego):

@@ -18,16 +18,20 @@ import pytest
 from kernels import compile_environment
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import _nrt_python, rtsys
+from track_files import export_town, write_tracks
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.tracks.convert import convert_tracks, look_at
 from shiftsim.files import PACKAGE
 from shiftsim.planners.registry import load_planner
 from shiftsim.planners.table import PLANNERS
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import _MODELS
+from shiftsim.train.pictures import blocks_of
 from shiftsim.verify.warmup import SHARES
 from shiftsim.world.layers import nearest
 from shiftsim.world.scenario import Scenario
@@ -133,6 +137,14 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         assert convert_dsc3d(site, folder / "store").accepted
         assert len(list(ScenarioStore(folder / "store"))) == 2
 
+    town = export_town(folder, "roundabout")
+    table = write_tracks(folder / "tracks.csv", town[0])
+
+    def convert_table() -> None:
+        shutil.rmtree(folder / "own", ignore_errors=True)
+        convert_tracks(look_at(table, town[1], city="roundabout"), folder / "own")
+        check_store(folder / "own")
+
     # a scripted planner needs a file, and has no kernels
     names = [name for name in PLANNERS if name != "scripted"]
     drives = {f"{name}, {mode}": partial(drive, name, mode) for name in names for mode in _MODELS}
@@ -141,6 +153,8 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         **SHARES,
         "environment": compile_environment,
         "conversion": convert,
+        "tracks and check": convert_table,
+        "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }
 

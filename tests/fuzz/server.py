@@ -72,14 +72,14 @@ def _read(target: str, folder: Path) -> tuple[str, str]:
         return ("garbage", "; ".join(bad[:3])) if bad else ("ok", "")
     except ShiftsimError as error:
         fault = _fault(error, folder)
-        return (fault or "refused"), f"{error} [{error.hint}]"[:2000]
+        return (fault or "refused"), f"{error.message} [{error.hint}]"[:2000]
     except BaseException:
         return "traceback", traceback.format_exc()[-3000:]
 
 
 def _fault(error: Any, folder: Path) -> str:
     """What is wrong with an error of ours; nothing with a good one."""
-    text, cause = str(error), error
+    text, cause = error.message, error
     while cause is not None:
         if isinstance(cause, MemoryError):
             return "memory"

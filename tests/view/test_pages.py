@@ -229,16 +229,16 @@ class TestFigures:
 
         files = [tmp_path / f"{name}.{ending}" for name in "ab"]
         for file in files:
-            save_figure(file, scenario, items, at=1.0)
+            save_figure(file, scenario, items, at=[1.0])
 
         assert files[0].read_bytes() == files[1].read_bytes()
 
     def test_an_unknown_ending_names_those_possible(self, scenario, tmp_path):
         with pytest.raises(ConfigError, match=r"\.bmp") as caught:
-            save_figure(tmp_path / "a.bmp", scenario, [shown(scenario)], at=0.0)
+            save_figure(tmp_path / "a.bmp", scenario, [shown(scenario)], at=[0.0])
 
         assert ".svg" in caught.value.hint
 
     def test_a_time_beyond_the_end_is_refused(self, scenario, tmp_path):
         with pytest.raises(ConfigError, match="not within"):
-            save_figure(tmp_path / "a.png", scenario, [shown(scenario)], at=99.0)
+            save_figure(tmp_path / "a.png", scenario, [shown(scenario)], at=[99.0])

@@ -35,7 +35,7 @@ def test_the_first_value_outside_is_named(values, text):
 
 def test_a_missing_value_may_be_nan():
     require(TABLE, "speed", np.array([1.0, np.nan]), "a", may_be_nan=True)
-    with pytest.raises(DataError, match=r"row 1: 200 is beyond .* m/s$"):
+    with pytest.raises(DataError, match=r"row 1: 200 is beyond .* m/s\n"):
         require(TABLE, "speed", np.array([np.nan, 200.0]), "a", may_be_nan=True)
 
 

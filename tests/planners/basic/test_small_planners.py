@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plans import recorded_inputs
 from worlds import cruise_scenario
 
 from shiftsim.errors import ConfigError, DataError, PlannerError
-from shiftsim.planners.contract import check_planner, recorded_inputs
+from shiftsim.planners.contract import check_planner
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AX, VX, VY, Command
@@ -153,7 +154,7 @@ def test_a_planner_that_returns_commands_obeys_the_contract():
 
 
 def test_inputs_of_the_contract_check_cannot_be_written():
-    scene, observations = recorded_inputs(cruise_scenario())
+    scene, observations = recorded_inputs(cruise_scenario(), 20)
     assert len(observations[0].history.time_us) == 22
     with pytest.raises(ValueError, match="read-only"):
         observations[3].history.ego[0, 0] = 1.0

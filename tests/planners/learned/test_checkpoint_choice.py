@@ -164,7 +164,7 @@ def test_without_torch_a_learned_planner_says_what_to_install(function):
         f"from shiftsim.planners.registry import {function}, readiness, PLANNERS\n"
         "print(readiness(PLANNERS['carl']))\n"
         f"try: {function}('carl', {{'checkpoint': 'deterministic:drive'}})\n"
-        "except ImportError as error: print(type(error).__name__, error, error.hint, sep='|')"
+        "except ImportError as e: print(type(e).__name__, e.message, e.hint, sep='|')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     ready, message = done.stdout.splitlines()

@@ -39,7 +39,7 @@ def test_every_recorded_plan_comes_out_again(nuplan_reference, scenes):
     assert report.mismatches == []
     assert report.not_covered == {}
     assert report.quantities["idm plan x"].cases == 224
-    assert report.quantities["log_future plan x"].cases == 320
+    assert report.quantities["log-future plan x"].cases == 320
     assert report.quantities["simple plan x"].cases == 256
 
 
