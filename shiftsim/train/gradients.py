@@ -37,6 +37,7 @@ class Gradients:
 
     def __init__(self, device: str, threads: int) -> None:
         self.device = device
+        torch.set_num_threads(1)  # sums must not depend on the number of cores
         self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
 
     def of(self, ends: Laid, count: int, see: See, judge: Judge) -> Summed:

@@ -105,7 +105,7 @@ def test_the_critic_learns_first(short, small, toy):
 def test_it_learns_to_drive_along_a_road(small, toy, monkeypatch):
     for name, value in {"ENVS": 4, "ROLLOUT": 256, "MINIBATCH": 128, "RECENT": 40}.items():
         monkeypatch.setattr(ppo, name, value)
-    settings = small(ppo_samples=256 * 30)
+    settings = small(ppo_samples=256 * 16)
     settings.out.mkdir()
     store = open_store(toy)
     towns = divide(store, store.tokens, 0)
@@ -117,4 +117,4 @@ def test_it_learns_to_drive_along_a_road(small, toy, monkeypatch):
             trainer.improve()
     returns = np.array(trainer.returns)
     quarter = len(returns) // 4
-    assert returns[-quarter:].mean() > returns[:quarter].mean() + 1.0
+    assert returns[-quarter:].mean() > returns[:quarter].mean() + 5.0
