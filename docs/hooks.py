@@ -10,8 +10,8 @@ from typing import Any
 _ROOT = Path(__file__).parent.parent
 
 
-def on_config(config: Any) -> None:
-    """Copy the modules to build/api."""
+def on_startup(**settings: Any) -> None:
+    """Copy the modules to build/api, before mkdocstrings looks there."""
     target = _ROOT / "build" / "api" / "shiftsim"
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(_ROOT / "shiftsim", target, ignore=shutil.ignore_patterns("__pycache__"))
