@@ -28,9 +28,9 @@ def plan_of(planner, scenario):
     return planner.plan(first_sight(scenario, planner))
 
 
-def recorded_inputs(scenario, count):
-    """The scene, and what a planner sees at so many iterations along the recorded ego."""
-    return scene_info(scenario), [observe_log(scenario, i) for i in range(count)]
+def recorded_inputs(scenario, planner=None):
+    """The scene, and what a planner sees at the first 20 iterations of the recorded ego."""
+    return scene_info(scenario, planner=planner), [observe_log(scenario, i) for i in range(20)]
 
 
 def in_ego_frame(plan, ego):

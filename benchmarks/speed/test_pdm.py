@@ -4,8 +4,8 @@ Run with `pytest benchmarks/speed/test_pdm.py -s`. Targets on one core: 6 ms wit
 """
 
 import pytest
+from plans import recorded_inputs
 
-from shiftsim.planners.contract import recorded_inputs
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plans import recorded_inputs
 
-from shiftsim.planners.contract import recorded_inputs
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.plan_check import validate_plan
 from shiftsim.world.state import TrafficLights

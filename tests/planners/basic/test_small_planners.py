@@ -154,7 +154,7 @@ def test_a_planner_that_returns_commands_obeys_the_contract():
 
 
 def test_inputs_of_the_contract_check_cannot_be_written():
-    scene, observations = recorded_inputs(cruise_scenario(), 20)
+    scene, observations = recorded_inputs(cruise_scenario())
     assert len(observations[0].history.time_us) == 22
     with pytest.raises(ValueError, match="read-only"):
         observations[3].history.ego[0, 0] = 1.0
