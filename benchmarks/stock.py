@@ -89,7 +89,7 @@ def _store(path: Path) -> Store:
         store = open_store(path)
         found["maps"], found["sets"] = list(store.cities), list(_sets(store))
     except ShiftsimError as error:
-        found["problem"] = str(error)
+        found["problem"] = error.message
     return found
 
 

@@ -1,5 +1,6 @@
 """The public names: what they print, what notebooks show of them, and that their examples run."""
 
+import re
 import sys
 
 import pytest
@@ -7,6 +8,7 @@ from stores import write_toy_store
 
 import shiftsim
 from shiftsim.api import RunSettings
+from shiftsim.files import PACKAGE
 from shiftsim.runs.config import RunConfig
 from shiftsim.sim.planner import scene_info
 
@@ -138,3 +140,12 @@ def test_a_hint_is_part_of_the_text_of_an_error():
     error = shiftsim.ShiftsimError("no map", "name one")
     assert (str(error), error.message) == ("no map\nhint: name one", "no map")
     assert str(shiftsim.ShiftsimError("no map")) == "no map"
+
+
+def test_no_hint_is_said_twice():
+    # who passes a hint on takes the message without it
+    twice = re.compile(r"(\{error\}|str\(error\)).*\berror\.hint")
+    folders = ("shiftsim", "planners", "metrics", "data", "benchmarks")
+    sources = [path for folder in folders for path in (PACKAGE.parent / folder).rglob("*.py")]
+    assert len(sources) > 300
+    assert not [str(path) for path in sources if twice.search(path.read_text("utf-8"))]

@@ -63,7 +63,7 @@ def try_read(source: Site, name: str, config: ConversionConfig) -> Annotations |
     try:
         return read_recording(source, name, config.category_map)
     except DataError as error:
-        return Broken(str(error).replace(f"{source.folder}{os.sep}", ""), error.hint)
+        return Broken(error.message.replace(f"{source.folder}{os.sep}", ""), error.hint)
     except MemoryError:
         return Broken("it does not fit into memory", "split the recording")
 

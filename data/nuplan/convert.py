@@ -150,7 +150,7 @@ def _log_files(logs: Path, chosen: ScenarioFilter) -> list[Path]:
 
 
 def _reason(error: DataError) -> str:
-    return f"{error} ({error.hint})" if error.hint else str(error)
+    return f"{error.message} ({error.hint})" if error.hint else error.message
 
 
 def _parts(windows: Sequence[Window]) -> list[list[Window]]:

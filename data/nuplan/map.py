@@ -37,11 +37,11 @@ def read_map(path: Path, name: str) -> VectorMap:
         try:
             return _assemble(GeoPackage(database), name)
         except MapError as error:
-            raise MapError(f"{path}: {error}", hint=REPAIR) from error
+            raise MapError(f"{path}: {error.message}", hint=REPAIR) from error
         except DataError as error:
-            if str(error).startswith(str(path)):
+            if error.message.startswith(str(path)):
                 raise
-            raise DataError(f"{path}: {error}", hint=error.hint) from error
+            raise DataError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def _assemble(gpkg: GeoPackage, name: str) -> VectorMap:

@@ -211,7 +211,7 @@ class _Converter:
             scene = replace(scene, metadata={**scene.metadata, "source_key": self.keys[name]})
             return convert_scene(scene, vehicles=self.vehicles)
         except DataError as error:
-            return Broken(str(error), error.hint)
+            return Broken(error.message, error.hint)
         except MemoryError:
             return Broken(f"{name}: it does not fit into memory", "give the machine more of it")
 

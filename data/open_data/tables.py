@@ -22,9 +22,9 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        if str(path) in str(error):
+        if str(path) in error.message:
             raise
-        raise type(error)(f"{path}: {error}", error.hint) from error
+        raise type(error)(f"{path}: {error.message}", error.hint) from error
 
 
 def read_columns(path: Path, wanted: Mapping[str, pa.DataType], hint: str) -> pa.Table:

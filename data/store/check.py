@@ -85,7 +85,7 @@ def survey_store(path: str | Path) -> CheckReport:
     try:
         store = ScenarioStore(path)
     except DataError as error:
-        return CheckReport([*problems, Problem(str(path), str(error), remedy=error.hint)], [])
+        return CheckReport([*problems, Problem(str(path), error.message, remedy=error.hint)], [])
     if not len(store):
         what = "the store has no scenarios, need at least 1"
         hint = "convert recordings again: the conversion says why it dropped what it dropped"
@@ -101,7 +101,7 @@ def survey_store(path: str | Path) -> CheckReport:
             ]
             problems += [_problem(where, f) for f in maps[city].of_map()]
         except DataError as error:
-            problems.append(Problem(where, str(error), remedy=error.hint, kind="map"))
+            problems.append(Problem(where, error.message, remedy=error.hint, kind="map"))
     rows = []
     summary = store.summary().select(["token", "recording", "city", "ego"]).to_pylist()
     for name, group in groupby(sorted(summary, key=_place), lambda row: row["recording"]):
@@ -138,7 +138,7 @@ def _check_recording(
             found = check_ego(states, time_us[first : first + len(states)])
             problems += [_problem(f"{where}, ego {ego}", f, name) for f in found]
     except DataError as error:
-        problems.append(Problem(where, str(error), True, error.hint, "file", name))
+        problems.append(Problem(where, error.message, True, error.hint, "file", name))
     for row in scenarios:
         place = f"scenario {row['token']}"
         try:
@@ -155,7 +155,7 @@ def _check_recording(
                 for kind, what, hint in _unusual(scene)
             ]
         except DataError as error:
-            problems.append(Problem(place, str(error), True, error.hint, "file", name))
+            problems.append(Problem(place, error.message, True, error.hint, "file", name))
     errors = sum(problem.is_error for problem in problems)
     kinds = Counter(problem.kind for problem in problems)
     counts = len(scenarios), errors, len(problems) - errors

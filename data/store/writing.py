@@ -44,7 +44,7 @@ def _to_be_written() -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        raise DataError(str(error), "correct what is given; it is not written") from error
+        raise DataError(error.message, "correct what is given; it is not written") from error
 
 
 class StoreWriter:

@@ -245,7 +245,9 @@ def checked_state(
     try:
         wanted = match.empty_state(planner, args)
     except CheckpointError as error:
-        raise CheckpointError(f"checkpoint {str(found.path)!r}: {error}", error.hint) from error
+        raise CheckpointError(
+            f"checkpoint {str(found.path)!r}: {error.message}", error.hint
+        ) from error
     problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)

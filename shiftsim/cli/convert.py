@@ -268,7 +268,7 @@ def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None
     try:
         save_tracks_picture(path, looked, made)
     except MissingExtraError as error:
-        typer.echo(f" no picture: {error} ({error.hint})", err=True)
+        typer.echo(f" no picture: {error.message} ({error.hint})", err=True)
     else:
         typer.echo(f" picture: {path}", err=True)
 

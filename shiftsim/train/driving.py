@@ -133,7 +133,7 @@ class Driver:
                 scenario = self._store.read(start.token)
                 lanes.append(Lane(start, job, scenario, self._student.fork()))
             except ShiftsimError as error:
-                failed.append(f"{start.token}: {error}")
+                failed.append(f"{start.token}: {error.message}")
         active = list(lanes)
         while active := [lane for lane in active if not lane.is_over]:
             active = _step(active, self._student, failed)
@@ -150,7 +150,7 @@ def _step(lanes: list[Lane], student: Student, failed: list[str]) -> list[Lane]:
             lane.look()
             seen.append(lane)
         except ShiftsimError as error:  # a scenario in which the expert fails teaches nothing
-            failed.append(f"{lane.start.token}: {error}")
+            failed.append(f"{lane.start.token}: {error.message}")
     asked = [lane for lane in seen if lane.features is not None]
     if asked:
         for lane, action in zip(
