@@ -32,6 +32,8 @@ from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import _MODELS
 from shiftsim.train.pictures import blocks_of
+from shiftsim.train.traffic.labels import labels_of
+from shiftsim.train.traffic.realism import compare
 from shiftsim.verify.warmup import SHARES
 from shiftsim.world.layers import nearest
 from shiftsim.world.scenario import Scenario
@@ -155,8 +157,17 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "conversion": convert,
         "tracks and check": convert_table,
         "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),
+        "realism": lambda: measure_realism(scenario),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }
+
+
+def measure_realism(scenario: Scenario) -> None:
+    """Labels of agents, and how real they are."""
+    compare([cruise_scenario(speed=4.0, iterations=60, tracks=scenario.tracks)], {})
+    poses = np.zeros((scenario.tracks.num_tracks, 3))
+    away = np.zeros((len(poses), 2))
+    labels_of(scenario.tracks, 30, poses, np.zeros(len(poses)), away)
 
 
 def num_kept() -> int:

@@ -236,6 +236,7 @@ _COMMANDS = {
     "export": "stores:export",
     "checkpoint": "planners:checkpoint",
     "train": "training:app",
+    "realism": "training:realism",
 }
 
 

@@ -173,7 +173,8 @@ def _results(
 ) -> Generator[list[TaskResult], None, None]:
     """The results of each batch, in whatever order they end."""
     config = prepared.config
-    make = partial(TaskRunner, config, prepared.store, prepared.planners, prepared.noises)
+    given = config, prepared.store, prepared.planners, prepared.noises, prepared.traffic
+    make = partial(TaskRunner, *given)
     if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
         with closing(make()) as run_batch, _no_exit():
             for batch in batches:

@@ -31,7 +31,7 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
 from shiftsim.runs.task import Batch
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
-from shiftsim.sim.traffic import make_traffic, traffic_name
+from shiftsim.sim.traffic import PLANNER, make_traffic, traffic_name
 
 if TYPE_CHECKING:
     from shiftsim.runs.filter import Verdicts
@@ -60,6 +60,7 @@ class Prepared:
     before: State  # what it holds now
     workers: int  # number of worker processes
     generator: Mapping[str, Any]  # what made the scenarios up; empty where they were recorded
+    traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -96,20 +97,14 @@ def prepare(
     config = replace(
         config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
     )
-    try:
-        make_traffic(config.traffic)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"traffic {config.traffic!r} is not available: {error}",
-            hint="use --traffic nonreactive",
-        ) from error
+    traffic, made_of = _traffic(config)
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:
         load_metric(metric)
     entries = _entries(config, planners or config.planners)
     store = open_named_store(config.store)
     chosen = _scenarios(config, store)
-    determining = chosen.determining | _determining(config, entries, models, thresholds)
+    determining = chosen.determining | _determining(config, entries, models, thresholds) | made_of
     folder = Path(config.out) if config.out else RUNS / run_name(config, chosen.split, determining)
     before = _check_folder(config, folder, determining)
     tasks = list(_tasks(entries, models, config.seeds, chosen.present))
@@ -133,7 +128,28 @@ def prepare(
         before=before,
         workers=_workers(config, entries, len(batches)),
         generator=store.generator,
+        traffic=traffic,
     )
+
+
+def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any]]:
+    """The planner that drives other vehicles, if one does, and what identifies the traffic."""
+    name = config.traffic.removeprefix(PLANNER)
+    if name != config.traffic:
+        arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
+        if takes_argument(name, "device"):
+            arguments.setdefault("device", config.device)
+        planner = run_planner(name, arguments)
+        return planner, {"traffic_made_of": dict(planner.fingerprint)}
+    try:
+        model = make_traffic(config.traffic)
+    except (ImportError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"traffic {config.traffic!r} is not available: {error}",
+            hint="use --traffic nonreactive",
+        ) from error
+    made_of = getattr(model, "fingerprint", None)
+    return None, {"traffic_made_of": dict(made_of)} if made_of else {}
 
 
 def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:

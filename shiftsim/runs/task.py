@@ -28,6 +28,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import Planner
+from shiftsim.sim.traffic import Traffic
 from shiftsim.world.scenario import Scenario
 
 T = TypeVar("T")
@@ -95,6 +96,7 @@ class TaskRunner:
     store: str  # folder or URL of the scenario store
     planners: Mapping[str, RunPlanner]  # the planners, by name
     noises: Mapping[str, NoiseModel]  # the noise models, by name
+    traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
     _originals: dict[str, Original] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -176,7 +178,7 @@ class TaskRunner:
         return Setting(
             noise=self.noises[task.noise],
             seed=task.seed,
-            traffic=self.config.traffic,
+            traffic=self._driven(self.traffic) if self.traffic else self.config.traffic,
             controller=self.config.controller,
             strict=self.config.strict,
         )
@@ -185,10 +187,18 @@ class TaskRunner:
         """The planner of a task, which has nothing of other tasks."""
         if self.config.controller == "log-playback":
             return None
-        name = task.planner
+        return self._original(task.planner, self.planners[task.planner]).copy()
+
+    def _driven(self, planner: RunPlanner) -> Traffic:
+        """Traffic whose vehicles a planner drives, for one rollout."""
+        from shiftsim.sim.traffic.planned import PlannedTraffic
+
+        return PlannedTraffic(self._original(self.config.traffic, planner).copy)
+
+    def _original(self, name: str, planner: RunPlanner) -> Original:
         if name not in self._originals:
-            self._originals[name] = Original(self.planners[name].make)
-        return self._originals[name].copy()
+            self._originals[name] = Original(planner.make)
+        return self._originals[name]
 
     def close(self) -> None:
         """Let the planners release what they hold."""

@@ -18,7 +18,9 @@ _MODELS = {
     "nonreactive": "shiftsim.sim.traffic:LogReplay",
     "reactive": "shiftsim.sim.traffic.idm.model:IdmTraffic",
     "constant-velocity": "shiftsim.sim.traffic.constant_velocity:ConstantVelocity",
+    "learned": "shiftsim.sim.traffic.learned.model:LearnedTraffic",
 }
+PLANNER = "planner:"  # begins the name of traffic whose vehicles a planner drives
 _SHORT = {"nr": "nonreactive", "r": "reactive"}
 
 
@@ -64,7 +66,8 @@ def traffic_name(name: str) -> str:
         ConfigError: The name is unknown.
     """
     full = _SHORT.get(name, name)
-    return full if ":" in full else one_of("traffic", full, [*_MODELS, "package.module:Model"])
+    others = "planner:NAME", "package.module:Model"
+    return full if ":" in full else one_of("traffic", full, [*_MODELS, *others])
 
 
 def make_traffic(name: str) -> Traffic:
@@ -74,6 +77,11 @@ def make_traffic(name: str) -> Traffic:
         ConfigError: The name is unknown, or what it names is not a traffic model.
     """
     target = _MODELS.get(full := traffic_name(name), full)
+    if full.startswith(PLANNER):
+        raise ConfigError(
+            f"traffic {name!r} needs the planner itself here",
+            hint="give traffic=PlannedTraffic(make) of shiftsim.sim.traffic.planned",
+        )
     hint = "give package.module:Model of a class on the Python path"
     model: Traffic = load_attribute("traffic", target, hint)()
     for method in ("start", "step"):

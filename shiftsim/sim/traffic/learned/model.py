@@ -1,0 +1,135 @@
+"""Learned traffic: a small network says how vehicles, bicycles and pedestrians go on.
+
+All agents of a step are answered at once. The network imitates recorded agents; what it was trained
+on is in docs/traffic_weights.md.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.errors import ConfigError
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.sim.traffic.learned.features import (
+    NO_LANE,
+    NUM_FEATURES,
+    Lanes,
+    Motion,
+    lanes_of,
+    move_agents,
+    observe_agents,
+)
+from shiftsim.sim.traffic.learned.network import WEIGHTS, controls, digest, load_weights
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import (
+    LAST_AGENT_KIND,
+    PACIFICA,
+    AgentKind,
+    LightStatus,
+    Tracks,
+    center_poses,
+    center_velocities,
+)
+
+LAG = 3  # rows over which accelerations and turns are measured
+_EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
+
+
+class LearnedTraffic:
+    """Vehicles, bicycles and pedestrians move as a network says; static objects are replayed.
+
+    A track that the recording brings in later begins as recorded, and nobody leaves.
+    """
+
+    def __init__(self, weights: str | Path = WEIGHTS) -> None:
+        """Traffic with the weights that come with shiftsim, or with those of a file."""
+        self._weights = load_weights(weights)
+        self.fingerprint = {"weights": digest(self._weights)}  # goes into what identifies a run
+        self._lanes: Lanes | None = None
+
+    def start(
+        self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
+    ) -> None:
+        """Note who moves: the tracks `own` (all by default), static objects apart."""
+        moves = tracks.kinds <= LAST_AGENT_KIND
+        if own is not None:
+            moves = moves & np.isin(np.arange(tracks.num_tracks), own)
+        self.own = np.flatnonzero(moves)
+        self._lanes = lanes_of(scenario.map)
+        self._followed = np.full(len(self.own), NO_LANE, np.int64)
+        self._features = np.zeros((len(self.own), NUM_FEATURES))
+        self._moved = np.zeros((len(self.own), 4))
+        self._spans = np.diff(scenario.iteration_times) * 1e-6
+        self._light_edges, self._red = _red_lights(scenario)
+        self._kinds = np.append(tracks.kinds, AgentKind.VEHICLE)
+
+    def observe(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> FloatArray:
+        """(A, F) features of the agents at an iteration, whose row is `row`; zeros where absent.
+
+        The array is written again by the next call.
+        """
+        if self._lanes is None:
+            raise ConfigError("traffic was stepped before it was started", hint="call start first")
+        self._motion = self._seen(iteration, ego, tracks, row)
+        self._lanes.is_red[self._light_edges] = self._red[iteration]
+        observe_agents(self._lanes, self._motion, self.own, self._followed, self._features)
+        return self._features
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move everyone who was there a step ago."""
+        features = self.observe(iteration, ego, tracks, row - 1)
+        motion, own = self._motion, self.own
+        out = controls(self._weights, features, motion.speeds[own])
+        move_agents(motion, own, out, self._spans[iteration], self._moved)
+        there = motion.present[own]
+        who, moved = own[there], self._moved[there]
+        tracks.valid[row, who] = True
+        tracks.poses[row, who] = moved[:, :3]
+        tracks.velocities[row, who, 0] = moved[:, 3] * np.cos(moved[:, 2])
+        tracks.velocities[row, who, 1] = moved[:, 3] * np.sin(moved[:, 2])
+        tracks.sizes[row, who] = tracks.sizes[row - 1, who]
+
+    def _seen(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> Motion:
+        """Everyone at a row, the ego last."""
+        before = max(row - LAG, 0)
+        poses = np.concatenate([tracks.poses[row], center_poses(ego[None, :3])])
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        sideways = center_velocities(ego[None])[0]
+        ego_velocity = [
+            cos[-1] * sideways[0] - sin[-1] * sideways[1],
+            sin[-1] * sideways[0] + cos[-1] * sideways[1],
+        ]
+        velocities = np.nan_to_num(np.concatenate([tracks.velocities[row], [ego_velocity]]))
+        speeds = velocities[:, 0] * cos + velocities[:, 1] * sin
+        old = np.nan_to_num(tracks.velocities[before])
+        heading = tracks.poses[before, :, 2]
+        span = max((row - before) * self._spans[iteration], 1e-3)
+        was_there = np.append(tracks.valid[before] & tracks.valid[row], False)
+        change, turn = np.zeros(len(poses)), np.zeros(len(poses))
+        change[:-1] = (
+            speeds[:-1] - old[:, 0] * np.cos(heading) - old[:, 1] * np.sin(heading)
+        ) / span
+        turn[:-1] = wrap_angles(poses[:-1, 2] - heading) / span
+        return Motion(
+            present=np.append(tracks.valid[row], True),
+            poses=poses,
+            speeds=speeds,
+            accelerations=np.where(was_there, change, 0.0),
+            turns=np.where(was_there, turn, 0.0),
+            velocities=velocities,
+            sizes=np.concatenate([tracks.sizes[row], _EGO_SIZE[None]]),
+            kinds=self._kinds,
+        )
+
+
+def _red_lights(scenario: Scenario) -> tuple[IntArray, np.ndarray]:
+    """(L,) edges with a light, and (T, L) whether a red one is listed at each iteration."""
+    lights, index = scenario.traffic_lights, scenario.map.edges.index
+    known = [i for i, name in enumerate(lights.connector_ids) if name in index]
+    named = np.array([index[lights.connector_ids[i]] for i in known], np.int64)
+    edges, place = np.unique(named, return_inverse=True)
+    is_red = lights.status[scenario.iteration_rows][:, known] == LightStatus.RED
+    out = np.zeros((len(edges), len(is_red)), np.bool_)
+    np.logical_or.at(out, place, is_red.T)
+    return edges, np.ascontiguousarray(out.T)

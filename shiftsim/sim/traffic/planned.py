@@ -1,0 +1,200 @@
+"""Vehicles driven by planners: each is an ego of its own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.errors import InvalidTrajectoryError, TrafficError
+from shiftsim.sim.dynamics.bicycle import command_and_step
+from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
+from shiftsim.sim.plan_check import find_fault, plain
+from shiftsim.sim.planner import Planner, SceneInfo, Sight
+from shiftsim.sim.traffic.learned.features import NO_LANE, choose_lane, lanes_of, next_lane
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import (
+    NUM_STATE,
+    PACIFICA,
+    VX,
+    AgentKind,
+    Command,
+    Tracks,
+    center_poses,
+    center_velocities,
+    rear_poses,
+)
+
+ROUTE = 400.0  # m of lanes ahead that a vehicle's route leads over
+_CANDIDATES = 16
+_EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
+
+
+@dataclass(slots=True)
+class _Driver:
+    """One vehicle and who drives it."""
+
+    track: int
+    planner: Planner
+    ego: FloatArray  # (B, 11) its states, by row of the rollout
+    tracks: Tracks  # what it sees: the ego in its own place
+    sight: Sight
+
+
+class PlannedTraffic:
+    """Vehicles on a lane at iteration 0 are driven by a planner, each as the ego is.
+
+    Vehicles whose lane leads nowhere are replayed.
+
+    The planner is told a route along the lanes, at forks the one that bends least, and sees the ego
+    among the vehicles. Plans are tracked as the ego's are, with the dimensions of nuPlan's ego
+    vehicle; boxes keep their sizes. Other tracks are replayed.
+    """
+
+    def __init__(self, make: Callable[[], Planner]) -> None:
+        """`make` makes a planner for one vehicle in one rollout."""
+        self._make = make
+        self._drivers: list[_Driver] = []
+
+    def start(
+        self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
+    ) -> None:
+        """Give every vehicle a planner."""
+        vehicles = tracks.valid[row] & (tracks.kinds == AgentKind.VEHICLE)
+        if own is not None:
+            vehicles &= np.isin(np.arange(tracks.num_tracks), own)
+        self._scenario, self._lanes = scenario, lanes_of(scenario.map)
+        first = int(scenario.iteration_rows[0])
+        step = scenario.row_step
+        rows = np.concatenate([first - step * np.arange(row, 0, -1), scenario.iteration_rows])
+        self._time_us, self._clock = scenario.time_us[rows], scenario.time_us[rows].tolist()
+        self._lights = scenario.traffic_lights.rows(rows)
+        self._seen_ego = np.full((len(rows), NUM_STATE), np.nan)
+        self._seen_ego[: row + 1] = scenario.ego[rows[: row + 1]]
+        self._row, self._known = row, row
+        self._drivers = []
+        for track in np.flatnonzero(vehicles).tolist():
+            route = self._route(tracks.poses[row, track])
+            if len(route) > 1:  # most planners need two blocks
+                self._drivers.append(self._driver(tracks, track, route, row))
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Ask every vehicle's planner, and move it.
+
+        Raises:
+            TrafficError: A planner failed.
+        """
+        self._seen_ego[row - 1] = ego
+        for driver in self._drivers:
+            self._show(driver, tracks, row - 1)
+        for driver in self._drivers:
+            try:
+                self._move(driver, iteration, row)
+            except Exception as error:
+                raise TrafficError(
+                    f"the planner of vehicle {tracks.tokens[driver.track]!r} failed at iteration "
+                    f"{iteration}: {error}",
+                    hint="leave the scenario out, or use other traffic",
+                ) from error
+        for driver in self._drivers:
+            track, state = driver.track, driver.ego[row]
+            tracks.valid[row, track] = True
+            tracks.poses[row, track] = center_poses(state[None, :3])[0]
+            tracks.velocities[row, track] = _in_map(state)
+            tracks.sizes[row, track] = tracks.sizes[row - 1, track]
+
+    def _route(self, pose: FloatArray) -> tuple[str, ...]:
+        """Roadblocks along the lanes ahead of a pose; none where it is on no lane."""
+        found, road = np.empty(_CANDIDATES, np.int64), self._scenario.map
+        x, y, heading = pose.tolist()
+        edge = choose_lane(self._lanes, x, y, heading, NO_LANE, found)
+        blocks: list[int] = []
+        length, seen = 0.0, set[int]()
+        while edge != NO_LANE and length < ROUTE and edge not in seen:
+            seen.add(edge)
+            block = int(road.block_of[edge])
+            if block >= 0 and (not blocks or blocks[-1] != block):
+                blocks.append(block)
+            length += road.baselines.length(edge)
+            edge = next_lane(self._lanes, edge)
+        return tuple(road.blocks.ids[block] for block in blocks)
+
+    def _driver(self, tracks: Tracks, track: int, route: tuple[str, ...], row: int) -> _Driver:
+        scenario = self._scenario
+        ego = np.full((len(self._clock), NUM_STATE), np.nan)
+        there = tracks.valid[: row + 1, track]
+        first = row - int(np.argmin(there[::-1])) + 1 if not there.all() else 0
+        ego[: row + 1] = 0.0
+        ego[: row + 1, :3] = rear_poses(tracks.poses[: row + 1, track])
+        velocity = np.nan_to_num(tracks.velocities[: row + 1, track])
+        heading = tracks.poses[: row + 1, track, 2]
+        ego[: row + 1, VX] = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+        if first:  # what is not recorded: straight back with the speed of the first sighting
+            ego[:first] = ego[first]
+            spans = (self._time_us[first] - self._time_us[:first]) * 1e-6
+            way = spans * ego[first, VX]
+            ego[:first, 0] -= way * np.cos(ego[first, 2])
+            ego[:first, 1] -= way * np.sin(ego[first, 2])
+        seen = Tracks(
+            tracks.valid.copy(),
+            tracks.poses.copy(),
+            tracks.velocities.copy(),
+            tracks.sizes.copy(),
+            np.where(np.arange(tracks.num_tracks) == track, AgentKind.VEHICLE, tracks.kinds),
+            tuple("ego" if i == track else name for i, name in enumerate(tracks.tokens)),
+        )
+        planner = self._make()
+        times = scenario.iteration_times
+        planner.reset(
+            SceneInfo(
+                map=scenario.map,
+                route=route,
+                goal=None,
+                dt=float(np.diff(times).mean() * 1e-6),
+                times=times,
+                token=f"{scenario.token}:{tracks.tokens[track]}",
+                log_name=scenario.log_name,
+            )
+        )
+        driver = _Driver(track, planner, ego, seen, Sight(self._time_us, ego, seen, self._lights))
+        for past in range(row + 1):
+            self._show(driver, tracks, past)
+        return driver
+
+    def _show(self, driver: _Driver, tracks: Tracks, row: int) -> None:
+        """Write what a driver sees of a row: everybody, and the ego where he is himself."""
+        seen, track = driver.tracks, driver.track
+        arrays = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
+        for target, source in zip(
+            (seen.valid, seen.poses, seen.velocities, seen.sizes), arrays, strict=True
+        ):
+            target[row] = source[row]
+        ego = self._seen_ego[row]
+        seen.valid[row, track] = True
+        seen.poses[row, track] = center_poses(ego[None, :3])[0]
+        seen.velocities[row, track] = _in_map(ego)
+        seen.sizes[row, track] = _EGO_SIZE
+
+    def _move(self, driver: _Driver, iteration: int, row: int) -> None:
+        """Write the next state of a driver."""
+        now_us, next_us = self._clock[row - 1], self._clock[row]
+        plan = driver.planner.plan(driver.sight.at(iteration, row - 1))
+        fault = find_fault(plan, now_us, next_us)
+        if fault is not None:
+            raise InvalidTrajectoryError(fault.message, fault.hint)
+        state, after, command = driver.ego[row - 1], driver.ego[row], np.empty(2)
+        if isinstance(plan, Command):
+            command[:] = plan.acceleration, plan.steering_rate
+            command_and_step(now_us, next_us, state, command, 0.0, 0.0, after)
+            return
+        times = plan.time_us + now_us if plan.relative else plain(plan.time_us)
+        states = plain(plan.states)
+        status = track_and_step(now_us, next_us, state, times, states, 0.0, 0.0, after, command)
+        raise_for_status(status, now_us, times)
+
+
+def _in_map(state: FloatArray) -> FloatArray:
+    """(2,) velocity of the box centre in the frame of the map [m/s], from an ego state (11,)."""
+    (along, aside), heading = center_velocities(state[None])[0], state[2]
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([cos * along - sin * aside, sin * along + cos * aside])

@@ -1,0 +1,118 @@
+"""Training learned traffic: imitation of recorded agents, in rounds (DAgger).
+
+The first round collects recorded states, some of them pushed aside; in later rounds the network
+drives all agents beside the recorded ego, and where that leads is labelled with the way back. Each
+round trains on the states of all rounds so far, and the last network is measured in towns left out.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.errors import ConfigError
+from shiftsim.files import whole_file
+from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.sim.traffic import make_traffic
+from shiftsim.sim.traffic.learned.model import LearnedTraffic
+from shiftsim.sim.traffic.learned.network import Weights
+from shiftsim.train.curves import Say, write_table
+from shiftsim.train.jobs import divide
+from shiftsim.train.traffic.learning import learn, new_network, weights_of
+from shiftsim.train.traffic.realism import compare
+from shiftsim.train.traffic.states import States, join, states_of
+
+WEIGHTS, TABLE, CURVE = "weights.npz", "realism.parquet", "losses.parquet"
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficSettings:
+    """What a training of traffic depends on, and where it is written."""
+
+    store: str  # name, path or URL of the store
+    out: Path  # folder that is written
+    split: str = ""  # of the store; all scenarios if empty
+    seed: int = 0
+    rounds: int = 5  # of collecting and training
+    scenarios: int = 150  # that each round collects from
+    epochs: int = 8  # of each round
+    tests: int = 100  # scenarios of towns left out that the result is measured on
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no training."""
+        for name in ("rounds", "scenarios", "epochs", "tests"):
+            if (value := getattr(self, name)) < 1:
+                raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
+
+
+def train_traffic(settings: TrafficSettings, say: Say) -> Path:
+    """Train, write weights, losses and the table of realism, and return the file of the weights.
+
+    The same settings on the same machine give the same weights.
+
+    Raises:
+        ConfigError: The folder is not empty.
+        DataError: The store is not there, or has too few scenarios.
+    """
+    out, seed = settings.out, settings.seed
+    if out.exists() and any(out.iterdir()):
+        raise ConfigError(f"{str(out)!r} is not empty", hint="choose another --out")
+    store = open_named_store(settings.store)
+    tokens = find_split(settings.split, store.path, store.tokens).tokens
+    towns = divide(store, tokens, seed)
+    trained = [token for group in towns.trained.values() for token in sorted(group)]
+    tested = [token for group in towns.tested.values() for token in sorted(group)]
+    out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)  # sums in one order
+    network, parts, losses = new_network(seed), list[States](), list[dict[str, Any]]()
+    file = out / WEIGHTS
+    for number in range(settings.rounds):
+        write_weights(file, weights_of(network))
+        chosen = np.random.default_rng([seed, 3, number]).permutation(trained)
+        parts.append(_collected(store, chosen[: settings.scenarios].tolist(), file, seed, number))
+        found = learn(network, join(parts), settings.epochs, seed + number)
+        losses += [
+            {"round": number + 1, "epoch": epoch + 1, "loss": loss}
+            for epoch, loss in enumerate(found)
+        ]
+        count = sum(len(part.features) for part in parts)
+        say(f"round {number + 1} of {settings.rounds}: {count} states, loss {found[-1]:.3f}")
+    write_weights(file, weights_of(network))
+    write_table(out / CURVE, losses)
+    order = np.random.default_rng([seed, 4]).permutation(tested)[: settings.tests].tolist()
+    models = {
+        "learned": partial(LearnedTraffic, file),
+        **{name: partial(make_traffic, name) for name in ("reactive", "constant-velocity")},
+    }
+    rows = compare((store.read(token) for token in order), models)
+    write_table(out / TABLE, rows)
+    return file
+
+
+def _collected(
+    store: ScenarioStore, tokens: Iterable[str], file: Path, seed: int, number: int
+) -> States:
+    """States of a round; from the second one on the network drives."""
+    traffic = LearnedTraffic(file)
+    return join(
+        [
+            states_of(
+                store.read(token),
+                traffic,
+                np.random.default_rng([seed, number, place]),
+                drives=number > 0,
+            )
+            for place, token in enumerate(tokens)
+        ]
+    )
+
+
+def write_weights(path: Path, weights: Weights) -> None:
+    """Write weights as `LearnedTraffic` reads them."""
+    with whole_file(path) as partial_file, partial_file.open("wb") as stream:
+        np.savez(stream, **weights._asdict())
