@@ -1,7 +1,7 @@
 """Reactive traffic in a city of 5200 lanes: the median of all steps of a rollout, and the rollout.
 
-Run with `pytest benchmarks/speed/test_traffic.py -s`. Targets on one core: 400 µs with 100 agents, 1 ms
-with 50 that learned traffic moves.
+Run with `pytest benchmarks/speed/test_traffic.py -s`. Targets on one core: 400 µs with 100 agents,
+1 ms with 50 that learned traffic moves.
 """
 
 from time import process_time

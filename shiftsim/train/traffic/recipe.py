@@ -5,7 +5,7 @@ drives all agents beside the recorded ego, and where that leads is labelled with
 round trains on the states of all rounds so far, and the last network is measured in towns left out.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError
 from shiftsim.files import whole_file
 from shiftsim.runs.scenarios import find_split, open_named_store
-from shiftsim.sim.traffic import make_traffic
+from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.sim.traffic.learned.network import Weights
 from shiftsim.train.curves import Say, write_table
@@ -85,7 +85,7 @@ def train_traffic(settings: TrafficSettings, say: Say) -> Path:
     write_weights(file, weights_of(network))
     write_table(out / CURVE, losses)
     order = np.random.default_rng([seed, 4]).permutation(tested)[: settings.tests].tolist()
-    models = {
+    models: dict[str, Callable[[], Traffic]] = {
         "learned": partial(LearnedTraffic, file),
         **{name: partial(make_traffic, name) for name in ("reactive", "constant-velocity")},
     }
