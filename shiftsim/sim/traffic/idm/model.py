@@ -60,6 +60,8 @@ class IdmTraffic:
         foreign = np.zeros(len(kinds), np.bool_)
         if own is not None:
             foreign = ~np.isin(np.arange(len(kinds)), own)
+        if scenario.script is not None:  # what an edit has stopped stands, and is in the way
+            foreign |= scenario.script.stopped
         is_replayed = np.isin(kinds, REPLAYED_KINDS) | foreign
         vehicles = np.flatnonzero(tracks.valid[row] & (kinds == AgentKind.VEHICLE) & ~foreign)
         standing = np.flatnonzero(tracks.valid[row] & is_replayed)
