@@ -104,7 +104,7 @@ class Rollout:
         self._lights = scenario.traffic_lights.rows(rows)
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
-        if scenario.script is not None and scenario.script.walkers:
+        if scenario.script is not None and scenario.script.has_pedestrians:
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
         self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)

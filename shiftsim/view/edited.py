@@ -8,6 +8,7 @@ from shiftsim.view import still
 from shiftsim.world.scenario import Scenario
 
 _EDITED = "#7b2fbf"  # as in replays
+_LINE = 0.2  # inch, height of a line of words
 _WIDTH = 110  # characters of the words below the picture
 
 
@@ -37,6 +38,10 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     still.add_legend(panels[1])
     words = edited.script.words if edited.script else ()
     lines = [part for line in words for part in textwrap.wrap(line, _WIDTH)]
+    width, height = figure.get_size_inches()
+    below = _LINE * (len(lines) + 1)
+    figure.set_size_inches(width, height + below)
+    figure.subplots_adjust(bottom=below / (height + below))
     figure.text(0.5, 0.01, "\n".join(lines), ha="center", va="bottom", fontsize=8)
     return figure
 

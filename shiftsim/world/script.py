@@ -9,8 +9,8 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.world.layers import contains
 from shiftsim.world.map import VectorMap
 
-FOLLOW, STOPPED, CAUTIOUS = 0, 1, 2  # how a track behaves under reactive traffic
-ASSERTIVE, WARY, MIXED, DEFAULT = 0, 1, 2, 3  # how reactive agents treat the ego
+FOLLOW, STOPPED, CAUTIOUS, LOGGED = 0, 1, 2, 3  # how a track behaves under reactive traffic
+OFF, ASSERTIVE, WARY, MIXED, DEFAULT = -1, 0, 1, 2, 3  # how reactive agents treat the ego
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,25 @@ class Walker:
     speed: float
     ego_within: float
     visible: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A pedestrian of interPlan: not there until it sets off, and slower the later it does.
+
+    Attributes:
+        token: Its token.
+        start: (3,) where it sets off: x [m], y [m], heading [rad].
+        end: (2,) where it goes [m].
+        iteration: When it sets off; 0 where the ego decides.
+        track: Its track.
+    """
+
+    token: str
+    start: FloatArray
+    end: FloatArray
+    iteration: int
+    track: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +87,16 @@ class Script:
         digest: Digest of the edit.
         words: What was edited, one line each.
         tokens: Tokens of the tracks that the edit made or changed.
-        behaviors: (N,) FOLLOW, STOPPED or CAUTIOUS of each track.
-        manner: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT.
+        behaviors: (N,) FOLLOW, STOPPED or CAUTIOUS of each track; LOGGED where it is not driven.
+        manner: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as interPlan's
+            do, OFF as nuPlan's do.
         walkers: Pedestrians that move by themselves.
         finish: Where a rollout ends before its time; None where it does not.
         seed: Of what is drawn during a rollout.
         profile: `shiftsim`, or `interplan` where its oddities are kept.
+        crossings: Pedestrians of interPlan.
+        sorts: What a scenario of interPlan is about, such as `stopped_vehicle`; else empty.
+        obstacles: (M, 2) where that is [m].
     """
 
     base: str
@@ -82,16 +105,22 @@ class Script:
     words: tuple[str, ...]
     tokens: tuple[str, ...]
     behaviors: IntArray
-    manner: int = ASSERTIVE
+    manner: int = OFF
     walkers: tuple[Walker, ...] = ()
     finish: Finish | None = None
     seed: int = 0
     profile: str = "shiftsim"
-    sorts: str = ""  # obstacle that an interPlan scenario is about
-    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) its places [m]
+    crossings: tuple[Crossing, ...] = ()
+    sorts: str = ""
+    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def stopped(self) -> BoolArray:
         """(N,) tracks that stand whatever happens."""
         stands: BoolArray = self.behaviors == STOPPED
         return stands
+
+    @property
+    def has_pedestrians(self) -> bool:
+        """Whether there are pedestrians that look for the ego."""
+        return bool(self.walkers or self.crossings)

@@ -29,7 +29,7 @@ from shiftsim.world.edits.spec import (
     digest_of,
     make_edit,
 )
-from shiftsim.world.script import CAUTIOUS, FOLLOW, STOPPED, Script, Walker
+from shiftsim.world.script import CAUTIOUS, FOLLOW, OFF, STOPPED, Script, Walker
 from shiftsim.world.state import VX, AgentKind, LightStatus, TrafficLights
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class _Editor:
             words=edit.words(),
             tokens=tuple(token for token in draft.touched if token in places),
             behaviors=draft.behaviors,
-            manner=MANNERS.index(edit.agents),
+            manner=MANNERS.index(edit.agents) if edit.agents else OFF,
             walkers=walkers,
             finish=draft.finish,
             seed=self.seed,

@@ -44,7 +44,7 @@ def reroute(draft: Draft, wanted: Reroute, *, ends: bool) -> None:
         goal_edge = edge_at(road, *wanted.goal)
         lanes = plan_lanes(road, first, goal_edge, set(range(len(road.edges))), _MAX_DEPTH)
     else:
-        blocks = _blocks(road, wanted, first, seconds)
+        blocks = _blocks(road, wanted, first, max(3, len(draft.scenario.route)))
         goal_edge = int(road.block_edges.at(blocks[-1])[-1])
         within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
         lanes = plan_lanes(road, first, goal_edge, within, len(blocks))
@@ -65,10 +65,9 @@ def reroute(draft: Draft, wanted: Reroute, *, ends: bool) -> None:
         draft.finish = Finish(line, total - TOLERANCE, int(road.block_of[lanes[-1]]))
 
 
-def _blocks(road: VectorMap, wanted: Reroute, first: int, seconds: float) -> list[int]:
+def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[int]:
     if not wanted.route:
-        # as many as are driven at the speed limit, and some to spare
-        return by_command(road, first, wanted.command, max(3, int(seconds)))
+        return by_command(road, first, wanted.command, count)
     lost = [name for name in wanted.route if name not in road.blocks.index]
     if lost:
         raise ConfigError(f"reroute: map {road.name!r} has no roadblock {lost[0]!r}")

@@ -177,7 +177,7 @@ class Edit:
     type: str = ""  # type of the new scenario; kept where empty
     window_s: float | None = None  # its duration [s]; kept where absent
     seed: int | None = None  # of what is drawn; made from the id where absent
-    agents: str = "assertive"  # how reactive agents treat the ego
+    agents: str = ""  # how reactive agents treat the ego; as nuPlan's do where empty
     end_at_goal: bool | None = None  # whether a rollout ends there; true with a reroute
     code: str = ""  # of interPlan, instead of all tables; needs `profile = "interplan"`
     details: Mapping[str, Any] = field(default_factory=dict)  # interPlan's, of the token
@@ -233,7 +233,7 @@ def _words(table: Any) -> str:
                 parts.append(f"{item.name} ({_words(value)})")
             else:
                 parts.append(f"{item.name} {_plain(value)}")
-    return ", ".join(parts) or "all defaults"
+    return ", ".join(parts) or "everything"
 
 
 def _plain(value: Any) -> str:
