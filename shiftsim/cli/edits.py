@@ -83,3 +83,32 @@ def show(
     out.parent.mkdir(parents=True, exist_ok=True)
     save_picture(before_and_after(opened.read(edited.base(found)), scenario), out)
     say(f"written: {out}")
+
+
+@app.command("import")
+def import_edits(
+    names: Annotated[
+        Path, typer.Argument(metavar="NAMES", help="interPlan's filter: scenario_tokens in YAML.")
+    ],
+    modifications: Annotated[
+        Path, typer.Argument(metavar="MODIFICATIONS", help="Its interPlan_modifications.yaml.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file to write.")] = Path(
+        "interplan.toml"
+    ),
+    window: Annotated[
+        float, typer.Option(help="Duration of the scenarios [s]; 0 keeps the recorded one.")
+    ] = 30.0,
+    debug: Debug = False,
+) -> None:
+    """Edits that make interPlan's scenarios, from interPlan's own two files."""
+    from shiftsim.files import write_text
+    from shiftsim.runs.edits import edits_text, make_edits
+    from shiftsim.runs.interplan.codes import import_names
+
+    table = import_names(names, modifications, window)
+    made = make_edits(table, out.stem)
+    write_text(out, edits_text(table))
+    tokens = {token for edit in made.edits for token in edit.tokens}
+    say(f"{plural(len(made.edits), 'edit')} of {plural(len(tokens), 'scenario')}")
+    say(f"written: {out}")

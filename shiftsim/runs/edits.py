@@ -4,6 +4,7 @@ The store keeps its bytes: an edited scenario is made when it is read. A run kee
 manifest, so that its folder alone says how to make its scenarios again.
 """
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, beginning, nearest
 from shiftsim.files import read_toml
+from shiftsim.runs.interplan.build import apply_code
 from shiftsim.world.edits.apply import apply_edit, edited_id
 from shiftsim.world.edits.spec import PROFILES, Edit, digest_of, make_edit
 from shiftsim.world.scenario import Scenario
@@ -166,7 +168,8 @@ class EditedStore(ScenarioStore):
             ConfigError: The edit cannot be applied.
         """
         recorded = super().read(self.base(token), plausible=plausible)
-        return apply_edit(recorded, self.edited[token].edit)
+        edit = self.edited[token].edit
+        return apply_code(recorded, edit) if edit.code else apply_edit(recorded, edit)
 
 
 def describe(edited: Mapping[str, Edited]) -> dict[str, Any]:
@@ -234,3 +237,26 @@ def read_edits(name: str, store: Path | None = None) -> EditSet:
                 hint=f"available: {', '.join(known) or 'none'}, or the path of a .toml file",
             )
     return make_edits(read_toml(path), path.stem)
+
+
+def edits_text(table: Mapping[str, Any]) -> str:
+    """The table of edits as TOML; what is null is left out, or 0 in a list."""
+    top = {name: value for name, value in table.items() if name != "edit"}
+    lines = [f"{name} = {_toml(value)}" for name, value in top.items()]
+    for edit in table["edit"]:
+        lines += ["", "[[edit]]"]
+        lines += [f"{_key(name)} = {_toml(value)}" for name, value in edit.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").isalnum() and name.isascii() else json.dumps(name)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        pairs = (f"{_key(k)} = {_toml(v)}" for k, v in value.items() if v is not None)
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_toml(0 if item is None else item) for item in value)}]"
+    return json.dumps(value)

@@ -19,6 +19,7 @@ import pyarrow as pa
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
+from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
@@ -235,6 +236,8 @@ def score_rollout(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
+    if scenario.script is not None and scenario.script.profile == "interplan":
+        result = add_interplan(result, log, scenario.map, scenario.script)
     profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {
         "scenario_type": scenario.scenario_type,

@@ -142,7 +142,8 @@ class Rollout:
             self._traffic.step(iteration, self._ego[row], self._tracks, row + 1)
         self.iteration += 1
         if not self.done and self._is_finished(row + 1):
-            self.num_samples = self.iteration
+            # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
+            self.num_samples = self.iteration + 1
 
     def _is_finished(self, row: int) -> bool:
         """Whether the ego is where an edit ends the rollout."""

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from shiftsim.data.nuplan.filter import read_yaml
 from shiftsim.errors import ConfigError
 from shiftsim.world.edits.spec import MANNERS
 
@@ -37,12 +38,12 @@ def parse_code(code: str) -> dict[str, Any]:
         letter, value = code[at], code[at + 1 : at + 2]
         if letter == "s" and code[at + 2 : at + 3].isdigit():
             value, at = code[at + 1 : at + 3], at + 1
+        if not value:
+            raise ConfigError(f"code {code!r}: letter {letter!r} has no value")
         if letter not in LETTERS:
             raise ConfigError(
                 f"code {code!r}: letter {letter!r} unknown", f"there are: {', '.join(LETTERS)}"
             )
-        if not value:
-            raise ConfigError(f"code {code!r}: letter {letter!r} has no value")
         if letter == "a" and not value.isdigit():
             raise ConfigError(f"code {code!r}: share {value!r} is no digit")
         out[LETTERS[letter]] = int(value) if letter == "a" else value
@@ -141,10 +142,11 @@ def manners_in_force(names: Iterable[str], details: Mapping[str, Any]) -> dict[s
     return out
 
 
-def import_names(names: Path, modifications: Path) -> dict[str, Any]:
+def import_names(names: Path, modifications: Path, window: float = 30.0) -> dict[str, Any]:
     """The table of an `edits.toml` for a list of interPlan's names and its modifications.
 
-    Both are the files of interPlan's repository, which are not part of this package.
+    Both are the files of interPlan's repository, which are not part of this package. The `window`
+    is the duration of the scenarios [s], 0 for the recorded one.
 
     Raises:
         ConfigError: A file cannot be read, or a code is wrong.
@@ -157,10 +159,12 @@ def import_names(names: Path, modifications: Path) -> dict[str, Any]:
             hint="name interPlan's filter first, then its interPlan_modifications.yaml",
         )
     details = {str(token): found or {} for token, found in details.items()}
-    edits = []
+    edits: list[dict[str, Any]] = []
     for name, manner in manners_in_force(map(str, listed), details).items():
         token, _, code = name.partition("-")
-        edit = {"name": code, "tokens": [token], "code": code, "agents": manner, "window_s": 30.0}
+        edit: dict[str, Any] = {"name": code, "tokens": [token], "code": code, "agents": manner}
+        if window:
+            edit["window_s"] = window
         if found := _used(details.get(token, {}), code):
             edit["details"] = found
         edits.append(edit)
@@ -177,20 +181,3 @@ def _used(details: Mapping[str, Any], code: str) -> dict[str, Any]:
     if number is not None:
         out["special_scenario"] = {number: special_of({"special_scenario": number}, details)}
     return out
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.
-
-    Raises:
-        ConfigError: It cannot be read, or holds something else.
-    """
-    import yaml
-
-    try:
-        found = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read {str(path)!r}: {error}", "check the path") from error
-    if not isinstance(found, dict):
-        raise ConfigError(f"{str(path)!r} holds no mapping", "name interPlan's own file")
-    return found

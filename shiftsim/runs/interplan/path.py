@@ -12,6 +12,7 @@ from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
+from shiftsim.metrics.interplan import simplified
 from shiftsim.metrics.route import driven_route
 from shiftsim.runs.interplan.codes import COMMANDS
 from shiftsim.world.edits.draft import EGO_SIZE
@@ -94,20 +95,10 @@ def _end(line: FloatArray, goal: FloatArray) -> float:
 
 def _driven_lanes(road: VectorMap, centers: FloatArray) -> list[int]:
     """The first edge of each stretch that the expert drove, as nuPlan simplifies a route."""
-    return [edges[0] for edges in simplified(road, centers)]
-
-
-def simplified(road: VectorMap, centers: FloatArray) -> list[list[int]]:
-    """Edges of box centres (K, 3), lists that share an edge with the one before left out."""
-    route = driven_route(road, centers)
-    out: list[list[int]] = []
-    for sample in range(len(route.counts)):
-        edges = route.at(sample)
-        if edges and (not out or set(edges).isdisjoint(out[-1])):
-            out.append(edges)
-    if not out:
+    lanes = [edges[0] for edges in simplified(driven_route(road, centers))]
+    if not lanes:
         raise ConfigError("the expert is on no lane")
-    return out
+    return lanes
 
 
 def _first_block(road: VectorMap, center: FloatArray) -> int:
