@@ -56,8 +56,8 @@ def select_tasks(
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in _rows_of(run.metrics, full):
         metrics.setdefault(_key(row), []).append(row)
-    for found in metrics.values():
-        _add_roles(found)
+    for listed in metrics.values():
+        _add_roles(listed)
     out, edits = [], edit_words(run.manifest, full)
     for row in rows:
         cls, known = scores.get(_key(row)), metrics.get(_key(row), [])

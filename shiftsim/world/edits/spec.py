@@ -307,10 +307,13 @@ def _one_place(item: Any, where: str) -> None:
 def _renamed(table: Mapping[str, Any]) -> dict[str, Any]:
     """`from` and `to` are no names in Python; places of a walk may be written without `at`."""
     out = dict(table)
-    if isinstance(out.get("walk"), list):
+    listed = out.get("walk")
+    if isinstance(listed, Mapping):
+        listed = [listed]
+    if isinstance(listed, (list, tuple)):
         names = {"from": "start", "to": "end"}
         walks = []
-        for walk in out["walk"]:
+        for walk in listed:
             items = walk.items() if isinstance(walk, Mapping) else ()
             named = {names.get(name, name): value for name, value in items}
             for name in ("start", "end"):
