@@ -112,3 +112,35 @@ def import_edits(
     tokens = {token for edit in made.edits for token in edit.tokens}
     say(f"{plural(len(made.edits), 'edit')} of {plural(len(tokens), 'scenario')}")
     say(f"written: {out}")
+
+
+@app.command()
+def sample(
+    kind: Annotated[str, typer.Option(help="jaywalker, parked or works.")],
+    count: Annotated[int, typer.Option(min=1, help="How many edits.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all draws.")] = 0,
+    store: Store = "demo",
+    split: Annotated[str, typer.Option(help="Only scenarios of a split. [whole store]")] = "",
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file. [KIND.toml]")] = Path(),
+    debug: Debug = False,
+) -> None:
+    """Draw plausible edits over a store: free of overlaps, and avoidable by braking at 4 m/s^2."""
+    from collections import Counter
+    from functools import lru_cache
+
+    from shiftsim.errors import one_of
+    from shiftsim.files import write_text
+    from shiftsim.runs.edits import edits_text
+    from shiftsim.runs.scenarios import find_split, open_named_store
+    from shiftsim.world.edits.sampling import KINDS, sample_edits
+
+    one_of("kind", kind, KINDS)
+    opened = open_named_store(store)
+    tokens = find_split(split, Path(opened.path), opened.tokens).tokens
+    read = lru_cache(maxsize=256)(opened.read)
+    edits = list(sample_edits(kind, count, seed, tokens, read))
+    path = out if out.suffix else Path(f"{kind}.toml")
+    write_text(path, edits_text({"format": 1, "edit": edits}))
+    for grade, number in sorted(Counter(edit["type"] for edit in edits).items()):
+        say(f"{grade:20} {number}")
+    say(f"written: {path}")

@@ -72,8 +72,8 @@ class IdmTraffic:
         is_agent = tracks.valid[row] & (kinds == AgentKind.VEHICLE) & ~foreign
         is_standing = tracks.valid[row] & is_replayed
         if script is not None and keeps_oddities:
-            # nuPlan rules 701, 702: logged vehicles are not simulated, and movers may overlap stopped
-            # vehicles and pedestrians at the start
+            # nuPlan rules 701, 702: logged vehicles are not simulated, and movers may overlap
+            # stopped vehicles and pedestrians at the start
             is_agent &= script.behaviors != LOGGED
             is_standing &= ~script.stopped & (kinds != AgentKind.PEDESTRIAN)
         vehicles, standing = np.flatnonzero(is_agent), np.flatnonzero(is_standing)
