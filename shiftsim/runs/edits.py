@@ -142,10 +142,19 @@ class Edited:
 class EditedStore(ScenarioStore):
     """A store whose scenarios are those that edits make of its own."""
 
-    def __init__(self, store: ScenarioStore, edits: EditSet) -> None:
-        """The edited scenarios of an open store."""
+    def __init__(
+        self, store: ScenarioStore, edits: EditSet, made: Mapping[str, Any] | None = None
+    ) -> None:
+        """The edited scenarios of an open store; those `made` in a run, as `describe` gave them."""
         vars(self).update(vars(store))
-        self.edited = edits.expand(store, store.tokens)
+        if made is None:
+            self.edited = edits.expand(store, store.tokens)
+        else:  # a bundle need not hold what other scenarios of the run are made of
+            by_digest = {edit.digest: edit for edit in edits.edits}
+            self.edited = {
+                token: Edited(found["base"], by_digest[found["digest"]])
+                for token, found in made.items()
+            }
         self.tokens = tuple(self.edited)
 
     def __contains__(self, token: object) -> bool:

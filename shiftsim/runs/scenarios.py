@@ -78,7 +78,7 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         )
     found.hash = run.manifest["determining"]["store"]
     if edits := run.manifest.get("edits"):
-        return EditedStore(found, make_edits(edits, run.path.name))
+        return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
 
 
