@@ -51,7 +51,7 @@ bench-smoke: install
 	$(BIN)/python -m pytest shiftsim/benchmarks/speed -q -p no:cacheprovider --benchmark-disable
 
 # folders of the references that are not compared yet; paper holds published figures
-NOT_VERIFIED := open_data scenario_edits paper
+NOT_VERIFIED := open_data paper
 
 verify: install
 	for folder in ../shared/reference/*/; do \

@@ -119,6 +119,7 @@ class RunSettings(TypedDict, total=False):
     split: str
     limit: int
     all_scenarios: bool
+    edits: str
     traffic: str
     controller: str
     thresholds: str

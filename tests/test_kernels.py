@@ -147,6 +147,12 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         convert_tracks(look_at(table, town[1], city="roundabout"), folder / "own")
         check_store(folder / "own")
 
+    def drive_edited() -> None:
+        # agents that look where the ego will be: one of them is beside it, another one far ahead
+        places = [{"pose": [x, y, 0.0]} for x, y in ((230.0, 3.5), (190.0, 3.5), (260.0, 0.0))]
+        edited = scenario.edited(agents="mixed", spawn=[*places])
+        simulate(edited, load("idm"), traffic="reactive")
+
     # a scripted planner needs a file, and has no kernels
     names = [name for name in PLANNERS if name != "scripted"]
     drives = {f"{name}, {mode}": partial(drive, name, mode) for name in names for mode in _MODELS}
@@ -154,6 +160,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         **drives,
         **SHARES,
         "environment": compile_environment,
+        "edited": drive_edited,
         "conversion": convert,
         "tracks and check": convert_table,
         "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),

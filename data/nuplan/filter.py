@@ -64,14 +64,17 @@ def read_filter(path: Path) -> ScenarioFilter:
     Raises:
         ConfigError: The file cannot be read, or asks for something that is not supported.
     """
+    if Path(path).suffix not in (".yaml", ".yml"):
+        lines = [line.split("#")[0].strip() for line in _read_text(path).splitlines()]
+        return ScenarioFilter(tokens=_tokens(path, [line for line in lines if line]))
+    return _from_values(path, read_yaml(path))
+
+
+def _read_text(path: Path) -> str:
     try:
-        text = Path(path).read_text("utf-8")
+        return Path(path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not readable: {error}", hint="check the path") from error
-    if Path(path).suffix not in (".yaml", ".yml"):
-        lines = [line.split("#")[0].strip() for line in text.splitlines()]
-        return ScenarioFilter(tokens=_tokens(path, [line for line in lines if line]))
-    return _from_values(path, _read_yaml(path, text))
 
 
 def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
@@ -190,9 +193,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker
         return super().construct_mapping(node, deep)
 
 
-def _read_yaml(path: Path, text: str) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file of nuPlan's world: sixteen digits are a token, no key is twice.
+
+    Raises:
+        ConfigError: It cannot be read, or is something else.
+    """
     try:
-        values = yaml.load(text, _Loader)
+        values = yaml.load(_read_text(path), _Loader)
     except yaml.MarkedYAMLError as error:
         line = 0 if error.problem_mark is None else error.problem_mark.line + 1
         what = f"{path}: line {line}: {error.problem}"

@@ -231,6 +231,7 @@ _COMMANDS = {
     "filter": "stores:filter_scenarios",
     "stats": "stores:show_stats",
     "split": "stores:make_split",
+    "edits": "edits:app",
     "planners": "planners:app",
     "convert": "open_data:app",
     "export": "stores:export",

@@ -8,7 +8,9 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
+from shiftsim.metrics.interplan import LANES, SORTS, role_of
 from shiftsim.report.words import COLLISIONS, UNITS
+from shiftsim.runs.edits import edit_words
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
@@ -53,15 +55,28 @@ def select_tasks(
     scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in _rows_of(run.metrics, full):
-        name = row["metric"]
-        role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
-        row |= {"role": role, "weight": WEIGHTS.get(name)}
         metrics.setdefault(_key(row), []).append(row)
-    out = []
+    for listed in metrics.values():
+        _add_roles(listed)
+    out, edits = [], edit_words(run.manifest, full)
     for row in rows:
         cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
-        out.append({**row, "cls": cls, "why": why(cls, known), "metrics": known})
+        found = {"cls": cls, "why": why(cls, known), "edits": edits, "metrics": known}
+        out.append({**row, **found})
     return out
+
+
+def _add_roles(rows: list[dict[str, Any]]) -> None:
+    """Add role and weight to the metrics of a task; those of interPlan differ from nuPlan's."""
+    names = {row["metric"] for row in rows}
+    sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
+    for row in rows:
+        name = row["metric"]
+        role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
+        weight = WEIGHTS.get(name)
+        if LANES in names and row["score"] is not None:
+            role, weight = role_of(name, sorts)
+        row |= {"role": role, "weight": weight}
 
 
 def explain_tasks(
@@ -127,12 +142,12 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
     head = f"{task['token']}  {task['scenario_type']}  {task['planner']} {task['noise']}{seed}"
     if task["status"] != "ok":
         hint = [f"hint: {task['hint']}"] if task["hint"] else []
-        lines = [task["error"], *hint, *(task["traceback"] or "").splitlines()]
+        lines = [*task["edits"], task["error"], *hint, *(task["traceback"] or "").splitlines()]
         return [f"{head}  {task['status']}", *(f"  {line}" for line in lines)]
     rule = "the score is the product of the × rows and the weighted mean of the + rows"
     rank = ("multiplier", "weighted", "").index
     rows = sorted(task["metrics"], key=lambda row: rank(row["role"]))
-    lines = [task["why"], rule, *map(_metric_line, rows)]
+    lines = [*task["edits"], task["why"], rule, *map(_metric_line, rows)]
     return [f"{head}  CLS {task['cls']:.4f}", *(f"  {line}" for line in lines)]
 
 

@@ -95,6 +95,7 @@ class RunConfig:
     split: str = _setting("", "Name or file (.toml, .txt). [whole store]")
     limit: int = _setting(0, "Only the first N scenarios.", least=0)
     all_scenarios: bool = _setting(False, "Also the scenarios that the filter dropped.", "--all")
+    edits: str = _setting("", "File (.toml) of edits; only what they make is run.")
     traffic: str = _setting(
         "nonreactive",
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",

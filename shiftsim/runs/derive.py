@@ -11,6 +11,7 @@ from typing import Any
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
+from shiftsim.runs.edits import make_edits
 from shiftsim.runs.execute import Progress, ended, record
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
@@ -121,8 +122,10 @@ class Rescorer:
     """Scores one stored rollout of a run after the other."""
 
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        self.config = config
-        self._run, self._scenarios = open_run(run), Scenarios(store)
+        self.config, self._run = config, open_run(run)
+        edits = self._run.manifest.get("edits")
+        made = make_edits(edits, self._run.path.name) if edits else None
+        self._scenarios = Scenarios(store, made)
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """The results of tasks."""
@@ -184,6 +187,8 @@ def rescore(
         determining=determining,
         argv=argv,
     )
+    if edits := run.manifest.get("edits"):
+        manifest["edits"] = edits
     writer = RunWriter(target, manifest)
     try:
         for result, _ in stored_results(run.path):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 from shiftsim.errors import DataError
 from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
+from shiftsim.runs.edits import EditedStore
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
 from shiftsim.runs.prepare import Prepared, prepare
@@ -81,6 +82,8 @@ def execute(
         argv=argv,
     )
     manifest["workers"] = prepared.workers
+    if prepared.edits is not None:
+        manifest["edits"] = {**prepared.edits.to_dict(), "made": dict(prepared.made)}
     if prepared.config.shard:  # what the whole run would be, for `merge`
         manifest["tokens"] = sorted(prepared.tokens)
     try:
@@ -102,6 +105,9 @@ def _execute(prepared: Prepared, manifest: dict[str, Any], on_progress: Watch) -
         if prepared.config.bundle:
             store = open_named_store(prepared.store)
             tokens = {task.token for task in prepared.tasks}
+            if prepared.edits is not None:
+                edited = EditedStore(store, prepared.edits)
+                tokens = {edited.base(token) for token in tokens}
             manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
         missing = set(prepared.missing)
         run = writer.finish(
@@ -173,8 +179,8 @@ def _results(
 ) -> Generator[list[TaskResult], None, None]:
     """The results of each batch, in whatever order they end."""
     config = prepared.config
-    given = config, prepared.store, prepared.planners, prepared.noises, prepared.traffic
-    make = partial(TaskRunner, *given)
+    given = config, prepared.store, prepared.planners, prepared.noises
+    make = partial(TaskRunner, *given, prepared.traffic, prepared.edits)
     if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
         with closing(make()) as run_batch, _no_exit():
             for batch in batches:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,9 +26,10 @@ from shiftsim.planners.registry import (
     takes_argument,
 )
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
+from shiftsim.runs.edits import EditSet, describe
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.scenarios import find_split, open_named_store, token_hash
+from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, token_hash
 from shiftsim.runs.task import Batch
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import PLANNER, make_traffic, traffic_name
@@ -61,6 +62,8 @@ class Prepared:
     workers: int  # number of worker processes
     generator: Mapping[str, Any]  # what made the scenarios up; empty where they were recorded
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
+    edits: EditSet | None = None  # what makes the scenarios of recorded ones
+    made: Mapping[str, Any] = field(default_factory=dict)  # which are made of which
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -76,6 +79,8 @@ class Chosen(NamedTuple):
     missing: list[str]  # tokens that it does not hold
     num_dropped: int  # scenarios left out because the filter dropped them
     determining: dict[str, Any]  # what identifies them
+    edits: EditSet | None  # what makes them of recorded ones
+    made: dict[str, Any]  # which are made of which, for the manifest
 
 
 def prepare(
@@ -129,6 +134,8 @@ def prepare(
         workers=_workers(config, entries, len(batches)),
         generator=store.generator,
         traffic=traffic,
+        edits=chosen.edits,
+        made=chosen.made,
     )
 
 
@@ -217,8 +224,12 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
         if store.is_reviewed:
             usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
-    tokens = split.tokens[: config.limit] if config.limit else split.tokens
-    store_tokens = set(known)
+    name, tokens, store_tokens = split.name, split.tokens, set(known)
+    edits, made = _edits(config, store), {}
+    if edits is not None:
+        made = describe(edits.expand(store, tokens))
+        name, tokens, store_tokens = f"{name}+{edits.name}", tuple(made), set(made)
+    tokens = tokens[: config.limit] if config.limit else tokens
     missing = sorted(set(tokens) - store_tokens)
     if missing and not config.allow_partial:
         raise DataError(
@@ -236,8 +247,19 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
         determining["filter"] = verdicts.hash
     if store.is_reviewed and store.reviews.hash:
         determining["review"] = store.reviews.hash
+    if edits is not None:
+        determining["edits"] = edits.digest
     present = [token for token in tokens if token in store_tokens]
-    return Chosen(split.name, present, missing, len(known) - len(usable), determining)
+    return Chosen(name, present, missing, len(known) - len(usable), determining, edits, made)
+
+
+def _edits(config: RunConfig, store: ScenarioStore) -> EditSet | None:
+    """The edits of a run, which its traffic can drive."""
+    if not config.edits:
+        return None
+    edits = open_edits(config.edits, store)
+    edits.require_traffic(config.traffic)
+    return edits
 
 
 def _verdicts(config: RunConfig, store: ScenarioStore) -> "Verdicts | None":

@@ -16,6 +16,7 @@ from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.files import below, read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
+from shiftsim.runs.edits import EditedStore, EditSet, make_edits, read_edits
 from shiftsim.runs.results import Run
 
 BUNDLE = "store"  # folder below that of the run
@@ -46,7 +47,7 @@ def open_named_store(name: str) -> ScenarioStore:
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     """The store that a run was made with, or its bundle, which then has the hash of that store.
 
-    `store` says where the store has moved.
+    `store` says where the store has moved. Edits of the run are in its manifest.
 
     Raises:
         DataError: It is not there, or is another one.
@@ -76,7 +77,20 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
             hint="name the right one with --store, or run again",
         )
     found.hash = run.manifest["determining"]["store"]
+    if edits := run.manifest.get("edits"):
+        return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
+
+
+def open_edits(name: str, store: ScenarioStore) -> EditSet:
+    """Edits by the path of a file, or by the name of one in `edits/` of a store; splits resolved.
+
+    Raises:
+        ConfigError: There is no such file, or it is wrong.
+    """
+    path, known = Path(store.path), store.tokens
+    edits = read_edits(name, path)
+    return edits.with_splits(lambda split: find_split(split, path, known).tokens)
 
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:

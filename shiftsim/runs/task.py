@@ -19,9 +19,11 @@ import pyarrow as pa
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
+from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
+from shiftsim.runs.edits import EditedStore, EditSet
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
@@ -74,15 +76,16 @@ class Stopwatch:
 class Scenarios:
     """A store that is opened when it is needed, and the scenario that was read last."""
 
-    def __init__(self, store: str) -> None:
-        self.store = store
+    def __init__(self, store: str, edits: EditSet | None = None) -> None:
+        self.store, self.edits = store, edits
         self._open: Any = None
         self._last: Scenario | None = None
 
     def read(self, token: str) -> Scenario:
         """A scenario; several tasks on one follow each other."""
         if self._open is None:
-            self._open = open_store(self.store)
+            found = open_store(self.store)
+            self._open = EditedStore(found, self.edits) if self.edits else found
         if self._last is None or self._last.token != token:
             self._last = self._open.read(token)
         return self._last
@@ -97,10 +100,11 @@ class TaskRunner:
     planners: Mapping[str, RunPlanner]  # the planners, by name
     noises: Mapping[str, NoiseModel]  # the noise models, by name
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
+    edits: EditSet | None = None  # what makes the scenarios of recorded ones
     _originals: dict[str, Original] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        self._scenarios = Scenarios(self.store)
+        self._scenarios = Scenarios(self.store, self.edits)
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """One result per task."""
@@ -162,8 +166,9 @@ class TaskRunner:
         keep = self.config.save_rollouts
         stored = b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
-            reactive = self.config.traffic != "nonreactive"
-            stored = encode_rows(rollout_rows(log, with_tracks=reactive))
+            # walkers of an edit wait for the ego
+            own_tracks = self.config.traffic != "nonreactive" or self.edits is not None
+            stored = encode_rows(rollout_rows(log, with_tracks=own_tracks))
         return TaskResult(
             task,
             OK,
@@ -241,6 +246,8 @@ def score_rollout(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
+    if scenario.script is not None and scenario.script.profile == "interplan":
+        result = add_interplan(result, log, scenario.map, scenario.script)
     profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {
         "scenario_type": scenario.scenario_type,

@@ -29,8 +29,9 @@ from shiftsim.sim.planner import (
     scene_info,
 )
 from shiftsim.sim.traffic import Traffic, make_traffic
+from shiftsim.sim.traffic.scripted import Scripted
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import NUM_STATE, Command, Trajectory
+from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
 PLAN_SAMPLES = 11  # first second of a plan, every 0.1 s
 MIN_ITERATIONS = 3
@@ -103,6 +104,8 @@ class Rollout:
         self._lights = scenario.traffic_lights.rows(rows)
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
+        if scenario.script is not None and scenario.script.has_pedestrians:
+            self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
         self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
         self._noise = sample_noise(
@@ -138,6 +141,17 @@ class Rollout:
             self._move_ego(plan)
             self._traffic.step(iteration, self._ego[row], self._tracks, row + 1)
         self.iteration += 1
+        if not self.done and self._is_finished(row + 1):
+            # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
+            self.num_samples = self.iteration + 1
+
+    def _is_finished(self, row: int) -> bool:
+        """Whether the ego is where an edit ends the rollout."""
+        finish = self.scenario.script.finish if self.scenario.script is not None else None
+        if finish is None:
+            return False
+        x, y, _ = center_poses(self._ego[row : row + 1, :3])[0].tolist()
+        return finish.is_reached(self.scenario.map, x, y)
 
     def _move_ego(self, plan: Trajectory | Command | None) -> None:
         """Write the next state of the ego, and note the command."""
@@ -199,11 +213,11 @@ class Rollout:
             expert_time_us=self._times,
             expert_ego=self.scenario.expert,
             route=self.scenario.route,
-            commands=self._commands,
-            noise=self._noise,
-            plans=self._plans,
-            planning_seconds=self._seconds,
-            degraded=self._degraded,
+            commands=self._commands[: self.num_samples],
+            noise=self._noise[: self.num_samples],
+            plans=self._plans[: self.num_samples],
+            planning_seconds=self._seconds[: self.num_samples],
+            degraded=self._degraded[: self.num_samples],
         )
 
 

@@ -25,6 +25,7 @@ KINDS = {  # module of `verify_<kind>`, patterns that must all match something (
     "dsc3d_sample": ("dsc3d", "expected_rows.parquet", "data"),
     "dsc3d_synthetic": ("dsc3d", "**/expected_ego_20hz.parquet"),
     "opendrive": ("opendrive", "*.refline.parquet"),
+    "scenario_edits": ("scenario_edits", "tokens.json", "build.json", "traffic.json"),
     "experiment": ("nuplan.experiment", "**/aggregator_metric|**/simulation_log"),
 }
 

@@ -214,7 +214,9 @@ function draw() {
 function drawPanel(panel, members, leading, at) {
   panel.drawMap(context);
   drawLights(context, scene, panel, at);
-  drawAgents(context, tracksOf(leading).fields, panel, at, highlighted);
+  const { fields, names } = tracksOf(leading);
+  const edited = new Set(meta.edited.map((name) => names.indexOf(name)));
+  drawAgents(context, fields, panel, at, highlighted, edited);
   if (state.expert) {
     drawPath(context, scene.get("expert.xy").data, at, panel, EXPERT, [2, 3], 1.5);
     drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, EXPERT, false);
@@ -412,6 +414,7 @@ function listLegend() {
   const fields = meta.ownTracks ? rollouts[state.focus] : scene;
   for (const kind of fields.get("tracks.kind").data) used.add(kind);
   const entries = [...used].sort().map((kind) => [AGENT_COLOURS[kind], KIND_NAMES[kind]]);
+  if (meta.edited.length) entries.push([EDITED, "edited"]);
   entries.push(["#cfe0d2", "route"], [MAP_COLOURS.crosswalk, "crosswalk"]);
   for (const [colour, text] of entries) {
     const item = document.createElement("span");
@@ -639,6 +642,12 @@ async function loadState() {
 async function start() {
   byId("token").textContent = meta.token;
   byId("about").textContent = [meta.type, meta.city, meta.log].filter(Boolean).join(" · ");
+  for (const line of meta.edits) {
+    const item = document.createElement("li");
+    item.textContent = line;
+    byId("edits").append(item);
+  }
+  byId("edits").hidden = !meta.edits.length;
   if (meta.back) {
     byId("back").hidden = false;
     byId("back").href = meta.back;

@@ -113,12 +113,15 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
 def describe_scene(replay: Replay) -> dict[str, Any]:
     """Everything that is text or a single number, as JSON values."""
     scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
+    script = scenario.script
     styles = planner_styles(item.planner for item in shown)
     return {
         "token": scenario.token,
         "type": scenario.scenario_type,
         "city": scenario.city,
         "log": scenario.log_name,
+        "edits": list(script.words) if script else [],
+        "edited": list(script.tokens) if script else [],
         "metrics": {SHORT_NAMES[name]: words for name, words in REASONS.items()},
         "vehicle": [PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center],
         "ownTracks": own,

@@ -78,10 +78,10 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
     """
     row = _sample_at(shown[0].log.time_us, at)
     extent = _extent_of(scenario, shown)
-    figure, axes = _panels(1, 1, extent)
+    figure, axes = panels(1, 1, extent)
     _draw_map(axes[0][0], scenario.map, scenario.route, extent)
     _moment(axes[0][0], shown, row, planner_styles(item.planner for item in shown))
-    _legend(axes[0][0])
+    add_legend(axes[0][0])
     _scale_bar(axes[0][0], extent)
     _heading(axes[0][0], scenario, at)
     return figure
@@ -96,16 +96,16 @@ def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> 
     """
     rows = [_sample_at(shown[0].log.time_us, time) for time in at]
     extent = _extent_of(scenario, shown)
-    figure, panels = _panels(len(shown), len(at), extent)
+    figure, lines = panels(len(shown), len(at), extent)
     styles = planner_styles(item.planner for item in shown)
-    for item, line in zip(shown, panels, strict=True):
+    for item, line in zip(shown, lines, strict=True):
         for time, row, axes in zip(at, rows, line, strict=True):
             _draw_map(axes, scenario.map, scenario.route, extent)
             _moment(axes, [item], row, styles)
             if item is shown[0]:
                 axes.set_title(f"{time:g} s", fontsize=9)
         line[0].set_ylabel(_caption(item).replace(", ", "\n", 1), fontsize=8)
-    _scale_bar(panels[-1][0], extent)
+    _scale_bar(lines[-1][0], extent)
     figure.suptitle(_words(scenario), fontsize=9)
     return figure
 
@@ -118,20 +118,26 @@ def overview(thing: Scenario | VectorMap) -> Any:
     """
     if isinstance(thing, VectorMap):
         bounds = thing.edges.polygons.bounds
-        extent = _extent(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
-        figure, ((axes,),) = _panels(1, 1, extent)
+        extent = extent_of_points(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
+        figure, ((axes,),) = panels(1, 1, extent)
         _draw_map(axes, thing, (), extent)
         _scale_bar(axes, extent)
         return figure
-    log, extent = as_recorded(thing), _extent(thing.expert[:, :2])
-    figure, ((axes,),) = _panels(1, 1, extent)
-    _draw_map(axes, thing.map, thing.route, extent)
-    _recorded(axes, log, 0)
-    _draw_ego(axes, log, 0, _LOG)
-    _legend(axes)
-    _scale_bar(axes, extent)
+    extent = extent_of_points(thing.expert[:, :2])
+    figure, ((axes,),) = panels(1, 1, extent)
+    draw_start(axes, thing, extent)
     _heading(axes, thing, 0.0)
     return figure
+
+
+def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
+    """A scenario at its first iteration, within an extent (4,) [m]."""
+    log = as_recorded(scenario)
+    _draw_map(axes, scenario.map, scenario.route, extent)
+    _recorded(axes, log, 0)
+    _draw_ego(axes, log, 0, _LOG)
+    add_legend(axes)
+    _scale_bar(axes, extent)
 
 
 def svg_of(figure: Any) -> str:
@@ -150,10 +156,10 @@ def _sample_at(time_us: IntArray, at: float) -> int:
 
 def _extent_of(scenario: Scenario, shown: Sequence[Shown]) -> FloatArray:
     paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
-    return _extent(np.concatenate(paths))
+    return extent_of_points(np.concatenate(paths))
 
 
-def _extent(points: FloatArray) -> FloatArray:
+def extent_of_points(points: FloatArray) -> FloatArray:
     """(4,) min x, min y, max x, max y of a picture that shows points (N, 2) [m]."""
     low, high = points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
     middle, half = (low + high) / 2.0, (high - low) / 2.0
@@ -161,19 +167,19 @@ def _extent(points: FloatArray) -> FloatArray:
     return np.array([*(middle - half), *(middle + half)])
 
 
-def _panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
+def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
     """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
     width, height = extent[2] - extent[0], extent[3] - extent[1]
     size = min(_LARGEST / max(width, height), _LARGEST * 2.0 / (columns * width))
     figure = new_figure(figsize=(columns * width * size + 0.1, rows * height * size + 0.4))
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.flat:
+    axes_of = figure.subplots(rows, columns, squeeze=False)
+    for axes in axes_of.flat:
         axes.set_xlim(extent[0], extent[2])
         axes.set_ylim(extent[1], extent[3])
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-    return figure, panels
+    return figure, axes_of
 
 
 def _draw_map(axes: Any, road: VectorMap, route: Sequence[str], extent: FloatArray) -> None:
@@ -257,7 +263,8 @@ def _draw_violation(axes: Any, item: Shown, colour: str) -> list[Any]:
     return [axes.scatter([x], [y], **cross), words]
 
 
-def _legend(axes: Any) -> None:
+def add_legend(axes: Any) -> None:
+    """What the lines of a picture are."""
     axes.legend(fontsize=8, loc="best", framealpha=0.85, edgecolor="none").set_zorder(11)
 
 
@@ -295,7 +302,7 @@ def _draw_boxes(
 def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
     """All samples, one after the other."""
     extent = _extent_of(scenario, shown)
-    figure, ((axes,),) = _panels(1, 1, extent)
+    figure, ((axes,),) = panels(1, 1, extent)
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     writer: Any = PillowWriter(fps=_FPS)
@@ -311,7 +318,7 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
         for row, time in enumerate(times):
             drawn = _moment(axes, shown, row, styles)
             if row == 0:
-                _legend(axes)  # of lines that look the same in all samples
+                add_legend(axes)  # of lines that look the same in all samples
             _heading(axes, scenario, float(time))
             writer.grab_frame()
             for artist in drawn:

@@ -13,6 +13,7 @@ const MAP_COLOURS = {
   centre: "#c3c3bd",
 };
 const AGENT_COLOURS = ["#8797a8", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
+const EDITED = "#7b2fbf"; // what an edit made or moved
 const AGENT_EDGE = "#3d4650";
 const KIND_NAMES = ["vehicle", "pedestrian", "bicycle", "cone", "barrier", "sign", "object"];
 const LIGHT_COLOURS = [null, "#1f9d4d", "#d9a400", "#d02a1e", null]; // absent, green, yellow, red, unknown
@@ -151,12 +152,13 @@ function poseAt(fields, name, count, index, at) {
   ];
 }
 
-function drawAgents(context, fields, panel, at, highlighted) {
+function drawAgents(context, fields, panel, at, highlighted, edited) {
   const kinds = fields.get("tracks.kind").data;
   const size = fields.get("tracks.size").data;
   const valid = fields.get("tracks.valid").data;
   const count = kinds.length;
   const marked = [];
+  const made = [];
   for (let kind = 0; kind < AGENT_COLOURS.length; kind++) {
     context.beginPath();
     for (let i = 0; i < count; i++) {
@@ -169,6 +171,7 @@ function drawAgents(context, fields, panel, at, highlighted) {
       if (py < panel.top - reach || py > panel.top + panel.height + reach) continue;
       const half = size[2 * i] / 2;
       addBox(context, x, y, heading, half, half, size[2 * i + 1] / 2, panel);
+      if (edited.has(i)) made.push([x, y, heading, half, size[2 * i + 1] / 2]);
       if (i === highlighted) marked.push([x, y, heading, half, size[2 * i + 1] / 2]);
     }
     context.fillStyle = AGENT_COLOURS[kind];
@@ -177,11 +180,17 @@ function drawAgents(context, fields, panel, at, highlighted) {
     context.strokeStyle = AGENT_EDGE;
     context.stroke();
   }
-  for (const [x, y, heading, half, halfWidth] of marked) {
+  outline(context, made, panel, 1.5, EDITED);
+  outline(context, marked, panel, 3, "#d02a1e");
+}
+
+// boxes drawn around agents
+function outline(context, boxes, panel, width, colour) {
+  for (const [x, y, heading, half, halfWidth] of boxes) {
     context.beginPath();
     addBox(context, x, y, heading, half + 0.4, half + 0.4, halfWidth + 0.4, panel);
-    context.lineWidth = 3;
-    context.strokeStyle = "#d02a1e";
+    context.lineWidth = width;
+    context.strokeStyle = colour;
     context.stroke();
   }
 }

@@ -11,6 +11,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, sealed
 from shiftsim.world.map import VectorMap
+from shiftsim.world.script import Script
 from shiftsim.world.state import Tracks, TrafficLights
 
 FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks
@@ -47,6 +48,7 @@ class Scenario:
         mission_goal: (3,) goal x [m], y [m], heading [rad], or None.
         mapping: Duration [s], offset [s] and subsample ratio the scenario was cut with.
         is_short: Whether the log ended before the duration did.
+        script: What an edit asks of a rollout; None of a scenario as it was recorded.
 
     Example:
         ```python
@@ -70,6 +72,7 @@ class Scenario:
     mission_goal: FloatArray | None
     mapping: tuple[float, float, float]
     is_short: bool = False
+    script: Script | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_us", "ego", "iteration_rows", "mission_goal"):
@@ -104,3 +107,25 @@ class Scenario:
     def expert(self) -> FloatArray:
         """(T, 11) recorded ego states at the iterations."""
         return self.ego[self.iteration_rows]
+
+    def edited(self, name: str = "edited", **tables: object) -> "Scenario":
+        """This scenario with something changed, as one `[[edit]]` of `edits.toml` would.
+
+        Args:
+            name: Ends the token of the new scenario.
+            tables: What to change, as in the file: `spawn`, `remove`, `walk`, … (docs/edits.md).
+
+        Raises:
+            ConfigError: A table is wrong, or cannot be applied.
+
+        Example:
+            ```python
+            scenario = shiftsim.open_store("demo")["03b23c"]
+            place = {"ahead_m": 30.0, "left_m": -3.0}
+            parked = scenario.edited(spawn={"at": place, "behavior": "stopped"})
+            print(parked.token, parked.script.words)
+            ```
+        """
+        from shiftsim.world.edits.apply import edit_scenario
+
+        return edit_scenario(self, name, **tables)

@@ -4,10 +4,7 @@ Vehicles of the first frame are put on the baseline of the lane or connector the
 which there is none, or no space, are not simulated.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import TrafficError
@@ -20,53 +17,10 @@ from shiftsim.sim.traffic.idm.paths import (
     pose_on_path,
 )
 from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet
+from shiftsim.world.lanes import Start, find_start
 from shiftsim.world.map import VectorMap
 
-_HEADING_SPACING = 0.5  # m ahead, between the two points that give a heading, nuPlan
 _MIN_VERTICES = 3  # of a baseline: a path of fewer than two cannot be driven, and one is lost
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where an agent is put on the lane graph."""
-
-    edge: int  # lane or connector
-    progress: float  # arc length on its baseline [m]
-    pose: FloatArray  # (3,) nearest pose on the baseline: x [m], y [m], heading [rad]
-
-
-def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
-    """The edge a vehicle follows from its pose (3,), or None where it is off the map.
-
-    A lane is preferred to a connector, and among several the one whose heading differs least.
-    """
-    x, y = float(pose[0]), float(pose[1])
-    edges = map.lanes_at(x, y)
-    if not edges and len(map.intersections.containing(x, y)):
-        edges = map.connectors_at(x, y)
-    if not edges:
-        return None
-    starts = [_project(map, edge, x, y) for edge in edges]
-    # nuPlan rule 120: the difference of headings is not wrapped
-    return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
-
-
-def _project(map: VectorMap, edge: int, x: float, y: float) -> Start:
-    line = shapely.LineString(map.baselines.at(edge))
-    progress = float(shapely.line_locate_point(line, shapely.Point(x, y)))
-    here = _point(line, progress)
-    ahead = _point(line, progress + _HEADING_SPACING)
-    if here == ahead:  # at the very end of the line
-        here_to_ahead = (_point(line, progress - _HEADING_SPACING), here)
-    else:
-        here_to_ahead = (here, ahead)
-    (ax, ay), (bx, by) = here_to_ahead
-    return Start(edge, progress, np.array([*here, np.arctan2(by - ay, bx - ax)]))
-
-
-def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
-    point = shapely.line_interpolate_point(line, progress)
-    return float(point.x), float(point.y)
 
 
 def place_agents(

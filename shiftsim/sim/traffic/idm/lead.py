@@ -7,6 +7,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
+from shiftsim.sim.traffic.idm.courtesy import ignores_ego_ahead
 from shiftsim.sim.traffic.idm.paths import remaining_path
 from shiftsim.sim.traffic.idm.scene import PROGRESS, RED, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
@@ -48,6 +49,9 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         footprints, agent, corridor, scratch
     ):
         return OFF_PATH, 0.0  # nuPlan rule 128
+    hidden, ahead = FREE, len(scene.agents) + 1
+    if footprints.present[ahead] and _in_corridor(footprints, ahead, corridor, scratch):
+        hidden = ahead if ignores_ego_ahead(scene, agent) else FREE
     found = _list_near(footprints, agent, corridor, scratch)
     best, lead = np.inf, FREE
     for _ in range(found):
@@ -60,7 +64,7 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
             break
         scratch.apart[nearest] = np.inf
         other = scratch.near[nearest]
-        if best == 0.0 and other > lead:
+        if other == hidden or (best == 0.0 and other > lead):
             continue
         gap = _gap(footprints, agent, other, best * (1.0 + _TIE) + _TINY)
         closer = gap < best or (gap == best and other < lead)

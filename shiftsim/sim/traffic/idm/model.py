@@ -13,6 +13,7 @@ from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
+from shiftsim.sim.traffic.idm.courtesy import make_courtesy, no_courtesy
 from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import (
     GREEN,
@@ -34,7 +35,10 @@ from shiftsim.sim.traffic.idm.step import (
     advance,
     write_agents,
 )
+from shiftsim.world.lanes import find_start
+from shiftsim.world.map import NONE
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.script import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, LightStatus, Tracks, center_poses
 
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
@@ -60,9 +64,19 @@ class IdmTraffic:
         foreign = np.zeros(len(kinds), np.bool_)
         if own is not None:
             foreign = ~np.isin(np.arange(len(kinds)), own)
+        script = scenario.script
+        keeps_oddities = script is not None and script.profile == "interplan"
+        if script is not None:  # what an edit has stopped stands, and is in the way
+            foreign |= script.stopped
         is_replayed = np.isin(kinds, REPLAYED_KINDS) | foreign
-        vehicles = np.flatnonzero(tracks.valid[row] & (kinds == AgentKind.VEHICLE) & ~foreign)
-        standing = np.flatnonzero(tracks.valid[row] & is_replayed)
+        is_agent = tracks.valid[row] & (kinds == AgentKind.VEHICLE) & ~foreign
+        is_standing = tracks.valid[row] & is_replayed
+        if script is not None and keeps_oddities:
+            # nuPlan rules 701, 702: logged vehicles are not simulated, and movers may overlap
+            # stopped vehicles and pedestrians at the start
+            is_agent &= script.behaviors != LOGGED
+            is_standing &= ~script.stopped & (kinds != AgentKind.PEDESTRIAN)
+        vehicles, standing = np.flatnonzero(is_agent), np.flatnonzero(is_standing)
         poses, sizes = tracks.poses[row], tracks.sizes[row]
         taken = np.concatenate(
             [
@@ -80,7 +94,15 @@ class IdmTraffic:
         fleet = make_fleet(scenario.map, placed, sizes[agents], speed, target)
         replayed = np.flatnonzero(is_replayed)
         graph = lane_graph(scenario.map)
-        self._scene = make_scene(self._parameters, graph, fleet, agents, replayed)
+        courtesy = no_courtesy(scenario.map, len(agents))
+        if script is not None:
+            cautious = script.behaviors[agents] == CAUTIOUS
+            steps = scenario.num_iterations
+            courtesy = make_courtesy(scenario.map, script.manner, cautious, script.seed, steps)
+        self._scene = make_scene(self._parameters, graph, fleet, agents, replayed, courtesy)
+        self._map, self._stopped = scenario.map, np.zeros(0, np.int64)
+        if script is not None and keeps_oddities:
+            self._stopped = np.flatnonzero(script.stopped)
         # nuPlan rule 129: the first gaps are measured between boxes on the lanes, not footprints
         for agent, start in enumerate(placed):
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
@@ -101,6 +123,11 @@ class IdmTraffic:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
         # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
         scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
+        if scene.courtesy.manner != OFF:
+            start = find_start(self._map, center_poses(ego[None, :3])[0])
+            scene.courtesy.ego_block[0] = NONE if start is None else self._map.block_of[start.edge]
+        if len(self._stopped):
+            self._drop_far(ego, tracks, row)
         end, what, first = -1, 0, BEGIN
         while end != DONE:
             end, what = advance(scene, ego, row_of(tracks, row), self._spans[iteration], first)
@@ -115,6 +142,17 @@ class IdmTraffic:
             elif end != DONE:
                 scene, first = with_longer_curves(scene), what
         self._scene = scene
+
+    def _drop_far(self, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Remove stopped vehicles that are far from the ego, for good: nuPlan rule 712."""
+        x, y, _ = center_poses(ego[None, :3])[0]
+        poses = tracks.poses[row, self._stopped]
+        far = np.hypot(poses[:, 0] - x, poses[:, 1] - y) > self._parameters.radius
+        if far.any():
+            gone = np.zeros(tracks.num_tracks, np.bool_)
+            gone[self._stopped[far]] = True
+            _remove(tracks, row, gone)
+            self._stopped = self._stopped[~far]
 
     @property
     def routes(self) -> dict[int, list[int]]:

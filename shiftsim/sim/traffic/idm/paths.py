@@ -10,7 +10,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners, wrap_angle
-from shiftsim.geometry.polylines import interpolate, point_on_polyline, vertex_heading
+from shiftsim.geometry.polylines import interpolate, vertex_heading
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
     GREEN,
@@ -25,11 +25,10 @@ from shiftsim.sim.traffic.idm.scene import (
     Scene,
 )
 from shiftsim.sim.traffic.idm.shapes import bound_ring
+from shiftsim.world.lanes import initial_curvature
 from shiftsim.world.layers import Polylines
 
 _SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
-_CURVATURE_SPACING = 2.0  # m between the three points of the estimate, nuPlan
-_STRAIGHT = 1e-6  # m^4, 16 times the squared area below which three points count as aligned
 
 
 @lean_kernel
@@ -98,26 +97,6 @@ def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, f
     x = interpolate(before[0], after[0], span, along)
     y = interpolate(before[1], after[1], span, along)
     return x, y, wrap_angle(interpolate(before[HEADING], after[HEADING], span, along))
-
-
-@lean_kernel
-def initial_curvature(baselines: Polylines, edge: int) -> float:
-    """Absolute curvature of a baseline at its start, of the circle through three points [1/m]."""
-    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
-    length = baselines.arc[stop - 1]
-    second, third = _CURVATURE_SPACING, 2.0 * _CURVATURE_SPACING
-    if length < 2.0 * _CURVATURE_SPACING:
-        second, third = length / 2.0, length
-    ax, ay = point_on_polyline(baselines.xy, baselines.arc, start, stop, 0.0)
-    bx, by = point_on_polyline(baselines.xy, baselines.arc, start, stop, second)
-    cx, cy = point_on_polyline(baselines.xy, baselines.arc, start, stop, third)
-    a = np.hypot(ax - bx, ay - by)
-    b = np.hypot(bx - cx, by - cy)
-    c = np.hypot(cx - ax, cy - ay)
-    square = (a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))
-    if square < _STRAIGHT:
-        return 0.0
-    return np.sqrt(square) / (a * b * c)
 
 
 @lean_kernel

@@ -69,16 +69,17 @@ class Fleet(NamedTuple):
 
 
 class Footprints(NamedTuple):
-    """What can be in an agent's way: A agents, then the ego, then replayed tracks; M in all.
+    """What can be in an agent's way: A agents, the ego, the ego ahead, replayed tracks; M in all.
 
-    The footprint of an agent is its box and the buffer of the piece of its path just ahead.
+    The footprint of an agent is its box and the buffer of the piece of its path just ahead. The ego
+    ahead is where it will be soon (`courtesy`), and seldom present.
     """
 
     present: BoolArray  # (M,) whether it is there
     bounds: FloatArray  # (M, 4) min x, min y, max x, max y [m]
     box: FloatArray  # (M, 4, 2) corners [m]
-    curve: FloatArray  # (A, V, 2) buffers of the path pieces just ahead of the agents [m]
-    curve_size: IntArray  # (A,) how many vertices of them count; 0 before the first step
+    curve: FloatArray  # (A + 2, V, 2) buffers of the path pieces just ahead of agents and ego [m]
+    curve_size: IntArray  # (A + 2,) how many vertices of them count; 0 before the first step
 
 
 class Scratch(NamedTuple):
@@ -92,6 +93,20 @@ class Scratch(NamedTuple):
     apart: FloatArray  # (M,) lower bounds of the gaps to them [m]
 
 
+class Courtesy(NamedTuple):
+    """What agents make of where the ego will be; A agents."""
+
+    manner: int  # as in `world.script`; OFF for nuPlan's agents, which do not look ahead
+    cautious: BoolArray  # (A,) to whom the ego always stands
+    edges: Polygons  # areas of the lanes and connectors
+    block_of: IntArray  # (E,) block of an edge
+    draws: IntArray  # (D,) 0 or 1, for agents of mixed manners
+    drawn: IntArray  # (1,) how many were used
+    ego_block: IntArray  # (1,) block of the ego's lane
+    line: FloatArray  # (5, 2) scratch for the ego's path [m]
+    keep: BoolArray  # (5,) flags of its vertices
+
+
 class Scene(NamedTuple):
     """The reactive traffic of one rollout."""
 
@@ -101,6 +116,7 @@ class Scene(NamedTuple):
     agents: IntArray  # (A,) their tracks
     replayed: IntArray  # (R,) tracks that are replayed from the log
     footprints: Footprints  # of agents, ego and replayed tracks
+    courtesy: Courtesy  # how agents treat the ego
     scratch: Scratch  # intermediate results
 
 
@@ -133,20 +149,25 @@ def lane_graph(map: VectorMap) -> LaneGraph:
 
 
 def make_scene(
-    parameters: IdmParameters, graph: LaneGraph, fleet: Fleet, agents: IntArray, replayed: IntArray
+    parameters: IdmParameters,
+    graph: LaneGraph,
+    fleet: Fleet,
+    agents: IntArray,
+    replayed: IntArray,
+    courtesy: Courtesy,
 ) -> Scene:
     """The scene at iteration 0, with nothing in anyone's way yet (attributes as of `Scene`)."""
     num_agents = len(agents)
-    count = num_agents + 1 + len(replayed)
+    count = num_agents + 2 + len(replayed)
     footprints = Footprints(
         present=np.zeros(count, np.bool_),
         bounds=np.zeros((count, 4)),
         box=np.zeros((count, 4, 2)),
-        curve=np.zeros((num_agents, _CURVE_CAPACITY, 2)),
-        curve_size=np.zeros(num_agents, np.int64),
+        curve=np.zeros((num_agents + 2, _CURVE_CAPACITY, 2)),
+        curve_size=np.zeros(num_agents + 2, np.int64),
     )
     scratch = _make_scratch(fleet.path.shape[1], count)
-    return Scene(parameters, graph, fleet, agents, replayed, footprints, scratch)
+    return Scene(parameters, graph, fleet, agents, replayed, footprints, courtesy, scratch)
 
 
 def _make_scratch(longest_path: int, count: int) -> Scratch:

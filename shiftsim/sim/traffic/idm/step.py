@@ -5,11 +5,12 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
+from shiftsim.sim.traffic.idm.courtesy import place_ego_ahead
 from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
 from shiftsim.sim.traffic.idm.paths import extend_route, move_agent, set_box
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
 from shiftsim.world.state import HEADING as EGO_HEADING
-from shiftsim.world.state import PACIFICA, VX, VY
+from shiftsim.world.state import PACIFICA, VX, VY, YAW_RATE
 
 DONE, LONGER_PATHS, LONGER_CURVES, LEFT_PATH = 0, 1, 2, 3  # how a step ends
 BEGIN = -1  # instead of the agent that an interrupted step goes on with
@@ -33,6 +34,8 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
     x = ego[0] + _EGO_CENTER * np.cos(heading)
     y = ego[1] + _EGO_CENTER * np.sin(heading)
     set_box(scene.footprints, len(agents), x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
+    lateral = ego[VY] + _EGO_CENTER * ego[YAW_RATE]
+    place_ego_ahead(scene, x, y, heading, ego[VX], lateral)
     _place_replayed(scene, row)
     if first == BEGIN:
         _remove_far_agents(scene, x, y)
@@ -60,7 +63,7 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
 def _place_replayed(scene: Scene, row: Row) -> None:
     """Put the replayed tracks that are present where they are."""
     footprints = scene.footprints
-    place = len(scene.agents)
+    place = len(scene.agents) + 1
     for track in scene.replayed:
         place += 1
         footprints.present[place] = row.valid[track]
@@ -92,7 +95,7 @@ def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, spa
         gap = path_end - fleet.progress[agent] - 0.5 * fleet.size[agent, 0]
     elif lead < len(scene.agents):
         lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
-    elif lead == len(scene.agents):
+    elif lead <= len(scene.agents) + 1 and not scene.courtesy.cautious[agent]:
         lead_speed, lead_heading = np.hypot(ego[VX], ego[VY]), ego[EGO_HEADING]
     # nuPlan rule 125: replayed tracks stand still, whatever their velocity
     limit = scene.graph.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]

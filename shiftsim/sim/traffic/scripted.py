@@ -1,0 +1,106 @@
+"""Walkers that an edit adds, beside any traffic: they wait for the ego, cross once, and stand."""
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.errors import TrafficError
+from shiftsim.sim.traffic import Traffic
+from shiftsim.world.lanes import find_start
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.script import Walker
+from shiftsim.world.state import Tracks, center_poses
+
+PEDESTRIAN_SIZE = (0.9000033778444835, 0.7913900336773054)  # length, width of interPlan's [m]
+_SETS_OFF = 50.0  # m, how near along its lane the ego must be
+_AT_END = 0.1  # m, a projection on the end of the lane
+_WALK = 150  # iterations that a walk takes, and as many more as it starts late
+
+
+def share_walked(iteration: int, active: int, num_iterations: int) -> float:
+    """How much of its way a pedestrian of interPlan has gone that set off at an iteration."""
+    return min(max(0, iteration - active) / min(active + _WALK, num_iterations), 1.0)
+
+
+class Scripted:
+    """Traffic of any model, and the walkers of an edited scenario."""
+
+    def __init__(self, traffic: Traffic) -> None:
+        self._traffic = traffic
+        self._walkers: tuple[Walker, ...] = ()
+        self._begun: list[float] = []
+        self._seconds = np.zeros(0)
+
+    def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
+        """Prepare traffic and walkers."""
+        self._walkers = scenario.script.walkers if scenario.script else ()
+        self._crossings = scenario.script.crossings if scenario.script else ()
+        self._map = scenario.map
+        self._active = [crossing.iteration for crossing in self._crossings]
+        self._begun = [np.inf] * len(self._walkers)
+        times = scenario.iteration_times
+        self._seconds = (times - times[0]) * 1e-6
+        self._traffic.start(scenario, tracks, row)
+        now = int(scenario.iteration_rows[0])
+        if self._crossings:
+            self._cross(0, scenario.ego[now], tracks, row)
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move the walkers, which the other traffic then sees, and that traffic."""
+        now, after = self._seconds[iteration], self._seconds[iteration + 1]
+        x, y, _ = center_poses(ego[None, :3])[0]
+        for number, walker in enumerate(self._walkers):
+            near = np.hypot(walker.start[0] - x, walker.start[1] - y) <= walker.ego_within
+            if near and self._begun[number] == np.inf:
+                self._begun[number] = now
+        self._place(after, tracks, row)
+        if self._crossings:
+            self._cross(iteration + 1, ego, tracks, row)
+        self._traffic.step(iteration, ego, tracks, row)
+        self._place(after, tracks, row)  # a model may have moved all pedestrians
+
+    def _cross(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move pedestrians of interPlan.
+
+        nuPlan rule 713: they are not there before they set off, report no velocity, walk the slower
+        the later they set off, and setting off at iteration 0 is forgotten.
+        """
+        center = center_poses(ego[None, :3])[0]
+        start = find_start(self._map, center)
+        if start is None:
+            raise TrafficError(
+                f"the ego is on no lane at iteration {iteration}, so no pedestrian can look for it",
+                hint="interPlan fails here as well",
+            )
+        lane = self._map.baselines.at(start.edge)
+        length = self._map.baselines.length(start.edge)
+        for number, crossing in enumerate(self._crossings):
+            if not self._active[number]:
+                x, y = crossing.start[:2]
+                along = self._map.progress_on(start.edge, float(x), float(y))
+                if abs(along - length) < _AT_END:
+                    along += float(np.hypot(*(crossing.start[:2] - lane[-1])))
+                if abs(along - start.progress) > _SETS_OFF:
+                    continue
+                self._active[number] = iteration
+            share = share_walked(iteration, self._active[number], len(self._seconds))
+            track = crossing.track
+            tracks.valid[row, track] = True
+            tracks.poses[row, track] = crossing.start
+            tracks.poses[row, track, :2] += share * (crossing.end - crossing.start[:2])
+            tracks.velocities[row, track] = 0.0
+            tracks.sizes[row, track] = PEDESTRIAN_SIZE
+
+    def _place(self, seconds: float, tracks: Tracks, row: int) -> None:
+        for walker, begun in zip(self._walkers, self._begun, strict=True):
+            track = walker.track
+            if begun == np.inf and not walker.visible:
+                continue
+            step = walker.end - walker.start[:2]
+            length = float(np.hypot(*step))
+            gone = 0.0 if begun == np.inf else min((seconds - begun) * walker.speed, length)
+            walks = 0.0 < gone < length
+            tracks.valid[row, track] = True
+            tracks.poses[row, track] = walker.start
+            tracks.poses[row, track, :2] += gone / length * step
+            tracks.velocities[row, track] = walker.speed * step / length if walks else 0.0
+            tracks.sizes[row, track] = walker.size

@@ -1,0 +1,90 @@
+"""Lanes as nuPlan sees them: the one a vehicle is in, poses on it, and how it begins to turn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.geometry.polylines import point_on_polyline
+from shiftsim.world.layers import Polylines
+from shiftsim.world.map import VectorMap
+
+_HEADING_SPACING = 0.5  # m ahead, between the two points that give a heading, nuPlan
+_CURVATURE_SPACING = 2.0  # m between the three points of the estimate, nuPlan
+_STRAIGHT = 1e-6  # m^4, 16 times the squared area below which three points count as aligned
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a vehicle is put on the lane graph."""
+
+    edge: int  # lane or connector
+    progress: float  # arc length on its baseline [m]
+    pose: FloatArray  # (3,) nearest pose on the baseline: x [m], y [m], heading [rad]
+
+
+def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
+    """The edge a vehicle follows from its pose (3,), or None where it is off the map.
+
+    A lane is preferred to a connector, and among several the one whose heading differs least.
+    """
+    x, y = float(pose[0]), float(pose[1])
+    edges = map.lanes_at(x, y)
+    if not edges and len(map.intersections.containing(x, y)):
+        edges = map.connectors_at(x, y)
+    if not edges:
+        return None
+    return nearest_heading(map, edges, pose)
+
+
+def nearest_heading(map: VectorMap, edges: list[int], pose: FloatArray) -> Start:
+    """The edge whose heading beside a pose (3,) is nearest to that of the pose."""
+    starts = [start_on(map, edge, float(pose[0]), float(pose[1])) for edge in edges]
+    # nuPlan rule 120: the difference of headings is not wrapped
+    return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
+
+
+def start_on(map: VectorMap, edge: int, x: float, y: float) -> Start:
+    """Where a point is put on an edge."""
+    line = shapely.LineString(map.baselines.at(edge))
+    progress, pose = pose_on_line(line, x, y)
+    return Start(edge, progress, pose)
+
+
+def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, FloatArray]:
+    """Arc length of the projection of a point on a line [m], and the pose (3,) there."""
+    progress = float(shapely.line_locate_point(line, shapely.Point(x, y)))
+    here = _point(line, progress)
+    ahead = _point(line, progress + _HEADING_SPACING)
+    if here == ahead:  # at the very end of the line
+        here_to_ahead = (_point(line, progress - _HEADING_SPACING), here)
+    else:
+        here_to_ahead = (here, ahead)
+    (ax, ay), (bx, by) = here_to_ahead
+    return progress, np.array([*here, np.arctan2(by - ay, bx - ax)])
+
+
+def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
+    point = shapely.line_interpolate_point(line, progress)
+    return float(point.x), float(point.y)
+
+
+@lean_kernel
+def initial_curvature(baselines: Polylines, edge: int) -> float:
+    """Absolute curvature of a baseline at its start, of the circle through three points [1/m]."""
+    start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
+    length = baselines.arc[stop - 1]
+    second, third = _CURVATURE_SPACING, 2.0 * _CURVATURE_SPACING
+    if length < 2.0 * _CURVATURE_SPACING:
+        second, third = length / 2.0, length
+    ax, ay = point_on_polyline(baselines.xy, baselines.arc, start, stop, 0.0)
+    bx, by = point_on_polyline(baselines.xy, baselines.arc, start, stop, second)
+    cx, cy = point_on_polyline(baselines.xy, baselines.arc, start, stop, third)
+    a = np.hypot(ax - bx, ay - by)
+    b = np.hypot(bx - cx, by - cy)
+    c = np.hypot(cx - ax, cy - ay)
+    square = (a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))
+    if square < _STRAIGHT:
+        return 0.0
+    return np.sqrt(square) / (a * b * c)
