@@ -2,8 +2,11 @@
 
 import pytest
 from made_runs import random_scores, write_run
+from pictures import cut_off, overlaps, written
 
 from shiftsim.report.groups import read_groups
+from shiftsim.report.palette import planner_styles
+from shiftsim.report.words import LONG
 
 pytest.importorskip("matplotlib")
 
@@ -74,3 +77,50 @@ def test_the_same_picture_has_the_same_bytes(groups, tmp_path):
 @pytest.mark.parametrize("ending", ["svg", "pdf"])
 def test_pictures_can_be_saved_as_vectors(groups, tmp_path, ending):
     assert drawn(groups)["metrics_made-up"].save(tmp_path, ending).stat().st_size > 1000
+
+
+def test_words_neither_cover_one_another_nor_leave_the_picture(tmp_path):
+    names = ("carl", "pdm-closed", "pluto", "diffusion-planner", "plantf", "log-future")
+    cities = ("Sindelfingen", "San Francisco", "Stuttgart", "Munich")
+    levels = ("low", "mid", "high")
+    runs = [
+        write_run(
+            tmp_path / traffic,
+            planners=names,
+            noise=("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in levels)),
+            cities=cities,
+            traffic=traffic,
+        )
+        for traffic in ("nonreactive", "reactive")
+    ]
+    for name, figure in drawn(read_groups(runs)).items():
+        assert {*names} <= {text for text, _ in written(figure.drawn)}, name
+        assert overlaps(figure.drawn) == [], name
+        assert cut_off(figure.drawn) == [], name
+
+
+def test_axes_are_labelled(groups):
+    for figure in drawn(groups).values():
+        assert all(axes.get_ylabel().endswith("score × 100") for axes in figure.drawn.axes[:1])
+    robustness = drawn(groups)["robustness_made-up"].drawn
+    assert {axes.get_xlabel() for axes in robustness.axes} == {"strength of the noise"}
+
+
+def test_metrics_stand_in_the_order_of_all_tables_with_words_first(groups):
+    axes = drawn(groups)["metrics_made-up"].drawn.axes[0]
+    headings = [label.get_text().replace("\n", " ") for label in axes.get_xticklabels()]
+    assert headings == [f"{words} ({short})" for short, words in LONG.items()]
+
+
+def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
+    colour = planner_styles(["alpha", "beta", "gamma"])["alpha"].colour
+    axes = drawn(groups)["robustness_made-up"].drawn.axes[0]
+    mine = [line for line in axes.lines if line.get_color() == colour]
+    faces = {
+        (len(line.get_xdata()), line.get_linestyle(), line.get_markerfacecolor())
+        for line in mine
+        if line.get_marker() not in ("None", "", "_", "|")
+    }
+    assert faces == {(1, "None", colour), (3, "--", "white")}
+    (thin,) = [line for line in mine if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
+    assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().mean)
