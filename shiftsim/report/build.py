@@ -156,7 +156,7 @@ section th, section td { padding: .22rem .6rem; text-align: left; white-space: n
 section th { border-bottom: 1.5px solid #444; vertical-align: bottom; }
 section tbody tr:nth-child(even) { background: #f4f5f7; }
 section .n { text-align: right; }
-section small { display: block; max-width: 6.5rem; margin-left: auto; white-space: normal;
+section th small { display: block; max-width: 6.5rem; margin-left: auto; white-space: normal;
   font-weight: normal; line-height: 1.2; }
 section pre { user-select: all; font-size: .8rem; padding: .6rem; background: #f4f5f7; }
 .wide, section pre { overflow-x: auto; }
@@ -171,7 +171,7 @@ def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[st
         words = html.escape(title)
         parts.append(f'<section><h2>{words}</h2>\n<img alt="{words}" src="{address}"></section>')
     cite = html.escape(citation(runs))
-    heading = "Cite <small>a click selects all</small>"
+    heading = "Cite (a click selects all)"
     parts.append(f"<section><h2>{heading}</h2>\n<pre>{cite}</pre></section>")
     return "\n".join([STYLE, *parts])
 

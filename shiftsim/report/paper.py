@@ -197,7 +197,7 @@ def noise_robustness(
         rows += _published_robustness(published, noises)
         notes.append(f"published: {published.source}")
     header = ("set", "traffic", "planner", *noises)
-    title = "Noise robustness: CLS x 100"
+    title = "Noise robustness: closed-loop score x 100"
     return Table("noise-robustness", title, header, tuple(rows), 3, tuple(notes))
 
 

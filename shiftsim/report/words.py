@@ -22,6 +22,7 @@ NAMES = {  # in the one order of metrics, that of `SHORT_NAMES`
 REASONS = NAMES | {  # what went wrong
     "no_ego_at_fault_collisions": "at-fault collision",
     "ego_is_making_progress": "no progress",
+    "ego_progress_along_expert_route": "little progress",
 }
 # what the headings of columns are short for, in the order of the columns
 LONG = {"CLS": "closed-loop score"} | {SHORT_NAMES[name]: words for name, words in NAMES.items()}
