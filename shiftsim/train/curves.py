@@ -40,6 +40,7 @@ def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, 
         look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
         right.plot(at, [100.0 * row[noise] for row in scores], **look)
     right.set(xlabel="samples [million]", ylim=(0, 100))
-    right.set_ylabel("closed-loop score × 100 on towns left out")
+    right.set_ylabel("closed-loop score × 100")
+    right.set_title("on towns left out", fontsize=9)
     right.legend(frameon=False, loc="lower right")
     save_picture(figure, path)

@@ -109,3 +109,26 @@ def test_the_list_begins_with_the_worst_and_leads_to_what_went_wrong(page, folde
     page.wait("document.documentElement.dataset.ready && location.hash.startsWith('#t=')")
     first = sections((folder / "view" / "index.html").read_text("utf-8"))["rows"]
     assert page.text("token").split()[0] in first
+
+
+def test_noise_is_dashed_and_hollow_in_a_replay_as_in_all_pictures(page, folder):
+    page.open(next((folder / "view" / "replay").glob("*.html")).as_uri())
+    looks = page.run(
+        """(() => {
+          const egos = new Set(), marks = new Set(), [ego, mark] = [drawEgo, drawMarker];
+          const colours = meta.rollouts.map((one) => one.colour);
+          window.drawEgo = (...a) => colours.includes(a[4]) && egos.add(Boolean(a[6].length));
+          window.drawMarker = (...a) => marks.add(a[6]);
+          draw();
+          [window.drawEgo, window.drawMarker] = [ego, mark];
+          const box = document.createElement("canvas");
+          const pen = box.getContext("2d", {willReadFrequently: true});
+          const centre = (hollow) => {
+            drawMarker(pen, "s", 20, 20, 9, "#125ced", hollow);
+            return [...pen.getImageData(20, 20, 1, 1).data];
+          };
+          return [[...egos].sort(), [...marks].sort(), centre(false), centre(true)];
+        })()"""
+    )
+    both = [False, True]
+    assert looks == [both, both, [0x12, 0x5C, 0xED, 255], [255, 255, 255, 255]]

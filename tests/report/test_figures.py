@@ -7,6 +7,7 @@ from pictures import cut_off, overlaps, written
 from shiftsim.report.groups import read_groups
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import LONG
+from shiftsim.train import curves
 
 pytest.importorskip("matplotlib")
 
@@ -124,3 +125,22 @@ def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
     assert faces == {(1, "None", colour), (3, "--", "white")}
     (thin,) = [line for line in mine if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
     assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().mean)
+
+
+def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
+    content = drawn(groups)["metrics_made-up"].save(tmp_path, "pdf").read_bytes()
+    assert b"/Type3" not in content
+    assert b"/CIDFontType2" in content
+
+
+def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(curves, "save_picture", lambda figure, path: kept.append(figure))
+    rows = [{"samples": 1e5 * i, "acceleration_error": 0.2, "steering_error": 0.1} for i in (1, 2)]
+    curves.draw_curves(tmp_path / "a.png", rows, [{"samples": 1e5, "none": 0.9, "ou-high": 0.7}])
+    (figure,) = kept
+    looks = [(line.get_color(), line.get_linestyle()) for line in figure.axes[1].lines]
+    colour = planner_styles(["carl"])["carl"].colour
+    assert looks == [(colour, "-"), (colour, "--")]
+    assert overlaps(figure) == []
+    assert cut_off(figure) == []
