@@ -14,8 +14,10 @@ from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.words import REASONS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, framed, json_text, replay_page
+from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
 from shiftsim.view.scene import Shown
+
+_WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "")
         styles=["list.css"],
         scripts=["list.js"],
         above=above,
-        data=f'<script type="application/json" id="data-rows">{json_text(list(rows))}</script>',
+        data=data_element("rows", list(rows)) + data_element("metrics", _WRONG),
     )
 
 
@@ -230,8 +232,7 @@ def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def _what(violated: Mapping[str, float | None]) -> str:
     """First violations in words, in the order of the metrics."""
-    words = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}
-    known = [(words[short], violated[short]) for short in words if short in violated]
+    known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
     return ", ".join(w if time is None else f"{w} {time:.1f} s" for w, time in known)
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from shiftsim.metrics import SHORT_NAMES
 from shiftsim.metrics.score import closed_loop_score
 from shiftsim.report.explain import explain_lines, select_tasks, why
 from shiftsim.report.words import in_words
@@ -56,3 +57,13 @@ def test_every_metric_has_a_line_with_value_threshold_and_weight(clean_run):
         assert in_words(row["metric"]) in text
     assert "threshold 0.95 s" in text
     assert text.count("weight ") == 4
+
+
+def test_metrics_stand_in_the_one_order_in_files_and_explanations(clean_run):
+    order = [name for name in SHORT_NAMES if name != "score"]
+    for task in select_tasks(clean_run, "0001cafe"):
+        assert [row["metric"] for row in task["metrics"]][: len(order)] == order
+    table = clean_run.metrics
+    first = table.slice(0, table.num_rows // clean_run.scores.num_rows)["metric"].to_pylist()
+    assert first[: len(order)] == order
+    assert [name for name in clean_run.scores.column_names if name in order] == order
