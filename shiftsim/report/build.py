@@ -16,7 +16,7 @@ from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_not
 from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
-from shiftsim.report.writers import ENDINGS, render
+from shiftsim.report.writers import ENDINGS, markdown_escape, render
 from shiftsim.runs.results import Run
 
 # the kinds of tables: names up to the first "_"
@@ -131,10 +131,9 @@ def write_report(
         elif style == "html":
             texts[name] = _page(title, report_html(runs, tables, _embedded(pictures)))
         elif style == "md":
-            images = [f"![{title}]({path.name})" for path, title in pictures.items()]
-            texts[name] = "\n\n".join(
-                [f"# {title}", subtitle, *parts, *images, f"```bibtex\n{cite}\n```"]
-            )
+            images = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
+            head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
+            texts[name] = "\n\n".join([*head, *parts, *images, f"```bibtex\n{cite}\n```"])
         elif style == "latex":
             texts[name] = "\n\n".join([f"% {title}\n% {subtitle}\n% cite: {CITED}", *parts])
         else:

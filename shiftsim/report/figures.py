@@ -25,6 +25,7 @@ _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
+_NOTE = 6.5  # points
 _NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "clean rollouts; bars: 95 % bootstrap interval over recordings"
 
@@ -219,6 +220,17 @@ def _finish(
     handles += [*map(_sample, samples.values())]
     labels += samples
     look = {"loc": "outside upper center", "frameon": False, "fontsize": 8, "handlelength": 3.2}
-    look |= {"ncols": min(4, max(1, len(labels))), "title_fontsize": 10}
-    figure.legend(handles, labels, title=f"{title}: {data.label}", **look)
-    figure.supxlabel(f"{data.rules}\n{note}", fontsize=6.5, color=_GREY)
+    look |= {"title": "\n".join(wrap(f"{title}: {data.label}", _per_line(figure, 10)))}
+    for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
+        legend = figure.legend(handles, labels, ncols=columns, title_fontsize=10, **look)
+        box = legend.get_window_extent(figure.canvas.get_renderer())
+        if box.width <= figure.bbox.width or columns == 1:
+            break
+        legend.remove()
+    lines = [*wrap(data.rules, _per_line(figure, _NOTE)), *wrap(note, _per_line(figure, _NOTE))]
+    figure.supxlabel("\n".join(lines), fontsize=_NOTE, color=_GREY)
+
+
+def _per_line(figure: Any, size: float) -> int:
+    """How many characters of a size [points] surely fit into the width of a figure."""
+    return int(figure.get_figwidth() * 72.0 / (0.62 * size))

@@ -208,8 +208,8 @@ def _add_legend(figure: Any, axes: Any) -> None:
     place = "outside right upper" if is_tall else "outside lower left"
     look: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handlelength": 3.0}
     handles, labels = axes.get_legend_handles_labels()
-    if is_tall:
-        labels = ["\n".join(wrap(label, 38, subsequent_indent="  ")) for label in labels]
+    length = 38 if is_tall else 85  # characters
+    labels = ["\n".join(wrap(label, length, subsequent_indent="  ")) for label in labels]
     legend = figure.legend(handles, labels, loc=place, **look)
     box = legend.get_window_extent(figure.canvas.get_renderer())
     own_width, own_height = box.width / figure.dpi + 0.1, box.height / figure.dpi + 0.1

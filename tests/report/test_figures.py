@@ -61,7 +61,7 @@ def test_planners_differ_without_colour(groups):
 
 def test_every_picture_says_what_its_scores_are(groups):
     for figure in drawn(groups).values():
-        text = figure.drawn._supxlabel.get_text()
+        text = " ".join(figure.drawn._supxlabel.get_text().split())
         assert "thresholds nuplan" in text
         assert "metrics v1" in text
         assert "4 scenarios" in text
@@ -80,18 +80,21 @@ def test_pictures_can_be_saved_as_vectors(groups, tmp_path, ending):
     assert drawn(groups)["metrics_made-up"].save(tmp_path, ending).stat().st_size > 1000
 
 
-def test_words_neither_cover_one_another_nor_leave_the_picture(tmp_path):
-    names = ("carl", "pdm-closed", "pluto", "diffusion-planner", "plantf", "log-future")
+PAPER = ("carl", "pdm-closed", "pluto", "diffusion-planner", "plantf", "log-future")
+OWN = tuple(f"my_package.my_module_{number}:MyFavouritePlanner" for number in range(5))
+LEVELS = ("low", "mid", "high")
+ALL = ("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in LEVELS))
+
+
+@pytest.mark.parametrize(
+    ("names", "noise", "split"),
+    [(PAPER, ALL, "deepplan"), (OWN, ("none", "ou-low"), "a-split-with-quite-a-long-name-indeed")],
+)
+def test_words_neither_cover_one_another_nor_leave_the_picture(tmp_path, names, noise, split):
     cities = ("Sindelfingen", "San Francisco", "Stuttgart", "Munich")
-    levels = ("low", "mid", "high")
+    settings = {"planners": names, "noise": noise, "cities": cities, "split": split}
     runs = [
-        write_run(
-            tmp_path / traffic,
-            planners=names,
-            noise=("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in levels)),
-            cities=cities,
-            traffic=traffic,
-        )
+        write_run(tmp_path / traffic, traffic=traffic, **settings)
         for traffic in ("nonreactive", "reactive")
     ]
     for name, figure in drawn(read_groups(runs)).items():

@@ -330,7 +330,8 @@ def test_a_report_is_a_folder_with_a_file_per_format(tmp_path):
         text = (tmp_path / "out" / f"report.{ending}").read_text("utf-8")
         assert "thresholds nuplan" in text
         assert "Noise robustness" in text
-        assert ("On &lt;a&gt;" if ending == "html" else "On <a>") in text
+        escaped = {"html": "On &lt;a&gt;", "md": r"# On \<a\>"}
+        assert escaped.get(ending, "On <a>") in text
         assert "2026-01-02 03:04 UTC" in text
         assert "shiftsim 9.8.7" in text
         assert (CITED if ending == "tex" else "@misc{shiftsim,") in text

@@ -64,6 +64,7 @@ def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
     for figure in (
         still(scenario, shown, at=1.0),
         still(scenario, shown[:1], at=0.0),
+        still(scenario, [replace(shown[1], planner="my_package.my_module:MyPlanner")], at=0.0),
         grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]),
         overview(scenario),
         overview(scenario.map),
