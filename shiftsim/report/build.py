@@ -16,7 +16,7 @@ from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_not
 from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
-from shiftsim.report.writers import ENDINGS, markdown_escape, render
+from shiftsim.report.writers import ENDINGS, latex_picture, markdown_escape, render
 from shiftsim.runs.results import Run
 
 # the kinds of tables: names up to the first "_"
@@ -116,29 +116,33 @@ def write_report(
     """Write tables and pictures to a folder, made if needed, and return the files.
 
     There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
-    files and shown in the HTML page; `cite.bib` says how to cite. Files of the same names are
-    replaced.
+    files and shown in the HTML page. LaTeX gets them as PDF files, and `cite.bib`. Files of the
+    same names are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}
     cite, subtitle = citation(runs), made_of(runs)
-    texts = {CITED: cite}
+    out, texts = [*pictures], dict[str, str]()
     for style in styles:
         parts = [render(table, style) for table in tables]
-        name = f"report.{ENDINGS[style]}"
         if style == "csv":
             texts |= {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
-        elif style == "html":
-            texts[name] = _page(title, report_html(runs, tables, _embedded(pictures)))
+            continue
+        if style == "html":
+            parts = [_page(title, report_html(runs, tables, _embedded(pictures)))]
         elif style == "md":
             images = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
-            texts[name] = "\n\n".join([*head, *parts, *images, f"```bibtex\n{cite}\n```"])
+            parts = [*head, *parts, *images, f"```bibtex\n{cite}\n```"]
         elif style == "latex":
-            texts[name] = "\n\n".join([f"% {title}\n% {subtitle}\n% cite: {CITED}", *parts])
+            files = {figure.save(folder, "pdf"): figure.title for figure in drawn}
+            out += files
+            texts[CITED] = cite
+            images = [latex_picture(path.name, t) for path, t in files.items()]
+            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *images]
         else:
-            texts[name] = "\n\n".join([f"{title}\n{subtitle}", *parts, cite])
-    out = [*pictures]
+            parts = [f"{title}\n{subtitle}", *parts, cite]
+        texts[f"report.{ENDINGS[style]}"] = "\n\n".join(parts)
     for name, text in texts.items():
         path = folder / name.replace("/", "-")
         write_text(path, f"{text}\n")

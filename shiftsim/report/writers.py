@@ -138,6 +138,19 @@ def _latex(table: Table) -> str:
     return "\n".join([*begin, r"\toprule", head, r"\midrule", *rows, *end])
 
 
+def latex_picture(name: str, title: str) -> str:
+    """A picture in LaTeX by the name of its file."""
+    lines = (
+        r"\begin{figure}  % needs \usepackage{graphicx}",
+        r"\centering",
+        f"\\includegraphics[width=\\linewidth]{{{name}}}",
+        f"\\caption{{{latex_escape(title)}}}",
+        f"\\label{{fig:{name.partition('.')[0]}}}",
+        r"\end{figure}",
+    )
+    return "\n".join(lines)
+
+
 def _html(table: Table) -> str:
     """A section; its table lies in a box that scrolls where the page is too narrow."""
 

@@ -4,6 +4,7 @@ import pytest
 from made_runs import random_scores, write_run
 from pictures import cut_off, overlaps, written
 
+from shiftsim.report.build import write_report
 from shiftsim.report.groups import read_groups
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import LONG
@@ -128,6 +129,15 @@ def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
     assert faces == {(1, "None", colour), (3, "--", "white")}
     (thin,) = [line for line in mine if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
     assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().mean)
+
+
+def test_a_report_in_latex_holds_the_pictures_as_pdf(groups, tmp_path):
+    figures = [*drawn(groups).values()]
+    write_report(tmp_path, "made up", [groups[0].run], [], figures, ["latex"])
+    text = (tmp_path / "report.tex").read_text("utf-8")
+    for figure in figures:
+        assert f"\\includegraphics[width=\\linewidth]{{{figure.name}.pdf}}" in text
+        assert (tmp_path / f"{figure.name}.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
