@@ -191,6 +191,7 @@ def diff(
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
     from shiftsim.benchmarks.bench import paired_runs
+    from shiftsim.report.words import LONG, legend
     from shiftsim.runs.diff import diff_lines, diff_runs
 
     pairs = paired_runs(first, second)
@@ -204,3 +205,6 @@ def diff(
             say(f"\n{run.path.name}")
         for line in diff_lines(pair):
             say(line)
+    changed = {short for pair in found for change in pair.changes for short in change.metrics}
+    if changed:
+        say(f" metrics: {legend(short for short in LONG if short in changed)}")

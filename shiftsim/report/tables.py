@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import TypeAlias
 
-from shiftsim.report.words import LONG
+from shiftsim.report.words import LONG, legend
 
 _GAP = 2  # blanks between columns of text
 
@@ -86,8 +86,8 @@ class Table:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the short headings mean, as "no at-fault collision (NCR), …", and the notes."""
-        known = [f"{self.words[name]} ({name})" for name in self.header if name in self.words]
-        return (f"columns: {', '.join(known)}", *self.notes) if known else self.notes
+        known = legend(self.header, self.words)
+        return (f"columns: {known}", *self.notes) if known else self.notes
 
 
 def shown(cell: Cell) -> str:

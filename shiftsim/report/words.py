@@ -1,6 +1,6 @@
 """What metrics, units and violations are called where people read them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,11 @@ UNITS = {  # nuPlan's names, shortened
 def in_words(metric: str) -> str:
     """A metric as "no at-fault collision (NCR)"; one that is not scored by its name."""
     return f"{NAMES[metric]} ({SHORT_NAMES[metric]})" if metric in NAMES else metric
+
+
+def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
+    """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
+    return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
 
 
 def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
