@@ -25,7 +25,7 @@ NEIGHBOURS = {
     "planners": ("sim.dynamics", "sim.loop", "sim.noise", "sim.plan_check", "sim.planner"),
     "metrics": ("sim.log",),
     "view": ("report.palette", "report.words"),
-    "train": ("env",),
+    "train": ("env", "report.palette"),
 }
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
 MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/")

@@ -124,7 +124,8 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     groups = read_groups(runs, (*known_sets(), *own))
     options = Options(TABLES, None, published, allow_partial)
     tables = [*extra(groups), *make_tables(groups, published_figures(), options)]
-    files = write_report(plan.folder / "report", tables, _pictures(groups, allow_partial), FORMATS)
+    drawn, title = _pictures(groups, allow_partial), f"Report on {plan.folder.resolve().name}"
+    files = write_report(plan.folder / "report", title, runs, tables, drawn, FORMATS)
     if as_json:
         say_json([summary(run) for run in runs])
         return

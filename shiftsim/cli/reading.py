@@ -1,6 +1,5 @@
 """Commands that read runs: report, explain, diff."""
 
-import html
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,6 +81,7 @@ def report(
     default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)
     tables = make_tables(groups, published_figures(), options)
+    title = f"Report on {', '.join(folder.resolve().name for folder in runs)}"
     if not table and options.tables != ("scores",):
         tables = [*extra(groups), *tables]
     drawn = []
@@ -90,11 +90,11 @@ def report(
 
         drawn = draw(groups, allow_partial=allow_partial)
     if out is not None:
-        files = write_report(out, tables, drawn, style or FORMATS)
+        files = write_report(out, title, opened, tables, drawn, style or FORMATS)
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            _write_pages(site, opened, tables, drawn, lambda i, n: advance(i, n, ""))
+            _write_pages(site, title, opened, tables, drawn, lambda i, n: advance(i, n, ""))
         say(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return
@@ -105,28 +105,26 @@ def report(
 
 def _write_pages(
     folder: Path,
+    title: str,
     runs: "Sequence[Run]",
     tables: "Sequence[Table]",
     drawn: "Sequence[Figure]",
     on_progress: Callable[[int, int], None],
 ) -> None:
     """A folder of pages: tables and pictures, and every scenario with its replay."""
-    from shiftsim.report.writers import render
+    from shiftsim.report.build import report_html
     from shiftsim.runs.scenarios import open_run_store
     from shiftsim.view.build import Choice, galleries, write_site
 
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [render(table, "html") for table in tables]
-    for figure in drawn:
-        name, title = html.escape(figure.save(folder).name), html.escape(figure.title)
-        parts.append(f'<figure><img src="{name}" alt="{title}"></figure>')
+    images = {figure.save(folder).name: figure.title for figure in drawn}
     stored = [run for run in runs if any(run.rollout_places.values())]
     write_site(
         folder,
         galleries(stored, [open_run_store(run) for run in stored], Choice()),
-        title=", ".join(run.path.name for run in runs),
+        title=title,
         limit=0,
-        above="\n".join(parts),
+        above=report_html(runs, tables, images),
         on_progress=on_progress,
     )
 
@@ -193,6 +191,7 @@ def diff(
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
     from shiftsim.benchmarks.bench import paired_runs
+    from shiftsim.report.words import LONG, legend
     from shiftsim.runs.diff import diff_lines, diff_runs
 
     pairs = paired_runs(first, second)
@@ -206,3 +205,6 @@ def diff(
             say(f"\n{run.path.name}")
         for line in diff_lines(pair):
             say(line)
+    changed = {short for pair in found for change in pair.changes for short in change.metrics}
+    if changed:
+        say(f" metrics: {legend(short for short in LONG if short in changed)}")

@@ -10,12 +10,14 @@ from pathlib import Path
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
 from shiftsim.report import data_tables, details, paper
+from shiftsim.report.about import CITED, citation, made_of, runs_table
 from shiftsim.report.figures import Figure
 from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_note
 from shiftsim.report.published import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import Table
-from shiftsim.report.writers import ENDINGS, render
+from shiftsim.report.writers import ENDINGS, latex_picture, markdown_escape, render
+from shiftsim.runs.results import Run
 
 # the kinds of tables: names up to the first "_"
 TABLES = (
@@ -28,9 +30,10 @@ TABLES = (
     "planning-time",
     "data-statistics",
     "benchmark-comparison",
+    "runs",
 )
 _ASK = "the run must say --checkpoint PLANNER=shiftsim"
-_ABOUT_DATA = ("data-statistics", "benchmark-comparison")
+_ABOUT_DATA = ("data-statistics", "benchmark-comparison", "runs")
 _LONG = ("planner-comparison-noise", *_ABOUT_DATA)
 BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
 
@@ -68,6 +71,7 @@ def make_tables(
         raise ConfigError(f"nothing to show beside published figures: {stand_ins}", hint=_ASK)
     beside = published if chosen.beside else None
     statistics = cache(lambda: data_tables.own_statistics(groups))
+    runs = list({group.run.path: group.run for group in groups}.values())
     makers: dict[str, Callable[[], Sequence[Table | None]]] = {
         "semantic-shift": lambda: paper.semantic_shift(
             groups, published, beside=chosen.beside, allow_partial=partial
@@ -82,8 +86,8 @@ def make_tables(
         "benchmark-comparison": lambda: (
             [data_tables.benchmark_comparison(published, statistics())] if published else []
         ),
+        "runs": lambda: [runs_table(runs)],
     }
-    runs = [group.run for group in groups]
     notes = [made_up_note(runs), weights_note(runs), stand_ins and f"left out: {stand_ins}; {_ASK}"]
     out: list[Table] = []
     for name in (name for name in TABLES if name in chosen.tables):
@@ -102,59 +106,95 @@ def _unused(name: str, tables: Sequence[Table]) -> str:
 
 
 def write_report(
-    folder: Path, tables: Sequence[Table], drawn: Sequence[Figure], styles: Sequence[str]
+    folder: Path,
+    title: str,
+    runs: Sequence[Run],
+    tables: Sequence[Table],
+    drawn: Sequence[Figure],
+    styles: Sequence[str],
 ) -> list[Path]:
     """Write tables and pictures to a folder, made if needed, and return the files.
 
     There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
-    files and shown in the HTML page. Files of the same names are replaced.
+    files and shown in the HTML page. LaTeX gets them as PDF files, and `cite.bib`. Files of the
+    same names are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}
-    out = [*pictures]
+    cite, subtitle = citation(runs), made_of(runs)
+    out, texts = [*pictures], dict[str, str]()
     for style in styles:
         parts = [render(table, style) for table in tables]
         if style == "csv":
-            files = {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
+            texts |= {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
+            continue
+        if style == "html":
+            parts = [_page(title, report_html(runs, tables, _embedded(pictures)))]
+        elif style == "md":
+            images = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
+            head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
+            parts = [*head, *parts, *images, f"```bibtex\n{cite}\n```"]
+        elif style == "latex":
+            files = {figure.save(folder, "pdf"): figure.title for figure in drawn}
+            out += files
+            texts[CITED] = cite
+            images = [latex_picture(path.name, t) for path, t in files.items()]
+            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *images]
         else:
-            text = "\n\n".join(parts)
-            if style == "html":
-                text = _page(text, pictures)
-            elif style == "md":
-                images = (f"![{title}]({path.name})" for path, title in pictures.items())
-                text = "\n\n".join([text, *images])
-            files = {f"report.{ENDINGS[style]}": text}
-        for name, text in files.items():
-            path = folder / name.replace("/", "-")
-            write_text(path, f"{text}\n")
-            out.append(path)
+            parts = [f"{title}\n{subtitle}", *parts, cite]
+        texts[f"report.{ENDINGS[style]}"] = "\n\n".join(parts)
+    for name, text in texts.items():
+        path = folder / name.replace("/", "-")
+        write_text(path, f"{text}\n")
+        out.append(path)
     return out
 
 
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem;
-  color: #1c1c1c; background: #fff; }
-h2 { font-size: 1.05rem; margin: 2.2rem 0 .5rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .22rem .6rem; text-align: left; white-space: nowrap; }
-th { border-bottom: 1.5px solid #444; }
-tbody tr:nth-child(even) { background: #f4f5f7; }
-.n { text-align: right; }
-p { color: #555; font-size: .8rem; margin: .25rem 0; }
-img { max-width: 100%; margin-top: 1.5rem; }
-"""
+STYLE = """<style>
+section h2 { font-size: 1.05rem; margin: 2.2rem 0 .5rem; }
+section p { color: #555; font-size: .8rem; margin: .25rem 0; overflow-wrap: anywhere; }
+section table { border-collapse: collapse; width: auto; font-size: .85rem;
+  font-variant-numeric: tabular-nums; }
+section th, section td { padding: .22rem .6rem; text-align: left; white-space: nowrap; }
+section th { border-bottom: 1.5px solid #444; vertical-align: bottom; }
+section tbody tr:nth-child(even) { background: #f4f5f7; }
+section .n { text-align: right; }
+section th small { display: block; max-width: 6.5rem; margin-left: auto; white-space: normal;
+  font-weight: normal; line-height: 1.2; }
+section pre { user-select: all; font-size: .8rem; padding: .6rem; background: #f4f5f7; }
+.wide, section pre { overflow-x: auto; }
+img { max-width: 100%; }
+</style>"""
 
 
-def _page(body: str, pictures: Mapping[Path, str]) -> str:
-    """One HTML file that holds its pictures."""
-    images = (
-        f'<img alt="{html.escape(title)}" src="data:image/png;base64,'
-        f'{base64.b64encode(path.read_bytes()).decode()}">'
-        for path, title in pictures.items()
-    )
-    head = f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>shiftsim report</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>{_STYLE}</style></head><body>"""
-    return "\n".join([head, body, *images, "</body></html>"])
+def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str]) -> str:
+    """Tables, pictures (titles by address) and citation as sections that any page can hold."""
+    parts = [f"<p>{html.escape(made_of(runs))}</p>", *(render(table, "html") for table in tables)]
+    for address, title in images.items():
+        words = html.escape(title)
+        parts.append(f'<section><h2>{words}</h2>\n<img alt="{words}" src="{address}"></section>')
+    cite = html.escape(citation(runs))
+    heading = "Cite (a click selects all)"
+    parts.append(f"<section><h2>{heading}</h2>\n<pre>{cite}</pre></section>")
+    return "\n".join([STYLE, *parts])
+
+
+def _embedded(pictures: Mapping[Path, str]) -> dict[str, str]:
+    """Titles by addresses that hold the pictures themselves."""
+    coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
+    return {f"data:image/png;base64,{coded[path]}": title for path, title in pictures.items()}
+
+
+def _page(title: str, body: str) -> str:
+    """One HTML file."""
+    words = html.escape(title)
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{words}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">
+<style>
+body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem;
+  padding: 0 1rem; color: #1c1c1c; background: #fff; }}
+</style></head><body>
+<h1>{words}</h1>
+{body}
+</body></html>"""

@@ -1,6 +1,5 @@
 """Statistics of a store as tables and as a picture."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,7 +11,7 @@ from shiftsim.data.store.statistics import (
     StoreStats,
 )
 from shiftsim.errors import ConfigError, one_of
-from shiftsim.report.palette import new_figure, save_picture
+from shiftsim.report.palette import AGENTS, new_figure, save_picture
 from shiftsim.report.tables import aligned
 from shiftsim.report.writers import csv_text
 
@@ -33,7 +32,14 @@ _HEADINGS = {
     "route_m": "route",
     "intersection": "at inters.",
 }
-_COLORS = {"vehicles": "#3b6ea5", "pedestrians": "#d1812f", "bicycles": "#4f9d69"}
+_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in AGENTS.items()}
+_OWN: dict[str, Any] = {"color": "#4a5560"}
+_PUBLISHED: dict[str, Any] = {"facecolor": "white", "edgecolor": "#4a5560", "hatch": "////"}
+_AXES = {
+    "interactions": "mean number of agents near\nthe ego's path within 3 s",
+    "mean_speed_mps": "mean speed of the ego [m/s]",
+}
+_LINE, _SETS_HEIGHT = 0.45, 1.5  # inches: a city, the published sets
 _ALIASES = {"SIFI": "Sindelfingen", "STR": "Stuttgart", "MUC": "Munich", "BER": "Berlin"}
 _ALIASES |= {"SFO": "San Francisco", "Muenchen": "Munich", "München": "Munich"}
 
@@ -85,68 +91,96 @@ def stats_dict(stats: StoreStats) -> dict[str, object]:
 
 
 def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
-    """Draw scenarios and agents per city as bars; the ending of the path decides the format.
+    """Draw the store beside the published sets, and its cities; the path's ending is the format.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
         ConfigError: The ending is none that can be drawn.
     """
-    figure = new_figure(figsize=(11.0, 4.2))
-    groups = stats.groups("city")
-    cities = [name for name in groups if name != ALL]
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.7, 1.0))
-    _draw_counts(left, cities, groups)
-    _draw_agents(middle, [*cities, ALL], groups)
-    _draw_interactions(right, [*cities, ALL], groups)
-    for axes in (left, middle, right):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(axis="x", labelrotation=0 if len(cities) < 4 else 30)
-    figure.suptitle(title)
+    figure = stats_figure(stats, title=title)
     try:
         save_picture(figure, path)
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
 
 
-def _say_values(
-    axes: Any, places: Iterable[float], values: Iterable[float], form: str = "{:.1f}", size: int = 9
-) -> None:
-    for place, value in zip(places, values, strict=True):
-        axes.annotate(form.format(value), (place, value), ha="center", va="bottom", fontsize=size)
+def stats_figure(stats: StoreStats, *, title: str) -> Any:
+    """The picture of `draw_stats` as a matplotlib figure; all bars lie, so that names have room.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    groups = stats.groups("city")
+    cities = [name for name in groups if name != ALL]
+    height = _LINE * (len(cities) + 1) + 0.5
+    figure = new_figure(figsize=(10.0, _SETS_HEIGHT + height + 1.0))
+    upper, lower = figure.subfigures(2, 1, height_ratios=(_SETS_HEIGHT, height))
+    _draw_sets(upper.subplots(), len(stats.rows))
+    panels = lower.subplots(1, 4, sharey=True, width_ratios=(1.0, 1.5, 1.0, 1.0))
+    _draw_counts(panels[0], cities, groups)
+    _draw_agents(panels[1], [*cities, ALL], groups)
+    _draw_means(panels[2], [*cities, ALL], groups, "interactions")
+    _draw_means(panels[3], [*cities, ALL], groups, "mean_speed_mps")
+    panels[0].set_yticks(range(len(cities) + 1), [*cities, ALL])
+    panels[0].invert_yaxis()
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _draw_sets(axes: Any, count: int) -> None:
+    """Scenarios of this store beside the published sets."""
+    counts = {"this store": count}
+    counts |= {f"{name} (published)": number for name, number in PUBLISHED_SETS.items()}
+    for place, value in enumerate(counts.values()):
+        _bar(axes, place, value, "{:.0f}", 0.65, _PUBLISHED if place else _OWN)
+    axes.set_yticks(range(len(counts)), list(counts))
+    axes.invert_yaxis()
+    _finish(axes, "scenarios of whole sets")
 
 
 def _draw_counts(axes: Any, cities: list[str], groups: _Means) -> None:
-    counts = [groups[name]["scenarios"] for name in cities]
-    axes.bar(cities, counts, color="#3b6ea5", label="this store", width=0.6)
-    published = [published_scenarios(name) for name in cities]
-    if any(published):
-        dashed = {"fill": False, "edgecolor": "black", "linestyle": "--", "width": 0.75}
-        axes.bar(cities, [count or 0 for count in published], label="published", **dashed)
-        axes.margins(y=0.18)
-        axes.legend(frameon=False, ncols=2, loc="upper center")
-    _say_values(axes, range(len(counts)), counts, "{:.0f}")
-    axes.set_title("Scenarios", fontsize=9)
-    sets = "\n".join(f"{name}  {count}" for name, count in PUBLISHED_SETS.items())
-    axes.set_xlabel(f"published sets:\n{sets}", fontsize=8, color="0.35")
+    for place, city in enumerate(cities):
+        published = published_scenarios(city)
+        shift = 0.0 if published is None else 0.2
+        width = 0.65 if published is None else 0.38
+        _bar(axes, place - shift, groups[city]["scenarios"], "{:.0f}", width, _OWN)
+        if published is not None:
+            _bar(axes, place + shift, published, "{:.0f}", width, _PUBLISHED)
+    known = any(published_scenarios(city) for city in cities)
+    _finish(axes, "scenarios (hatched: published)" if known else "scenarios")
 
 
 def _draw_agents(axes: Any, names: list[str], groups: _Means) -> None:
-    width = 0.27
-    for shift, (kind, color) in enumerate(_COLORS.items(), -1):
-        places = [place + shift * width for place in range(len(names))]
-        over = [groups[name].get(kind, 0.0) for name in names]
-        start = [groups[name].get(f"{kind}_t0", 0.0) for name in names]
-        axes.bar(places, over, width * 0.95, color=color, alpha=0.45)
-        axes.bar(places, start, width * 0.95, color=color, label=kind)
-        _say_values(axes, places, over, size=8)
-    axes.set_xticks(range(len(names)), names)
-    axes.set_title("Agents per scenario\n(full colour: at t0; pale: over the scenario)", fontsize=9)
-    axes.margins(y=0.18)
-    axes.legend(frameon=False, ncols=3, loc="upper center")
+    width = 0.28
+    for number, (kind, colour) in enumerate(_COLOURS.items()):
+        places = [place + (number - 1) * width for place in range(len(names))]
+        for place, name in zip(places, names, strict=True):
+            over, start = groups[name].get(kind, 0.0), groups[name].get(f"{kind}_t0", 0.0)
+            look = {"color": colour, "label": kind if place == places[0] else None}
+            _bar(axes, place, over, "{:.1f}", width, {"color": colour, "alpha": 0.45})
+            axes.barh(place, start, width * 0.9, **look)
+    axes.legend(frameon=False, fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    _finish(axes, "agents per scenario: mean at its start (full),\nin all of it (pale)")
 
 
-def _draw_interactions(axes: Any, names: list[str], groups: _Means) -> None:
-    values = [groups[name].get("interactions", 0.0) for name in names]
-    axes.bar(names, values, color="#8a5aa8", width=0.6)
-    _say_values(axes, range(len(values)), values)
-    axes.set_title("Interaction density\n(agents near the ego's path within 3 s)", fontsize=9)
+def _draw_means(axes: Any, names: list[str], groups: _Means, column: str) -> None:
+    for place, name in enumerate(names):
+        _bar(axes, place, groups[name].get(column, 0.0), "{:.1f}", 0.65, _OWN)
+    _finish(axes, _AXES[column])
+
+
+def _bar(
+    axes: Any, place: float, value: float, form: str, width: float, look: dict[str, Any]
+) -> None:
+    """A lying bar with its value at its end."""
+    axes.barh(place, value, width * 0.9, **look)
+    where: dict[str, Any] = {"xytext": (2, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(form.format(value), (value, place), fontsize=7, **where)
+
+
+def _finish(axes: Any, label: str) -> None:
+    axes.set_xlabel(label, fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.margins(x=0.18)
+    axes.set_xlim(left=0.0)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -52,7 +52,7 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
     return Table(
         "planner-comparison-noise" if noisy else "planner-comparison",
         f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
-        "difference of CLS x 100, first minus second",
+        "difference of closed-loop scores x 100, first minus second",
         (*labels, "difference", "95 % CI", "better/same/worse", "p", "p (Holm)"),
         tuple(rows),
         len(labels),
@@ -76,7 +76,7 @@ def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> l
             scores = (g.estimate("cls", where, allow_partial=allow_partial) for g in columns)
             rows.append((name or "unknown", Number(int(where.sum()), 0), *scores))
         header = ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in columns))
-        title = f"Scores by scenario type: {data.label}, clean, CLS x 100"
+        title = f"Scores by scenario type: {data.label}, clean, closed-loop score x 100"
         name = f"scenario-types_{data.name}"
         out.append(Table(name, title, header, tuple(rows), 1, (data.rules,)))
     return out

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
-from shiftsim.report.words import COLLISIONS, UNITS
+from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words
 from shiftsim.runs.edits import edit_words
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -60,10 +60,18 @@ def select_tasks(
         _add_roles(listed)
     out, edits = [], edit_words(run.manifest, full)
     for row in rows:
-        cls, known = scores.get(_key(row)), metrics.get(_key(row), [])
+        known = sorted(metrics.get(_key(row), []), key=_place)
+        cls = scores.get(_key(row))
         found = {"cls": cls, "why": why(cls, known), "edits": edits, "metrics": known}
         out.append({**row, **found})
     return out
+
+
+def _place(row: dict[str, Any]) -> tuple[int, int]:
+    """Where a metric stands in a list: by role, then in the order of all tables."""
+    name, names = row["metric"], list(SHORT_NAMES)
+    role = ("multiplier", "weighted", "").index(row["role"])
+    return role, names.index(name) if name in SHORT_NAMES else len(names)
 
 
 def _add_roles(rows: list[dict[str, Any]]) -> None:
@@ -112,8 +120,8 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     parts = [row for row in scored if row["role"] == "weighted"]
     zero = [row for row in factors if row["score"] == 0.0]
     if zero:
-        causes = (f"{row['metric']} is 0{_first_violation(row)}" for row in zero)
-        return f"score 0 because {' and '.join(causes)}"
+        causes = (f"{_cause(row['metric'])}{_first_violation(row)}" for row in zero)
+        return f"score 0 because of {' and '.join(causes)}"
     if cls == 0.0:
         return "score 0 because every weighted metric is 0"
     product = " × ".join(f"{row['score']:g}" for row in factors)
@@ -122,10 +130,16 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
 
 
+def _cause(metric: str) -> str:
+    """What went wrong, as "at-fault collision (NCR)"."""
+    reason = REASONS.get(metric, metric)
+    return f"{reason} ({SHORT_NAMES[metric]})" if metric in SHORT_NAMES else reason
+
+
 def _first_violation(row: dict[str, Any]) -> str:
     if row["first_violation_iteration"] is None:
         return ""
-    return f" ({row['first_violation_s']:.1f} s{_partner(row)})"
+    return f" at {row['first_violation_s']:.1f} s{_partner(row)}"
 
 
 def _partner(row: dict[str, Any]) -> str:
@@ -145,9 +159,7 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
         lines = [*task["edits"], task["error"], *hint, *(task["traceback"] or "").splitlines()]
         return [f"{head}  {task['status']}", *(f"  {line}" for line in lines)]
     rule = "the score is the product of the × rows and the weighted mean of the + rows"
-    rank = ("multiplier", "weighted", "").index
-    rows = sorted(task["metrics"], key=lambda row: rank(row["role"]))
-    lines = [*task["edits"], task["why"], rule, *map(_metric_line, rows)]
+    lines = [*task["edits"], task["why"], rule, *map(_metric_line, task["metrics"])]
     return [f"{head}  CLS {task['cls']:.4f}", *(f"  {line}" for line in lines)]
 
 
@@ -157,7 +169,7 @@ def _metric_line(row: dict[str, Any]) -> str:
     role = {"multiplier": "×", "weighted": "+"}.get(row["role"], " ")
     weight = "" if row["weight"] is None else f"weight {row['weight']:g}"
     score = "–" if row["score"] is None else f"{row['score']:.4f}"
-    parts = [f"{role} {SHORT_NAMES.get(name, ''):3} {name:33} {score:>6}", f"{weight:8}"]
+    parts = [f"{role} {in_words(name):29} {score:>6}", f"{weight:8}"]
     if row["value"] is not None:
         parts.append(f"value {row['value']:.4g}{unit}")
     if row["threshold"] is not None:

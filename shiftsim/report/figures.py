@@ -1,28 +1,33 @@
 """Pictures of a report: robustness curves, scores per city and per metric.
 
-Planners differ in colour and marker, so that they stay apart without colour; dashes mean noise in
-other pictures, and are not used here. Nothing is drawn of groups whose score is withheld.
+Planners and noise are drawn as everywhere (`palette`): clean scores are full marks and solid lines,
+those under noise hollow marks on dashed lines. Nothing is drawn of groups whose score is withheld.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import wrap
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from shiftsim.arrays import BoolArray
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
-from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
-from shiftsim.report.paper import METRICS, traffics
+from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
+from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate
+from shiftsim.report.words import LONG
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
-_SIZES = {"*": 1.7, "P": 1.2, "X": 1.2, "D": 0.85}  # markers of equal weight to the eye
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
-_BARS = "bars: 95 % bootstrap interval over recordings"
+_NOTE = 6.5  # points
+_NONE: Mapping[str, str] = MappingProxyType({})
+_BARS = "clean rollouts; bars: 95 % bootstrap interval over recordings"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +76,16 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
             _finish(drawn, data, "Score per city", note)
             out.append(Figure(f"cities_{data.name}", f"Score per city of {data.label}", drawn))
         if clean:
-            places = [_Place(COLUMNS[name], name) for name in ("cls", *METRICS)]
+            places = [_Place(_heading(short), name) for name, short in COLUMNS.items()]
             drawn = _dots(clean, places, styles, allow_partial)
             _finish(drawn, data, "Metrics", _BARS)
             out.append(Figure(f"metrics_{data.name}", f"Metrics on {data.label}", drawn))
     return out
+
+
+def _heading(short: str) -> str:
+    """A metric in words, with its abbreviation, on lines of their own."""
+    return "\n".join([*wrap(LONG[short], 12), f"({short})"])
 
 
 def _named_apart(sets: Sequence[DataSet]) -> list[DataSet]:
@@ -113,13 +123,14 @@ def _robustness(
                     for group in groups
                     if (group.traffic, group.planner) == (traffic, planner)
                 }
-                _curve(
-                    axes, planner, found, kind, place - len(planners) / 2, _line(styles[planner])
-                )
+                shift = 0.02 * (place - len(planners) / 2)
+                _curve(axes, planner, found, kind, shift, styles[planner])
             axes.set_xticks(range(len(LEVELS)), LEVELS)
+            axes.set_xlabel("strength of the noise", fontsize=8)
             axes.set_title(f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
             _score_axis(axes)
-    _finish(figure, data, "Noise robustness", "error bars: standard deviation over seeds")
+    note = "error bars: standard deviation over seeds; thin line: the clean score"
+    _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
     return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
 
 
@@ -128,26 +139,24 @@ def _curve(
     planner: str,
     found: dict[str, Estimate | None],
     kind: str,
-    offset: float,
-    style: dict[str, Any],
+    shift: float,
+    style: Style,
 ) -> None:
     """One planner's scores by level; shifted a little, so that error bars do not cover others."""
     names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
     points = {i: cell for i, name in enumerate(names) if (cell := found.get(name)) is not None}
     if not points:
         return
-    places = [place + 0.02 * offset for place in points]
-    means = [cell.mean for cell in points.values()]
-    errors = [cell.std or 0.0 for cell in points.values()]
+    means, errors = ([getattr(c, name) for c in points.values()] for name in ("mean", "std"))
+    bars = [error or 0.0 for error in errors]
+    look = {**style.marks("some"), "linestyle": dashes("some"), "linewidth": 1.3, "capsize": 2}
+    axes.errorbar([place + shift for place in points], means, yerr=bars, **look)
+    clean = means[0] if 0 in points else math.nan
+    if 0 in points:
+        axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
     partial = any(cell and cell.label for cell in found.values())
     label = f"{planner} (partial)" if partial else planner
-    axes.errorbar(places, means, yerr=errors, label=label, capsize=2, **style)
-
-
-def _line(style: Style) -> dict[str, Any]:
-    look = {"linewidth": 1.4, "markeredgecolor": "white", "markeredgewidth": 0.5}
-    size = 6.0 * _SIZES.get(style.marker, 1.0)
-    return {"color": style.colour, "marker": style.marker, "markersize": size, **look}
+    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
 
 
 def _dots(
@@ -159,7 +168,7 @@ def _dots(
     figure, panels = _panels(len(modes), 1, (max(5.5, 1.05 * len(places)), 2.9))
     for (axes,), traffic in zip(panels, modes, strict=True):
         for group in (group for group in groups if group.traffic == traffic):
-            style = _line(styles[group.planner]) | {"linestyle": "none"}
+            style = {**styles[group.planner].marks("none"), "linestyle": "none"}
             shift = _SPREAD * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
             label: str | None = f"{group.planner}{'' if group.is_complete else ' (partial)'}"
             for x, place in enumerate(places):
@@ -176,7 +185,8 @@ def _dots(
         axes.set_xticks(range(len(places)), [place.heading for place in places])
         axes.set_xlim(-0.5, len(places) - 0.5)
         axes.set_title(_TRAFFIC.get(traffic, traffic), fontsize=9)
-        _score_axis(axes)
+        several = len({place.column for place in places}) > 1
+        _score_axis(axes, "score" if several else "closed-loop score")
     return figure
 
 
@@ -185,18 +195,42 @@ def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, An
     return figure, figure.subplots(rows, columns, squeeze=False, sharey=True)
 
 
-def _score_axis(axes: Any) -> None:
+def _score_axis(axes: Any, scores: str = "closed-loop score") -> None:
     axes.set_ylim(-3.0, 103.0)
-    axes.set_ylabel("score x 100", fontsize=9)
+    axes.set_ylabel(f"{scores} × 100", fontsize=9)
+    axes.label_outer()
     axes.grid(axis="y", color="0.9", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
 
 
-def _finish(figure: Any, data: DataSet, title: str, note: str) -> None:
+def _sample(noise: str) -> Any:
+    """What lines of clean or disturbed rollouts look like, for a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise))
+
+
+def _finish(
+    figure: Any, data: DataSet, title: str, note: str, samples: Mapping[str, str] = _NONE
+) -> None:
+    """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
+    handles += [*map(_sample, samples.values())]
+    labels += samples
     look = {"loc": "outside upper center", "frameon": False, "fontsize": 8, "handlelength": 3.2}
-    look |= {"ncols": min(4, max(1, len(labels))), "title_fontsize": 10}
-    figure.legend(handles, labels, title=f"{title}: {data.label}", **look)
-    figure.supxlabel(f"{data.rules}\n{note}", fontsize=6.5, color=_GREY)
+    look |= {"title": "\n".join(wrap(f"{title}: {data.label}", _per_line(figure, 10)))}
+    for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
+        legend = figure.legend(handles, labels, ncols=columns, title_fontsize=10, **look)
+        box = legend.get_window_extent(figure.canvas.get_renderer())
+        if box.width <= figure.bbox.width or columns == 1:
+            break
+        legend.remove()
+    lines = [*wrap(data.rules, _per_line(figure, _NOTE)), *wrap(note, _per_line(figure, _NOTE))]
+    figure.supxlabel("\n".join(lines), fontsize=_NOTE, color=_GREY)
+
+
+def _per_line(figure: Any, size: float) -> int:
+    """How many characters of a size [points] surely fit into the width of a figure."""
+    return int(figure.get_figwidth() * 72.0 / (0.62 * size))

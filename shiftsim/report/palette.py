@@ -1,4 +1,8 @@
-"""What all pictures share: matplotlib, and how planners are drawn.
+"""What all pictures share: matplotlib, and how planners, noise, the recorded driver are drawn.
+
+Colour and marker are the planner. A clean rollout has a solid line and full marks, a disturbed one
+a dashed line and hollow marks, in curves, stills and replays alike. The recorded driver is dotted,
+in a colour of no planner.
 
 The colours of the known planners were searched for being far apart in every pair: at least 18 in
 CIELAB to normal eyes and under all kinds of colour-blindness, at least 6 in lightness in grey.
@@ -7,29 +11,37 @@ Markers tell planners apart without any colour.
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from shiftsim.errors import MissingExtraError
 from shiftsim.files import whole_file
+from shiftsim.world.state import AgentKind
 
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
-def new_figure(**settings: Any) -> Any:
-    """An empty figure of matplotlib; ids in SVG files are always the same.
+def new_figure(
+    layout: Literal["constrained", "compressed"] = "constrained", **settings: Any
+) -> Any:
+    """An empty figure of matplotlib that can be measured.
+
+    Ids in SVG files are always the same; PDF files hold their fonts as TrueType, as papers ask for.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
     try:
         import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError(
             "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
         ) from error
-    matplotlib.rcParams["svg.hashsalt"] = "shiftsim"
-    return Figure(layout="constrained", **settings)
+    matplotlib.rcParams.update({"svg.hashsalt": "shiftsim", "pdf.fonttype": 42})
+    figure = Figure(layout=layout, **settings)
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def save_picture(figure: Any, path: Path) -> None:
@@ -39,11 +51,34 @@ def save_picture(figure: Any, path: Path) -> None:
         figure.savefig(partial, dpi=150, format=kind[1:] or None, metadata=_PLAIN.get(kind))
 
 
+RECORDED = "#1f1f1f"  # the recorded driver
+ALARM = "#b00020"  # violations
+AGENTS = {
+    AgentKind.VEHICLE: "#8797a8",
+    AgentKind.PEDESTRIAN: "#a8791e",
+    AgentKind.BICYCLE: "#8a5f9e",
+}
+OTHER_AGENT = "#8f8f8f"
+_SIZES = {"*": 1.7, "P": 1.2, "X": 1.2, "D": 0.85}  # markers of equal weight to the eye
+
+
 class Style(NamedTuple):
     """How one planner is drawn: colour as `#rrggbb`, and the name of its marker in matplotlib."""
 
     colour: str
     marker: str
+
+    def marks(self, noise: str, size: float = 6.0) -> dict[str, Any]:
+        """Settings of matplotlib for the marks of a clean or a disturbed rollout [points]."""
+        is_clean = noise == "none"
+        return {
+            "color": self.colour,
+            "marker": self.marker,
+            "markersize": size * _SIZES.get(self.marker, 1.0),
+            "markerfacecolor": self.colour if is_clean else "white",
+            "markeredgecolor": "white" if is_clean else self.colour,
+            "markeredgewidth": 0.5 if is_clean else 1.1,
+        }
 
 
 # the planners of the paper in its colours' names: log grey, CaRL blue, Diffusion Planner orange,
@@ -66,6 +101,11 @@ _OTHERS = (
     Style("#0f8f96", "v"),
     Style("#4d4d4d", "P"),
 )
+
+
+def dashes(noise: str) -> Literal["-", "--"]:
+    """Line style of matplotlib for a clean or a disturbed rollout."""
+    return "-" if noise == "none" else "--"
 
 
 def planner_styles(planners: Iterable[str]) -> dict[str, Style]:

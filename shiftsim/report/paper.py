@@ -8,18 +8,9 @@ from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
 from shiftsim.report.published import Published, called_alike
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Estimate, Number, Table
+from shiftsim.report.words import LONG, NAMES
 from shiftsim.sim.noise import NOISE_NAMES
 
-METRICS = (  # the order of the paper's columns
-    "drivable_area_compliance",
-    "driving_direction_compliance",
-    "ego_is_comfortable",
-    "ego_is_making_progress",
-    "ego_progress_along_expert_route",
-    "no_ego_at_fault_collisions",
-    "speed_limit_compliance",
-    "time_to_collision_within_bound",
-)
 VAL14 = "val14"
 INTERVALS = (
     "95 % CI: cluster bootstrap over recordings, 10 000 draws; it says how much the choice "
@@ -87,7 +78,7 @@ def _columns(
         _Column(data.label, "all", estimate),
         _Column("95 % CI", "", score_interval),
         *(_Column(name, name, partial(estimate, where=data.within(city))) for city, name in cities),
-        *(_Column(COLUMNS[n], COLUMNS[n], partial(estimate, name=n)) for n in METRICS),
+        *(_Column(COLUMNS[n], COLUMNS[n], partial(estimate, name=n)) for n in NAMES),
     ]
 
 
@@ -124,7 +115,8 @@ def _semantic_table(
     header = ("traffic", "planner", *(column.heading for column in columns))
     title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
     name = f"semantic-shift_{data.name}"
-    return Table(name, title, header, tuple(rows), 2, tuple(filter(None, notes)))
+    words = _words(published)
+    return Table(name, title, header, tuple(rows), 2, tuple(filter(None, notes)), words=words)
 
 
 def traffics(groups: Iterable[Group]) -> list[str]:
@@ -160,15 +152,24 @@ def _own_list_note(data: DataSet, published: Published) -> str:
 
 def published_semantic(published: Published) -> Table:
     """The paper's own table."""
+    metrics = [name for name in LONG if name in published.columns]
+    columns = [*(name for name in published.columns if name not in LONG), *metrics]
     rows: list[tuple[Cell, ...]] = [
-        (traffic, f"{planner} {PUBLISHED}", *map(Number, values))
-        for traffic, planners in published.semantic_shift.items()
-        for planner, values in planners.items()
+        (traffic, f"{planner} {PUBLISHED}", *(Number(values[name]) for name in columns))
+        for traffic in published.semantic_shift
+        for planner, values in published.scores(traffic).items()
     ]
-    header = ("traffic", "planner", *(_SETS.get(name, name) for name in published.columns))
+    header = ("traffic", "planner", *(_SETS.get(name, name) for name in columns))
     notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
     title = "Zero-shot generalization as published"
-    return Table("semantic-shift_published", title, header, tuple(rows), 2, notes)
+    words = _words(published)
+    return Table("semantic-shift_published", title, header, tuple(rows), 2, notes, words=words)
+
+
+def _words(published: Published | None) -> dict[str, str]:
+    """What headings are short for: metrics, and the paper's sites."""
+    sites = published.cities if published else {}
+    return LONG | {short: names[0] for short, names in sites.items()}
 
 
 def noise_robustness(
@@ -196,7 +197,7 @@ def noise_robustness(
         rows += _published_robustness(published, noises)
         notes.append(f"published: {published.source}")
     header = ("set", "traffic", "planner", *noises)
-    title = "Noise robustness: CLS x 100"
+    title = "Noise robustness: closed-loop score x 100"
     return Table("noise-robustness", title, header, tuple(rows), 3, tuple(notes))
 
 

@@ -1,8 +1,11 @@
 """A table as data, its cells, and its plain text."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from textwrap import wrap
 from typing import TypeAlias
+
+from shiftsim.report.words import LONG, legend
 
 _GAP = 2  # blanks between columns of text
 
@@ -68,6 +71,7 @@ class Table:
     num_labels: int  # leading columns that hold text
     notes: tuple[str, ...] = ()  # what a reader must know to use the numbers
     full: "Table | None" = None  # the same for machines, where it is another table
+    words: Mapping[str, str] = field(default_factory=lambda: LONG)  # what headings are short for
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -78,6 +82,12 @@ class Table:
     def lines(self) -> list[list[str]]:
         """Header and rows as people read them."""
         return [[*self.header], *([shown(cell) for cell in row] for row in self.rows)]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the short headings mean, as "no at-fault collision (NCR), …", and the notes."""
+        known = legend(self.header, self.words)
+        return (f"columns: {known}", *self.notes) if known else self.notes
 
 
 def shown(cell: Cell) -> str:
@@ -94,7 +104,9 @@ def text(table: Table, width: int = 0) -> str:
         out += [""] if piece else []
         chosen = [[line[i] for i in columns] for line in lines]
         out += [f" {line}".rstrip() for line in aligned(chosen, table.num_labels)]
-    return "\n".join([*out, *(f" {note}" for note in table.notes)])
+    fitted = (wrap(note, width - 1, subsequent_indent="  ") for note in table.remarks)
+    notes = [line for lines in fitted for line in lines] if width else table.remarks
+    return "\n".join([*out, *(f" {note}" for note in notes)])
 
 
 def aligned(lines: Sequence[Sequence[str]], num_labels: int) -> list[str]:

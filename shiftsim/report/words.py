@@ -1,23 +1,31 @@
 """What metrics, units and violations are called where people read them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
+from shiftsim.metrics import SHORT_NAMES
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
-REASONS = {
-    "no_ego_at_fault_collisions": "at-fault collision",
+NAMES = {  # in the one order of metrics, that of `SHORT_NAMES`
+    "no_ego_at_fault_collisions": "no at-fault collision",
     "drivable_area_compliance": "drivable area",
+    "ego_is_making_progress": "making progress",
     "driving_direction_compliance": "driving direction",
-    "ego_is_making_progress": "no progress",
     "ego_progress_along_expert_route": "progress",
     "time_to_collision_within_bound": "time to collision",
     "speed_limit_compliance": "speed limit",
     "ego_is_comfortable": "comfort",
 }
+REASONS = NAMES | {  # what went wrong
+    "no_ego_at_fault_collisions": "at-fault collision",
+    "ego_is_making_progress": "no progress",
+    "ego_progress_along_expert_route": "little progress",
+}
+# what the headings of columns are short for, in the order of the columns
+LONG = {"CLS": "closed-loop score"} | {SHORT_NAMES[name]: words for name, words in NAMES.items()}
 UNITS = {  # nuPlan's names, shortened
     "meters": "m",
     "seconds": "s",
@@ -30,6 +38,16 @@ UNITS = {  # nuPlan's names, shortened
     "ratio": "",
     "boolean": "",
 }
+
+
+def in_words(metric: str) -> str:
+    """A metric as "no at-fault collision (NCR)"; one that is not scored by its name."""
+    return f"{NAMES[metric]} ({SHORT_NAMES[metric]})" if metric in NAMES else metric
+
+
+def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
+    """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
+    return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
 
 
 def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:

@@ -24,7 +24,7 @@ def _markdown(table: Table) -> str:
     head, *rows = ([markdown_escape(cell) for cell in line] for line in table.lines)
     body = [f"| {' | '.join(line)} |" for line in (head, rule, *rows)]
     title = [f"### {markdown_escape(table.title)}", ""] if table.title else []
-    notes = [line for note in table.notes for line in ("", markdown_escape(note))]
+    notes = [line for note in table.remarks for line in ("", markdown_escape(note))]
     return "\n".join([*title, *body, *notes])
 
 
@@ -125,7 +125,7 @@ def _latex(table: Table) -> str:
         return f"  {' & '.join(safe)} \\\\"
 
     head, *rows = (line([latex_escape(cell) for cell in cells]) for cells in table.lines)
-    notes = "; ".join(latex_escape(note) for note in table.notes)
+    notes = "; ".join(latex_escape(note) for note in table.remarks)
     caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
     begin = [
         r"\begin{table}  % needs \usepackage{booktabs}",
@@ -138,20 +138,39 @@ def _latex(table: Table) -> str:
     return "\n".join([*begin, r"\toprule", head, r"\midrule", *rows, *end])
 
 
+def latex_picture(name: str, title: str) -> str:
+    """A picture in LaTeX by the name of its file."""
+    lines = (
+        r"\begin{figure}  % needs \usepackage{graphicx}",
+        r"\centering",
+        f"\\includegraphics[width=\\linewidth]{{{name}}}",
+        f"\\caption{{{latex_escape(title)}}}",
+        f"\\label{{fig:{name.partition('.')[0]}}}",
+        r"\end{figure}",
+    )
+    return "\n".join(lines)
+
+
 def _html(table: Table) -> str:
+    """A section; its table lies in a box that scrolls where the page is too narrow."""
+
     def row(cells: Sequence[str], tag: str) -> str:
-        parts = (
-            f"<{tag}{'' if i < table.num_labels else ' class=n'}>{html.escape(cell)}</{tag}>"
-            for i, cell in enumerate(cells)
-        )
+        kinds = ["" if i < table.num_labels else " class=n" for i in range(len(cells))]
+        parts = (f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
         return f"<tr>{''.join(parts)}</tr>"
 
+    def heading(name: str) -> str:
+        words = table.words.get(name)
+        return f"<small>{html.escape(words)}</small> {name}" if words else html.escape(name)
+
     head, *rows = table.lines
+    title = html.escape(table.title or table.name)
     lines = [
         f'<section id="{html.escape(table.name)}">',
-        f"<h2>{html.escape(table.title)}</h2>",
-        f"<div class=wide><table>\n<thead>{row(head, 'th')}</thead>\n<tbody>",
-        *(row(cells, "td") for cells in rows),
+        f"<h2>{title}</h2>",
+        f'<div class="wide" tabindex="0" role="region" aria-label="{title}"><table>',
+        f"<thead>{row([*map(heading, head)], 'th')}</thead>\n<tbody>",
+        *(row([*map(html.escape, cells)], "td") for cells in rows),
         "</tbody></table></div>",
         *(f"<p>{html.escape(note)}</p>" for note in table.notes),
     ]

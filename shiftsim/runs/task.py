@@ -261,7 +261,9 @@ def score_rollout(
         **profile,
     }
     start_us = int(log.time_us[0])
-    rows = [_metric_row(row, start_us) for row in result.rows]
+    order = {name: place for place, name in enumerate(SHORT_NAMES)}
+    ordered = sorted(result.rows, key=lambda row: order.get(row.metric, len(order)))
+    rows = [_metric_row(row, start_us) for row in ordered]
     own = _storable([_metric_row(row, start_us) for row in result.extra])
     return scores, [{**row, **profile} for row in (*rows, *own)]
 

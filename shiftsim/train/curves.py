@@ -7,7 +7,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shiftsim.errors import MissingExtraError
 from shiftsim.files import whole_file
+from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
 
 Say = Callable[[str], None]
 
@@ -21,24 +23,24 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
 def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, Any]]) -> None:
     """Draw errors while training, and scores after each round; nothing without matplotlib."""
     try:
-        import matplotlib
-    except ImportError:
+        figure = new_figure(figsize=(8.0, 3.2))
+    except MissingExtraError:
         return
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     samples = [row["samples"] / 1e6 for row in curve]
-    for name, factor in (("acceleration_error", 1.0), ("steering_error", 10.0)):
-        label = name.replace("_", " ") + (f" x {factor:g}" if factor != 1.0 else "")
-        left.plot(samples, [factor * row[name] for row in curve], label=label, linewidth=0.9)
+    for name, factor, colour in (("acceleration", 1.0, "0.15"), ("steering", 10.0, "0.6")):
+        values = [factor * row[f"{name}_error"] for row in curve]
+        label = f"{name} error" + (f" × {factor:g}" if factor != 1.0 else "")
+        left.plot(samples, values, label=label, color=colour, linewidth=0.9)
     left.set(xlabel="samples [million]", ylabel="mean absolute error", yscale="log")
     left.legend(frameon=False)
     at = [row["samples"] / 1e6 for row in scores]
+    style = planner_styles(["carl"])["carl"]
     for noise in ("none", "ou-high"):
-        right.plot(at, [100.0 * row[noise] for row in scores], marker="o", label=f"noise {noise}")
-    right.set(xlabel="samples [million]", ylabel="CLS on towns left out", ylim=(0, 100))
+        look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
+        right.plot(at, [100.0 * row[noise] for row in scores], **look)
+    right.set(xlabel="samples [million]", ylim=(0, 100))
+    right.set_ylabel("closed-loop score × 100")
+    right.set_title("on towns left out", fontsize=9)
     right.legend(frameon=False, loc="lower right")
-    with whole_file(path) as partial:
-        figure.savefig(partial, format="png", dpi=100)
+    save_picture(figure, path)

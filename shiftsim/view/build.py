@@ -1,5 +1,6 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
+import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,13 @@ import pyarrow as pa
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
 from shiftsim.metrics import SHORT_NAMES
+from shiftsim.report.words import REASONS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, framed, json_text, replay_page
+from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
 from shiftsim.view.scene import Shown
+
+_WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,7 @@ def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "")
         styles=["list.css"],
         scripts=["list.js"],
         above=above,
-        data=f'<script type="application/json" id="data-rows">{json_text(list(rows))}</script>',
+        data=data_element("rows", list(rows)) + data_element("metrics", _WRONG),
     )
 
 
@@ -193,8 +197,47 @@ def write_site(
         gallery.page(token, back="../index.html").save(pages / page_name(token))
         rows += gallery.rows(token)
         on_progress(done + 1, len(found))
-    write_text(folder / "index.html", list_page(title, rows, above=above))
+    page = list_page(title, rows, above="\n".join([above, worst_table(rows)]))
+    write_text(folder / "index.html", page)
     return len(found)
+
+
+def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
+    """HTML: the rows with the lowest scores, what went wrong in words, and links to that moment."""
+    below = sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=_lowest_first)[:count]
+    if not below:
+        return ""
+    lines = []
+    for row in below:
+        times = [time for time in row["violated"].values() if time is not None]
+        at = f"t={min(times):.2f}&amp;" if times else ""
+        link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{_safe(row["token"])}</a>'
+        score = "–" if row["cls"] is None else f"{100.0 * row['cls']:.2f}"
+        noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
+        cells = (_safe(row["type"]), _safe(row["planner"]), _safe(noise), _what(row["violated"]))
+        inner = "".join(f"<td>{cell}</td>" for cell in (link, *cells))
+        lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
+    names = ("scenario", "type", "planner", "noise", "what went wrong, first time")
+    heads = "".join(f"<th>{name}</th>" for name in names)
+    title = f"The worst {len(lines)} of {len(rows)} rollouts"
+    return f"""<section id="worst"><h2>{title}</h2>
+<div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
+<thead><tr><th class="number">CLS</th>{heads}</tr></thead>
+<tbody>{"".join(lines)}</tbody></table></div></section>"""
+
+
+def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return (row["cls"] or 0.0, row["token"], row["planner"], row["noise"], row["seed"])
+
+
+def _what(violated: Mapping[str, float | None]) -> str:
+    """First violations in words, in the order of the metrics."""
+    known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
+    return ", ".join(w if time is None else f"{w} {time:.1f} s" for w, time in known)
+
+
+def _safe(text: str) -> str:
+    return html.escape(text)
 
 
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:

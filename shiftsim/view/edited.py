@@ -1,14 +1,16 @@
 """A recorded scenario beside what an edit makes of it."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
 
+from shiftsim.report.palette import new_figure
 from shiftsim.view import still
 from shiftsim.world.scenario import Scenario
 
 _EDITED = "#7b2fbf"  # as in replays
-_LINE = 0.2  # inch, height of a line of words
+_SIDE = 5.0  # inches, width of each of the two
 _WIDTH = 110  # characters of the words below the picture
 
 
@@ -18,14 +20,17 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     Raises:
         MissingExtraError: matplotlib is missing.
     """
-    import textwrap
-
     points = [recorded.expert[:, :2], edited.expert[:, :2]]
     made = _made(edited)
     if len(made):
         points.append(edited.tracks.poses[edited.iteration_rows[0], made, :2])
     extent = still.extent_of_points(np.concatenate(points))
-    figure, (panels,) = still.panels(1, 2, extent)
+    side = extent[2:] - extent[:2]
+    width, height = 2.0 * _SIDE, _SIDE * min(side[1] / side[0], 2.0)
+    words = edited.script.words if edited.script else ()
+    lines = [part for line in words for part in textwrap.wrap(line, _WIDTH)]
+    figure = new_figure(layout="compressed", figsize=(width, height + 0.5))
+    panels = figure.subplots(1, 2)
     for scenario, axes in zip((recorded, edited), panels, strict=True):
         still.draw_start(axes, scenario, extent)
         axes.set_title(
@@ -35,14 +40,8 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     x, y = tracks.poses[row, made, 0], tracks.poses[row, made, 1]
     ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
     panels[1].scatter(x, y, label="edited", **ring)
-    still.add_legend(panels[1])
-    words = edited.script.words if edited.script else ()
-    lines = [part for line in words for part in textwrap.wrap(line, _WIDTH)]
-    width, height = figure.get_size_inches()
-    below = _LINE * (len(lines) + 1)
-    figure.set_size_inches(width, height + below)
-    figure.subplots_adjust(bottom=below / (height + below))
-    figure.text(0.5, 0.01, "\n".join(lines), ha="center", va="bottom", fontsize=8)
+    figure.supxlabel("\n".join(lines), fontsize=8)
+    still.add_legend(figure, panels[1])
     return figure
 
 

@@ -3,6 +3,7 @@
 
 const byId = (id) => document.getElementById(id);
 const rows = JSON.parse(byId("data-rows").textContent);
+const metrics = JSON.parse(byId("data-metrics").textContent); // words by abbreviation, in their order
 const PAGE = 200;
 let sorting = { key: "cls", up: true };
 let room = PAGE;
@@ -12,14 +13,16 @@ for (const row of rows) {
   row.first = times.length ? Math.min(...times) : Infinity;
 }
 
-function options(id, values) {
-  for (const value of [...new Set(values)].sort()) {
+function options(id, values, words = {}) {
+  for (const value of values) {
     const option = document.createElement("option");
     option.value = value;
-    option.textContent = value;
+    option.textContent = words[value] ? `${words[value]} (${value})` : value;
     byId(id).append(option);
   }
 }
+
+const sorted = (values) => [...new Set(values)].sort();
 
 function matches(row) {
   for (const name of ["city", "planner", "noise"]) {
@@ -40,6 +43,7 @@ function compare(a, b) {
 }
 
 function violatedText(row) {
+  // by time; what has none in the order of the metrics, as it stands there
   const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
   return parts.map(([name, t]) => (t === null ? name : `${name} ${t.toFixed(1)} s`)).join(" · ");
 }
@@ -77,10 +81,11 @@ function show() {
   }
 }
 
-options("city", rows.map((row) => row.city));
-options("planner", rows.map((row) => row.planner));
-options("noise", rows.map((row) => row.noise));
-options("violated", rows.flatMap((row) => Object.keys(row.violated)));
+options("city", sorted(rows.map((row) => row.city)));
+options("planner", sorted(rows.map((row) => row.planner)));
+options("noise", sorted(rows.map((row) => row.noise)));
+const violated = new Set(rows.flatMap((row) => Object.keys(row.violated)));
+options("violated", Object.keys(metrics).filter((name) => violated.has(name)), metrics);
 for (const id of ["city", "planner", "noise", "violated", "low", "high", "find"]) {
   byId(id).addEventListener("input", () => {
     room = PAGE;

@@ -72,9 +72,8 @@ def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -
     if not 1 <= len(shown) <= MAX_ROLLOUTS:
         raise ValueError(f"a replay shows 1 to {MAX_ROLLOUTS} rollouts, not {len(shown)}")
     replay = Replay(scenario, shown)
-    meta = describe_scene(replay) | {"back": back}
     data = [
-        _data("meta", "application/json", json_text(meta)),
+        data_element("meta", describe_scene(replay) | {"back": back}),
         _data("scene", "text/plain", pack(scene_fields(replay))),
     ]
     for index in range(len(shown)):
@@ -127,6 +126,11 @@ def json_text(value: Any) -> str:
     """JSON that can stand inside a script element whatever its strings hold."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def data_element(name: str, value: Any) -> str:
+    """A value as JSON in an element `data-name`, which a page's script reads."""
+    return _data(name, "application/json", json_text(value))
 
 
 def _data(name: str, kind: str, text: str) -> str:

@@ -32,7 +32,8 @@ let scene, map, times, strips, panels, highlighted = -1;
 
 const canvas = byId("scene");
 const context = canvas.getContext("2d", { alpha: false });
-const dashOf = (rollout) => (rollout.noise === "none" ? CLEAN : NOISY);
+const isNoisy = (rollout) => rollout.noise !== "none";
+const dashOf = (rollout) => (isNoisy(rollout) ? NOISY : CLEAN);
 const labelOf = (rollout) =>
   rollout.noise === "none" ? rollout.planner : `${rollout.planner} ${rollout.noise} #${rollout.seed}`;
 const duration = () => times[times.length - 1];
@@ -231,10 +232,10 @@ function drawPanel(panel, members, leading, at) {
     const rollout = meta.rollouts[index];
     if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour);
     const pose = egoPose(index, at);
-    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading);
+    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     const reach = meta.vehicle[2];
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
-    drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour);
+    drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour, isNoisy(rollout));
   }
   let line = 0;
   for (const index of order.reverse()) line = tellViolations(panel, index, line);
@@ -280,7 +281,7 @@ function captionPanel(panel, rollout, fields, at) {
   const width = context.measureText(text).width;
   context.fillStyle = "rgba(255, 255, 255, 0.85)";
   context.fillRect(panel.left + 6, panel.top + 6, width + 26, 20);
-  drawMarker(context, rollout.marker, panel.left + 16, panel.top + 16, 5, rollout.colour);
+  drawMarker(context, rollout.marker, panel.left + 16, panel.top + 16, 5, rollout.colour, isNoisy(rollout));
   context.fillStyle = "#222222";
   context.fillText(text, panel.left + 26, panel.top + 20);
 }
@@ -322,10 +323,11 @@ function showCurves() {
 // one mark per moment: what is first violated at the same time shares it
 function marksOf(index, row) {
   const { colour, marker, violations: all } = meta.rollouts[index];
+  const hollow = isNoisy(meta.rollouts[index]);
   const moments = [...new Set(all.map((item) => item.t))];
   return moments.map((t) => {
     const names = all.filter((item) => item.t === t).map((item) => item.short);
-    return { t, row, text: names.join(" "), colour, marker };
+    return { t, row, text: names.join(" "), colour, marker, hollow };
   });
 }
 
@@ -372,7 +374,7 @@ function swatch(rollout) {
   pen.lineTo(28, 7);
   pen.stroke();
   pen.setLineDash([]);
-  drawMarker(pen, rollout.marker, 14, 7, 4.5, rollout.colour);
+  drawMarker(pen, rollout.marker, 14, 7, 4.5, rollout.colour, isNoisy(rollout));
   return picture;
 }
 

@@ -1,42 +1,42 @@
 """Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, MissingExtraError
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
-from shiftsim.sim.log import SimulationLog, as_recorded
-from shiftsim.view.scene import Shown, map_lines, violations
+from shiftsim.report.palette import RECORDED, new_figure, planner_styles, save_picture
+from shiftsim.sim.log import as_recorded
+from shiftsim.view.drawing import (
+    SMALL,
+    Mark,
+    caption,
+    draw_boxes,
+    draw_ego,
+    draw_map,
+    draw_others,
+    draw_paths,
+    draw_recorded,
+    draw_scale,
+    draw_violation,
+    spread_labels,
+)
+from shiftsim.view.scene import Shown
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
 STILLS = (".pdf", ".png", ".svg")
 FILMS = (".mp4", ".gif")
 _PAD = 12.0  # m around the driven paths
 _FPS = 10
 _FILM_DPI = 100
-_LAYERS = {  # what is drawn first lies below
-    "walkway": "#ece6d8",
-    "drivable": "#dcdcd8",
-    "route": "#b9d2be",
-    "crosswalk": "#f7f4ea",
-}
-_AGENTS = {
-    AgentKind.VEHICLE: "#8797a8",
-    AgentKind.PEDESTRIAN: "#a8791e",
-    AgentKind.BICYCLE: "#8a5f9e",
-}
-_MARKER: dict[str, Any] = {"markersize": 5, "markeredgewidth": 1.0}
-_OTHER, _LOG = "#8f8f8f", "#1f1f1f"
-_ALARM = "#b00020"
-_LARGEST = 7.0  # inches, of a single picture
+_LARGEST = 6.0  # inches, of a single scene
+_WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
 
 
 def save_figure(
@@ -77,14 +77,25 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
         MissingExtraError: matplotlib is missing.
     """
     row = _sample_at(shown[0].log.time_us, at)
-    extent = _extent_of(scenario, shown)
-    figure, axes = panels(1, 1, extent)
-    _draw_map(axes[0][0], scenario.map, scenario.route, extent)
-    _moment(axes[0][0], shown, row, planner_styles(item.planner for item in shown))
-    add_legend(axes[0][0])
-    _scale_bar(axes[0][0], extent)
-    _heading(axes[0][0], scenario, at)
+    figure, axes, _ = _scene(scenario, shown, at)
+    draw_boxes(axes, shown, row, planner_styles(item.planner for item in shown))
     return figure
+
+
+def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, Any, list[Mark]]:
+    """Figure and axes with all that does not move, and the marks of violations."""
+    extent = _extent_of(scenario, shown)
+    figure, axes = _single(extent)
+    draw_map(axes, scenario.map, scenario.route, extent)
+    styles = planner_styles(item.planner for item in shown)
+    draw_paths(axes, shown, styles)
+    found = (draw_violation(axes, item, styles[item.planner]) for item in shown)
+    marks = [mark for mark in found if mark]
+    draw_scale(axes, extent)
+    _heading(axes, scenario, at)
+    add_legend(figure, axes)
+    spread_labels(figure, axes, marks)
+    return figure, axes, marks
 
 
 def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> Any:
@@ -96,17 +107,27 @@ def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> 
     """
     rows = [_sample_at(shown[0].log.time_us, time) for time in at]
     extent = _extent_of(scenario, shown)
-    figure, lines = panels(len(shown), len(at), extent)
+    width, height = extent[2:] - extent[:2]
+    size = min(_WIDTH / len(at), _LARGEST * width / max(width, height))
+    figure = new_figure(
+        layout="compressed",
+        figsize=(size * len(at) + 0.4, (size * height / width + 0.1) * len(shown) + 0.5),
+    )
+    panels = figure.subplots(len(shown), len(at), squeeze=False)
     styles = planner_styles(item.planner for item in shown)
-    for item, line in zip(shown, lines, strict=True):
+    for item, line in zip(shown, panels, strict=True):
         for time, row, axes in zip(at, rows, line, strict=True):
-            _draw_map(axes, scenario.map, scenario.route, extent)
-            _moment(axes, [item], row, styles)
+            _frame(axes, extent)
+            draw_map(axes, scenario.map, scenario.route, extent)
+            draw_paths(axes, [item], styles)
+            draw_boxes(axes, [item], row, styles)
+            draw_violation(axes, item, styles[item.planner], "short")
             if item is shown[0]:
-                axes.set_title(f"{time:g} s", fontsize=9)
-        line[0].set_ylabel(_caption(item).replace(", ", "\n", 1), fontsize=8)
-    _scale_bar(lines[-1][0], extent)
-    figure.suptitle(_words(scenario), fontsize=9)
+                axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
+        words = "\n".join(wrap(caption(item), max(20, int(size * height / width * 15))))
+        line[0].set_ylabel(words, fontsize=SMALL - 1)
+    draw_scale(panels[-1][0], extent)
+    figure.suptitle(_words(scenario), fontsize=SMALL + 1)
     return figure
 
 
@@ -119,25 +140,27 @@ def overview(thing: Scenario | VectorMap) -> Any:
     if isinstance(thing, VectorMap):
         bounds = thing.edges.polygons.bounds
         extent = extent_of_points(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
-        figure, ((axes,),) = panels(1, 1, extent)
-        _draw_map(axes, thing, (), extent)
-        _scale_bar(axes, extent)
+        figure, axes = _single(extent)
+        draw_map(axes, thing, (), extent)
+        draw_scale(axes, extent)
         return figure
     extent = extent_of_points(thing.expert[:, :2])
-    figure, ((axes,),) = panels(1, 1, extent)
+    figure, axes = _single(extent)
     draw_start(axes, thing, extent)
     _heading(axes, thing, 0.0)
+    add_legend(figure, axes)
     return figure
 
 
 def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
     """A scenario at its first iteration, within an extent (4,) [m]."""
     log = as_recorded(scenario)
-    _draw_map(axes, scenario.map, scenario.route, extent)
-    _recorded(axes, log, 0)
-    _draw_ego(axes, log, 0, _LOG)
-    add_legend(axes)
-    _scale_bar(axes, extent)
+    _frame(axes, extent)
+    draw_map(axes, scenario.map, scenario.route, extent)
+    draw_recorded(axes, log)
+    draw_others(axes, log, 0)
+    draw_ego(axes, log, 0, RECORDED)
+    draw_scale(axes, extent)
 
 
 def svg_of(figure: Any) -> str:
@@ -167,42 +190,41 @@ def extent_of_points(points: FloatArray) -> FloatArray:
     return np.array([*(middle - half), *(middle + half)])
 
 
-def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
-    """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
-    width, height = extent[2] - extent[0], extent[3] - extent[1]
-    size = min(_LARGEST / max(width, height), _LARGEST * 2.0 / (columns * width))
-    figure = new_figure(figsize=(columns * width * size + 0.1, rows * height * size + 0.4))
-    axes_of = figure.subplots(rows, columns, squeeze=False)
-    for axes in axes_of.flat:
-        axes.set_xlim(extent[0], extent[2])
-        axes.set_ylim(extent[1], extent[3])
-        axes.set_aspect("equal")
-        axes.set_xticks([])
-        axes.set_yticks([])
-    return figure, axes_of
+def _single(extent: FloatArray) -> tuple[Any, Any]:
+    """A figure with one scene, as wide and high as the extent needs."""
+    sides = extent[2:] - extent[:2]
+    width, height = sides * _LARGEST / sides.max()
+    figure = new_figure(layout="compressed", figsize=(width + 0.2, height + 0.4))
+    axes = figure.subplots()
+    _frame(axes, extent)
+    return figure, axes
 
 
-def _draw_map(axes: Any, road: VectorMap, route: Sequence[str], extent: FloatArray) -> None:
-    from matplotlib.collections import LineCollection
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
-
-    layers = map_lines(road, route, extent)
-    for name, colour in _LAYERS.items():
-        if layers[name]:
-            outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
-            axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="none", zorder=1))
-    axes.add_collection(
-        LineCollection(layers["boundary"], colors="#a9a9a3", linewidths=0.5, zorder=1.5)
-    )
+def _frame(axes: Any, extent: FloatArray) -> None:
+    axes.set_xlim(extent[0], extent[2])
+    axes.set_ylim(extent[1], extent[3])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
 
 
-def _scale_bar(axes: Any, extent: FloatArray) -> None:
-    width = extent[2] - extent[0]
-    length = next(v for v in (100, 50, 20, 10, 5, 2, 1) if v <= max(width / 4.0, 1.0))
-    x, y = extent[0] + 0.04 * width, extent[1] + 0.04 * (extent[3] - extent[1])
-    axes.plot([x, x + length], [y, y], color="black", linewidth=2, zorder=9)
-    axes.text(x + length / 2.0, y, f"{length} m\n", ha="center", va="bottom", fontsize=8, zorder=9)
+def add_legend(figure: Any, axes: Any) -> None:
+    """Beside a tall scene, else below it; the figure grows by as much."""
+    width, height = figure.get_size_inches()
+    is_tall = height > 1.3 * width
+    place = "outside right upper" if is_tall else "outside lower left"
+    look: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handlelength": 3.0}
+    handles, labels = axes.get_legend_handles_labels()
+    length = 38 if is_tall else 85  # characters
+    labels = ["\n".join(wrap(label, length, subsequent_indent="  ")) for label in labels]
+    legend = figure.legend(handles, labels, loc=place, **look)
+    box = legend.get_window_extent(figure.canvas.get_renderer())
+    own_width, own_height = box.width / figure.dpi + 0.1, box.height / figure.dpi + 0.1
+    if is_tall:
+        figure.set_size_inches(width + own_width, max(height, own_height))
+    else:
+        figure.set_size_inches(max(width, own_width), height + own_height)
+    figure.draw_without_rendering()  # the layout settles in two steps
 
 
 def _words(scenario: Scenario) -> str:
@@ -211,98 +233,12 @@ def _words(scenario: Scenario) -> str:
 
 
 def _heading(axes: Any, scenario: Scenario, time: float) -> None:
-    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=9)
-
-
-def _caption(item: Shown) -> str:
-    """Planner, noise, score and what cost most of it."""
-    name = item.planner if item.noise == "none" else f"{item.planner} {item.noise}"
-    score = "" if item.cls is None else f": {100.0 * item.cls:.0f}"
-    found = _gravest(item)
-    return f"{name}{score}" if found is None else f"{name}{score}, {_told(found)}"
-
-
-def _told(found: Mapping[str, Any]) -> str:
-    return f"{found['words']}, {found['t']:.1f} s"
-
-
-def _gravest(item: Shown) -> dict[str, Any] | None:
-    """The violation that cost most: the first of a multiplier, else the first."""
-    found = violations(item)
-    return next((one for one in found if one["multiplier"]), found[0] if found else None)
-
-
-def _moment(axes: Any, shown: Sequence[Shown], row: int, styles: Mapping[str, Style]) -> list[Any]:
-    """Everything that moves at one sample; returns what was drawn."""
-    drawn = _recorded(axes, shown[0].log, row)
-    for item in shown:
-        style, ego = styles[item.planner], item.log.ego
-        is_clean = item.noise == "none"
-        line = {"color": style.colour, "linewidth": 1.8, "linestyle": "-" if is_clean else "--"}
-        mark = {"marker": style.marker, "markevery": (min(10, len(ego) - 1), 50)}
-        look = {"markerfacecolor": "white" if is_clean else style.colour, **line, **mark, **_MARKER}
-        look["markeredgecolor"] = style.colour
-        drawn += axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=_caption(item), **look)
-        drawn += _draw_ego(axes, item.log, row, style.colour)
-        drawn += _draw_violation(axes, item, style.colour)
-    return drawn
-
-
-def _draw_violation(axes: Any, item: Shown, colour: str) -> list[Any]:
-    """A cross where the gravest violation began; the caption says what it was."""
-    found = _gravest(item)
-    if found is None:
-        return []
-    time_us = item.log.time_us
-    row = int(np.searchsorted(time_us, time_us[0] + found["t"] * 1e6 - 1.0))
-    x, y = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
-    place: dict[str, Any] = {"xytext": (6, 6), "textcoords": "offset points", "zorder": 10}
-    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": colour, "lw": 0.8, "alpha": 0.85}
-    words = axes.annotate(found["short"], (x, y), fontsize=7, bbox=box, **place)
-    cross = {"marker": "x", "color": _ALARM, "s": 60, "linewidths": 2.2, "zorder": 9}
-    return [axes.scatter([x], [y], **cross), words]
-
-
-def add_legend(axes: Any) -> None:
-    """What the lines of a picture are."""
-    axes.legend(fontsize=8, loc="best", framealpha=0.85, edgecolor="none").set_zorder(11)
-
-
-def _draw_ego(axes: Any, log: SimulationLog, row: int, colour: str) -> list[Any]:
-    pose, size = center_poses(log.ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
-    return _draw_boxes(axes, pose, np.array(size), colour, zorder=7)
-
-
-def _recorded(axes: Any, log: SimulationLog, row: int) -> list[Any]:
-    """The others at one sample, and the recorded path of the ego."""
-    tracks, expert = log.tracks, log.expert_ego
-    dotted = {"color": _LOG, "linewidth": 1, "linestyle": ":", "zorder": 4}
-    drawn: list[Any] = axes.plot(expert[:, 0], expert[:, 1], label="recorded driver", **dotted)
-    for kind in np.unique(tracks.kinds):
-        there = tracks.valid[row] & (tracks.kinds == kind)
-        colour = _AGENTS.get(AgentKind(int(kind)), _OTHER)
-        drawn += _draw_boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], colour)
-    return drawn
-
-
-def _draw_boxes(
-    axes: Any, poses: FloatArray, sizes: FloatArray, colour: str, zorder: float = 3
-) -> list[Any]:
-    """(N, 3) centre poses and (N, 2) lengths and widths as filled boxes."""
-    from matplotlib.collections import PolyCollection
-
-    if not len(poses):
-        return []
-    corners = boxes_to_corners(poses, sizes)
-    edge: dict[str, Any] = {"edgecolors": "#30363c", "linewidths": 0.6}
-    boxes = PolyCollection(list(corners), facecolors=colour, zorder=zorder, **edge)
-    return [axes.add_collection(boxes, autolim=False)]
+    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=SMALL + 1)
 
 
 def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
-    """All samples, one after the other."""
-    extent = _extent_of(scenario, shown)
-    figure, ((axes,),) = panels(1, 1, extent)
+    """All samples, one after the other; a violation is marked from its first moment on."""
+    figure, axes, marks = _scene(scenario, shown, 0.0)
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     writer: Any = PillowWriter(fps=_FPS)
@@ -310,16 +246,16 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
         if not FFMpegWriter.isAvailable():
             raise MissingExtraError("mp4 needs ffmpeg", hint="install ffmpeg, or write a .gif")
         writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
-    _draw_map(axes, scenario.map, scenario.route, extent)
-    _scale_bar(axes, extent)
     styles = planner_styles(item.planner for item in shown)
     times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
+    figure.set_layout_engine("none")  # it is laid out, and each frame would be again
     with writer.saving(figure, str(path), _FILM_DPI):
-        for row, time in enumerate(times):
-            drawn = _moment(axes, shown, row, styles)
-            if row == 0:
-                add_legend(axes)  # of lines that look the same in all samples
-            _heading(axes, scenario, float(time))
+        for row, time in enumerate(times.tolist()):
+            drawn = draw_boxes(axes, shown, row, styles)
+            for mark in marks:
+                for artist in (mark.cross, mark.label):
+                    artist.set_visible(mark.time <= time + 1e-6)
+            _heading(axes, scenario, time)
             writer.grab_frame()
             for artist in drawn:
                 artist.remove()

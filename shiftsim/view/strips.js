@@ -97,7 +97,7 @@ class Strips {
     const ends = []; // of the texts so far, by row: none is written over another
     for (const mark of this.marks) {
       const y = top + mark.row * VIOLATION_ROW + 8;
-      drawMarker(context, mark.marker, this.x(mark.t), y, 4.5, mark.colour);
+      drawMarker(context, mark.marker, this.x(mark.t), y, 4.5, mark.colour, mark.hollow);
       context.fillStyle = "#3a3a3a";
       const text = ` ${mark.text}`;
       const width = context.measureText(text).width;

@@ -10,16 +10,11 @@ from shiftsim.data.deepplan.recording import Converted
 from shiftsim.data.tracks.columns import KINDS
 from shiftsim.data.tracks.convert import Looked
 from shiftsim.data.tracks.reading import TrackTable
-from shiftsim.report.palette import new_figure, save_picture
+from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
-_COLOURS = {
-    AgentKind.VEHICLE: "#3b6ea5",
-    AgentKind.PEDESTRIAN: "#a8791e",
-    AgentKind.BICYCLE: "#8a5f9e",
-}
-_OTHER, _EGO, _ROAD, _LINE = "#8f8f8f", "#c23b22", "#dcdcd8", "#b8b8b2"
+_ROAD, _LINE = "#dcdcd8", "#b8b8b2"
 _MARGIN = 0.05  # of the extent
 _MAX_POINTS = 300_000
 _MAX_EGOS = 40
@@ -111,7 +106,7 @@ def _draw_tracks(axes: Any, table: TrackTable) -> None:
         breaks = np.flatnonzero(np.diff(table.track[rows])) + 1
         xy = np.insert(table.xy[rows], breaks, np.nan, axis=0)
         known = AgentKind(kind) if kind >= 0 else None
-        colour = _OTHER if known is None else _COLOURS.get(known, _OTHER)
+        colour = OTHER_AGENT if known is None else AGENTS.get(known, OTHER_AGENT)
         name = known.name.lower().replace("_", " ") if known is not None else "unknown kind"
         axes.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=0.6, zorder=3, label=name)
 
@@ -120,11 +115,11 @@ def _draw_egos(axes: Any, made: Converted) -> None:
     for number, ego in enumerate(made.egos):
         x, y = ego.states[:, 0], ego.states[:, 1]
         label = "egos, from dot to arrow" if not number else None
-        axes.plot(x, y, color=_EGO, linewidth=1.3, zorder=4, label=label)
+        axes.plot(x, y, color=RECORDED, linewidth=1.3, zorder=4, label=label)
         if number < _MAX_EGOS:
-            axes.plot(x[0], y[0], "o", color=_EGO, markersize=4, zorder=5)
+            axes.plot(x[0], y[0], "o", color=RECORDED, markersize=4, zorder=5)
             heading = ego.states[-1, 2]
             to = x[-1] + 6.0 * np.cos(heading), y[-1] + 6.0 * np.sin(heading)
-            style = {"arrowstyle": "-|>", "color": _EGO}
+            style = {"arrowstyle": "-|>", "color": RECORDED}
             axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
-            axes.annotate(ego.name, (x[0], y[0]), fontsize=6, color=_EGO, zorder=6)
+            axes.annotate(ego.name, (x[0], y[0]), fontsize=6, color=RECORDED, zorder=6)

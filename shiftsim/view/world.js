@@ -255,7 +255,8 @@ function drawPlan(context, fields, panel, at, colour) {
   context.lineCap = "butt";
 }
 
-function drawEgo(context, pose, vehicle, panel, colour, filled) {
+// the box of an ego: filled when it leads, with a dashed edge where its rollout is disturbed
+function drawEgo(context, pose, vehicle, panel, colour, filled, dash = []) {
   const [length, width, toCentre] = vehicle;
   const front = toCentre + length / 2;
   context.beginPath();
@@ -264,18 +265,20 @@ function drawEgo(context, pose, vehicle, panel, colour, filled) {
   context.strokeStyle = colour;
   if (filled) {
     context.fillStyle = colour;
-    context.globalAlpha = 0.8;
+    context.globalAlpha = dash.length ? 0.3 : 0.8;
     context.fill();
     context.globalAlpha = 1;
   }
+  context.setLineDash(dash);
   context.stroke();
+  context.setLineDash([]);
   const [x, y, heading] = pose;
   const tip = panel.toScreen(x + front * Math.cos(heading), y + front * Math.sin(heading));
   const tail = panel.toScreen(x + toCentre * Math.cos(heading), y + toCentre * Math.sin(heading));
   context.beginPath();
   context.moveTo(...tail);
   context.lineTo(...tip);
-  context.strokeStyle = filled ? "#ffffff" : colour;
+  context.strokeStyle = filled && !dash.length ? "#ffffff" : colour;
   context.stroke();
 }
 
@@ -311,15 +314,16 @@ function star(r) {
   });
 }
 
-function drawMarker(context, marker, x, y, radius, colour) {
+// full for a clean rollout, hollow for a disturbed one
+function drawMarker(context, marker, x, y, radius, colour, hollow = false) {
   context.save();
   context.translate(x, y);
   context.beginPath();
   (MARKERS[marker] || MARKERS.o)(context, radius);
-  context.fillStyle = colour;
+  context.fillStyle = hollow ? "#ffffff" : colour;
   context.fill();
   context.lineWidth = 1.2;
-  context.strokeStyle = "#ffffff";
+  context.strokeStyle = hollow ? colour : "#ffffff";
   context.stroke();
   context.restore();
 }

@@ -52,14 +52,14 @@ class Page:
     def __init__(self, browser):
         self.browser = browser
 
-    def open(self, address, size=SIZES[0]):
+    def open(self, address, size=SIZES[0], ready="document.documentElement.dataset.ready"):
         """Show a page and wait until it says that it is ready."""
         metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
         self.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
         self.browser.get("about:blank")
         self.browser.get_log("browser")
         self.browser.get(address)
-        self.wait("document.documentElement.dataset.ready")
+        self.wait(ready)
 
     def run(self, script):
         """Value of an expression in the page."""

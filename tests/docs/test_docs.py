@@ -43,6 +43,7 @@ from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
+from shiftsim.report.words import LONG
 from shiftsim.runs import config
 from shiftsim.runs.results import TABLES
 
@@ -360,6 +361,12 @@ def test_weights_are_those_of_the_score() -> None:
     roles: dict[str, Any] = dict.fromkeys(MULTIPLIERS, "factor")
     roles |= {name: f"weight {weight:g}" for name, weight in WEIGHTS.items()}
     assert [row[:3] for row in rows] == [[SHORT_NAMES[n], n, role] for n, role in roles.items()]
+
+
+def test_metrics_of_the_readme_stand_in_the_order_of_all_tables() -> None:
+    text = (REPOSITORY / "README.md").read_text("utf-8")
+    assert f"| planner | noise | {' | '.join(LONG)} |" in text
+    assert f"Columns: {', '.join(LONG.values())}." in " ".join(text.split())
 
 
 def test_checkpoints_are_those_of_the_planners() -> None:

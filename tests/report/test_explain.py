@@ -2,8 +2,10 @@
 
 import pytest
 
+from shiftsim.metrics import SHORT_NAMES
 from shiftsim.metrics.score import closed_loop_score
 from shiftsim.report.explain import explain_lines, select_tasks, why
+from shiftsim.report.words import in_words
 
 
 def metric(name, score, role, weight=None, **first):
@@ -20,8 +22,7 @@ def test_a_score_of_zero_names_every_cause_with_time_and_partner():
         metric("ego_is_making_progress", 0.0, "multiplier"),
     ]
     assert why(0.0, rows) == (
-        "score 0 because no_ego_at_fault_collisions is 0 (4.3 s, track 17) and "
-        "ego_is_making_progress is 0"
+        "score 0 because of at-fault collision (NCR) at 4.3 s, track 17 and no progress (EMP)"
     )
 
 
@@ -53,6 +54,16 @@ def test_every_metric_has_a_line_with_value_threshold_and_weight(clean_run):
     (task,) = select_tasks(clean_run, "0001cafe", planner="constant-velocity", noise="none")
     text = "\n".join(explain_lines(task))
     for row in task["metrics"]:
-        assert row["metric"] in text
+        assert in_words(row["metric"]) in text
     assert "threshold 0.95 s" in text
     assert text.count("weight ") == 4
+
+
+def test_metrics_stand_in_the_one_order_in_files_and_explanations(clean_run):
+    order = [name for name in SHORT_NAMES if name != "score"]
+    for task in select_tasks(clean_run, "0001cafe"):
+        assert [row["metric"] for row in task["metrics"]][: len(order)] == order
+    table = clean_run.metrics
+    first = table.slice(0, table.num_rows // clean_run.scores.num_rows)["metric"].to_pylist()
+    assert first[: len(order)] == order
+    assert [name for name in clean_run.scores.column_names if name in order] == order

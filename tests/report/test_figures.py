@@ -2,8 +2,13 @@
 
 import pytest
 from made_runs import random_scores, write_run
+from pictures import cut_off, overlaps, written
 
+from shiftsim.report.build import write_report
 from shiftsim.report.groups import read_groups
+from shiftsim.report.palette import planner_styles
+from shiftsim.report.words import LONG
+from shiftsim.train import curves
 
 pytest.importorskip("matplotlib")
 
@@ -57,7 +62,7 @@ def test_planners_differ_without_colour(groups):
 
 def test_every_picture_says_what_its_scores_are(groups):
     for figure in drawn(groups).values():
-        text = figure.drawn._supxlabel.get_text()
+        text = " ".join(figure.drawn._supxlabel.get_text().split())
         assert "thresholds nuplan" in text
         assert "metrics v1" in text
         assert "4 scenarios" in text
@@ -74,3 +79,81 @@ def test_the_same_picture_has_the_same_bytes(groups, tmp_path):
 @pytest.mark.parametrize("ending", ["svg", "pdf"])
 def test_pictures_can_be_saved_as_vectors(groups, tmp_path, ending):
     assert drawn(groups)["metrics_made-up"].save(tmp_path, ending).stat().st_size > 1000
+
+
+PAPER = ("carl", "pdm-closed", "pluto", "diffusion-planner", "plantf", "log-future")
+OWN = tuple(f"my_package.my_module_{number}:MyFavouritePlanner" for number in range(5))
+LEVELS = ("low", "mid", "high")
+ALL = ("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in LEVELS))
+
+
+@pytest.mark.parametrize(
+    ("names", "noise", "split"),
+    [(PAPER, ALL, "deepplan"), (OWN, ("none", "ou-low"), "a-split-with-quite-a-long-name-indeed")],
+)
+def test_words_neither_cover_one_another_nor_leave_the_picture(tmp_path, names, noise, split):
+    cities = ("Sindelfingen", "San Francisco", "Stuttgart", "Munich")
+    settings = {"planners": names, "noise": noise, "cities": cities, "split": split}
+    runs = [
+        write_run(tmp_path / traffic, traffic=traffic, **settings)
+        for traffic in ("nonreactive", "reactive")
+    ]
+    for name, figure in drawn(read_groups(runs)).items():
+        assert {*names} <= {text for text, _ in written(figure.drawn)}, name
+        assert overlaps(figure.drawn) == [], name
+        assert cut_off(figure.drawn) == [], name
+
+
+def test_axes_are_labelled(groups):
+    for figure in drawn(groups).values():
+        assert all(axes.get_ylabel().endswith("score × 100") for axes in figure.drawn.axes[:1])
+    robustness = drawn(groups)["robustness_made-up"].drawn
+    assert {axes.get_xlabel() for axes in robustness.axes} == {"strength of the noise"}
+
+
+def test_metrics_stand_in_the_order_of_all_tables_with_words_first(groups):
+    axes = drawn(groups)["metrics_made-up"].drawn.axes[0]
+    headings = [label.get_text().replace("\n", " ") for label in axes.get_xticklabels()]
+    assert headings == [f"{words} ({short})" for short, words in LONG.items()]
+
+
+def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
+    colour = planner_styles(["alpha", "beta", "gamma"])["alpha"].colour
+    axes = drawn(groups)["robustness_made-up"].drawn.axes[0]
+    mine = [line for line in axes.lines if line.get_color() == colour]
+    faces = {
+        (len(line.get_xdata()), line.get_linestyle(), line.get_markerfacecolor())
+        for line in mine
+        if line.get_marker() not in ("None", "", "_", "|")
+    }
+    assert faces == {(1, "None", colour), (3, "--", "white")}
+    (thin,) = [line for line in mine if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
+    assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().mean)
+
+
+def test_a_report_in_latex_holds_the_pictures_as_pdf(groups, tmp_path):
+    figures = [*drawn(groups).values()]
+    write_report(tmp_path, "made up", [groups[0].run], [], figures, ["latex"])
+    text = (tmp_path / "report.tex").read_text("utf-8")
+    for figure in figures:
+        assert f"\\includegraphics[width=\\linewidth]{{{figure.name}.pdf}}" in text
+        assert (tmp_path / f"{figure.name}.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
+    content = drawn(groups)["metrics_made-up"].save(tmp_path, "pdf").read_bytes()
+    assert b"/Type3" not in content
+    assert b"/CIDFontType2" in content
+
+
+def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(curves, "save_picture", lambda figure, path: kept.append(figure))
+    rows = [{"samples": 1e5 * i, "acceleration_error": 0.2, "steering_error": 0.1} for i in (1, 2)]
+    curves.draw_curves(tmp_path / "a.png", rows, [{"samples": 1e5, "none": 0.9, "ou-high": 0.7}])
+    (figure,) = kept
+    looks = [(line.get_color(), line.get_linestyle()) for line in figure.axes[1].lines]
+    colour = planner_styles(["carl"])["carl"].colour
+    assert looks == [(colour, "-"), (colour, "--")]
+    assert overlaps(figure) == []
+    assert cut_off(figure) == []

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from shiftsim.report.palette import _KNOWN, planner_styles
+from shiftsim.report.palette import _KNOWN, _OTHERS, AGENTS, RECORDED, planner_styles
 
 # dichromatic vision after Machado, Oliveira and Fernandes (2009), on linear RGB
 VISION = {
@@ -59,3 +59,11 @@ def test_markers_are_all_different():
 def test_own_planners_have_styles_of_their_own():
     found = planner_styles(["carl", "mine:A", "mine:B", "pluto"])
     assert len(set(found.values())) == 4
+
+
+@pytest.mark.parametrize("eyes", VISION)
+def test_the_recorded_driver_has_the_colour_of_no_planner(eyes):
+    recorded = lab(RECORDED, VISION[eyes])
+    for style in (*_KNOWN.values(), *_OTHERS):
+        assert np.linalg.norm(recorded - lab(style.colour, VISION[eyes])) >= 12.0, style
+    assert RECORDED not in AGENTS.values()

@@ -6,17 +6,20 @@ import io
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from made_runs import random_scores, write_run
+from made_runs import METRICS, random_scores, write_run
 
 from shiftsim.benchmarks import known_sets, published
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
+from shiftsim.report.about import CITED, runs_table
 from shiftsim.report.build import TABLES, Options, make_tables, write_report
 from shiftsim.report.details import planner_comparison, planning_times, scenario_types
 from shiftsim.report.groups import KnownSet, read_groups, token_digest
-from shiftsim.report.paper import noise_robustness, semantic_shift
+from shiftsim.report.paper import noise_robustness, published_semantic, semantic_shift
 from shiftsim.report.scores import score_table, scores, summary
 from shiftsim.report.tables import Number, Table, shown
-from shiftsim.report.writers import latex_escape, markdown_escape, render
+from shiftsim.report.words import LONG
+from shiftsim.report.writers import FORMATS, latex_escape, markdown_escape, render
 from shiftsim.runs.diff import diff_lines, diff_runs
 from shiftsim.runs.results import open_run
 
@@ -271,7 +274,8 @@ def test_html_prints_names_as_they_are():
 
 
 def test_markdown_keeps_its_columns():
-    line = render(hostile_table(), "md").splitlines()[-3]
+    lines = render(hostile_table(), "md").splitlines()
+    (*_, line) = (line for line in lines if line.startswith("|"))
     assert line.replace(r"\|", "").count("|") == 3
     assert markdown_escape("a_b\nc") == r"a\_b c"
 
@@ -318,13 +322,48 @@ def test_a_report_is_a_folder_with_a_file_per_format(tmp_path):
     groups = read_groups([run])
     kinds = tuple(name for name in TABLES if "data" not in name and "benchmark" not in name)
     tables = make_tables(groups, published(), Options(tables=kinds))
-    files = write_report(tmp_path / "out", tables, [], ("text", "md", "csv", "latex", "html"))
+    files = write_report(tmp_path / "out", "On <a>", [run], tables, [], FORMATS)
     names = {path.name for path in files}
     assert {"report.txt", "report.md", "report.tex", "report.html", "scores.csv"} <= names
+    assert "@misc{nuplan," in (tmp_path / "out" / CITED).read_text("utf-8")
     for ending in ("txt", "md", "tex", "html"):
         text = (tmp_path / "out" / f"report.{ending}").read_text("utf-8")
         assert "thresholds nuplan" in text
         assert "Noise robustness" in text
+        escaped = {"html": "On &lt;a&gt;", "md": r"# On \<a\>"}
+        assert escaped.get(ending, "On <a>") in text
+        assert "2026-01-02 03:04 UTC" in text
+        assert "shiftsim 9.8.7" in text
+        assert (CITED if ending == "tex" else "@misc{shiftsim,") in text
+
+
+def test_the_runs_table_says_when_from_what_and_with_which_versions(tmp_path):
+    weights = {"checkpoint": "1f" * 32, "weights": "own weights"}
+    run = write_run(tmp_path / "a", planners=("carl", "idm"), fingerprint=weights)
+    rows = {row[0]: row[1] for row in runs_table([run]).rows}
+    assert rows["date"] == "2026-01-02 03:04 UTC"
+    assert rows["store"] == "nowhere, 0123456789ab"
+    assert rows["weights"] == "carl: own weights; idm: own weights"
+    assert (rows["shiftsim"], rows["numpy"], rows["numba"]) == ("9.8.7 (abc)", "1.2", "0.3")
+    assert rows["rollouts finished"] == "8 of 8"
+
+
+def test_metrics_stand_in_one_order_with_their_words(tmp_path):
+    run = write_run(tmp_path / "a", noise=("none", "ou-low"))
+    order = [short for name, short in SHORT_NAMES.items() if name != "score"]
+    assert list(LONG) == ["CLS", *order]
+    assert [SHORT_NAMES[name] for name in (*MULTIPLIERS, *WEIGHTS)] == order
+    assert [name for name in run.scores.column_names if name in SHORT_NAMES] == METRICS
+    (shift,) = semantic_shift(read_groups([run]))
+    theirs = published_semantic(published())
+    for table in (scores(read_groups([run])), shift, theirs):
+        assert [name for name in table.header if name in order] == order
+        text = render(table, "text")
+        assert "no at-fault collision (NCR), drivable area (DAC), making progress (EMP)" in text
+        assert "<small>no at-fault collision</small> NCR" in render(table, "html")
+    first = next(iter(published().semantic_shift["NR"].items()))
+    row = cells(theirs, "NR", f"{first[0]} (published)")
+    assert row["NCR"] == f"{first[1][list(published().columns).index('NCR')]:.2f}"
 
 
 # --- durations

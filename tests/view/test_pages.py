@@ -13,7 +13,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.view.build import Choice, Gallery, list_page, page_name, write_site
+from shiftsim.view.build import Choice, Gallery, list_page, page_name, worst_table, write_site
 from shiftsim.view.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
 from shiftsim.view.scene import Shown
 from shiftsim.view.still import save_figure
@@ -98,8 +98,23 @@ def test_the_list_escapes_what_it_shows():
     page = list_page(HOSTILE, [row])
 
     assert "<script>alert" not in page
-    assert page.count("<script") == 2
+    assert page.count("<script") == 3  # rows, words of the metrics, the program
     assert json.loads(sections(page)["rows"])[0]["token"] == HOSTILE
+
+
+def test_the_worst_are_ten_in_words_and_without_markup_of_theirs():
+    row = {"token": HOSTILE, "type": HOSTILE, "planner": HOSTILE, "noise": "ou-low", "seed": 3}
+    row |= {"violated": {"NCR": 4.3, "PER": None}, "page": page_name(HOSTILE), "index": 1}
+    rows = [{**row, "cls": 1.0 - number / 100.0} for number in range(12)]
+
+    table = worst_table(rows)
+
+    assert "<script" not in table
+    assert table.count("<tr>") == 11
+    assert table.index(">89.00<") < table.index(">98.00<")
+    assert "at-fault collision 4.3 s, little progress" in table
+    assert f'href="{page_name(HOSTILE)}#t=4.30&amp;focus=2"' in table
+    assert worst_table(rows[:1]) == ""
 
 
 def test_a_page_needs_nothing_from_elsewhere(scenario):

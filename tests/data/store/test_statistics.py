@@ -5,14 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pictures import cut_off, overlaps, written
 from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.cli import main
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.statistics import scenario_stats, store_stats
+from shiftsim.data.store.statistics import PUBLISHED_SETS, scenario_stats, store_stats
 from shiftsim.errors import ConfigError
-from shiftsim.report.dataset import draw_stats, published_scenarios, stats_dict, stats_table
+from shiftsim.report.dataset import (
+    draw_stats,
+    published_scenarios,
+    stats_dict,
+    stats_figure,
+    stats_table,
+)
 from shiftsim.world.state import AgentKind
 
 
@@ -120,6 +127,22 @@ def test_the_picture_is_drawn_the_same_again(store, tmp_path):
     assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(ConfigError, match="not supported"):
         draw_stats(found, tmp_path / "one.bmpx", title="toy")
+
+
+def test_the_picture_shows_published_sets_beside_ours_and_labels_all_axes(store):
+    found = store_stats(store)
+    cities = ["Berlin", "San Francisco", "a", "Sindelfingen"]
+    found = replace(found, cities=dict(zip(found.rows, cities, strict=True)))
+    figure = stats_figure(found, title="toy: 4 scenarios")
+    sets, counts, *others = figure.axes
+    assert [bar.get_width() for bar in sets.patches] == [4, *PUBLISHED_SETS.values()]
+    assert sorted(bar.get_width() for bar in counts.patches) == [1, 1, 1, 1, 101, 180, 490]
+    assert all(axes.get_xlabel() for axes in figure.axes)
+    assert "m/s" in others[-1].get_xlabel()
+    words = [text for text, _ in written(figure)]
+    assert {"this store", "DeepPlan (published)", "San Francisco", "all", "bicycles"} <= {*words}
+    assert overlaps(figure) == []
+    assert cut_off(figure) == []
 
 
 def test_commands_print_write_and_leave_out_what_was_dropped(store, tmp_path, capsys):

@@ -1,0 +1,214 @@
+"""The parts of a still or a film: map, driven paths, boxes, violations, and where words find room.
+
+Planners and noise look as in all pictures (`report/palette.py`): a disturbed rollout has a dashed
+path, and a hollow box.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
+from shiftsim.sim.log import SimulationLog
+from shiftsim.view.scene import Shown, map_lines, violations
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import PACIFICA, AgentKind, center_poses
+
+SMALL = 8  # points, of most words
+_LAYERS = {  # what is drawn first lies below
+    "walkway": "#ece6d8",
+    "drivable": "#dcdcd8",
+    "route": "#b9d2be",
+    "crosswalk": "#f7f4ea",
+}
+_EVERY = 50  # samples from mark to mark
+_EDGE = "#30363c"
+# where a label may stand: which way from its mark, and what part of it lies left of and below that
+_AROUND = {
+    (0.8, 0.6): (0.0, 0.0),
+    (-0.8, 0.6): (-1.0, 0.0),
+    (0.8, -0.6): (0.0, -1.0),
+    (-0.8, -0.6): (-1.0, -1.0),
+    (1.0, 0.0): (0.0, -0.5),
+    (-1.0, 0.0): (-1.0, -0.5),
+    (0.0, 1.0): (-0.5, 0.0),
+    (0.0, -1.0): (-0.5, -1.0),
+}
+_AWAY = (8.0, 22.0, 40.0, 62.0, 90.0)  # points
+
+
+def draw_map(axes: Any, road: VectorMap, route: Sequence[str], extent: FloatArray) -> None:
+    """Areas and boundaries of the map, and the route."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    layers = map_lines(road, route, extent)
+    for name, colour in _LAYERS.items():
+        if layers[name]:
+            outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
+            axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="none", zorder=1))
+    axes.add_collection(
+        LineCollection(layers["boundary"], colors="#a9a9a3", linewidths=0.5, zorder=1.5)
+    )
+
+
+def draw_scale(axes: Any, extent: FloatArray) -> None:
+    """A bar of a round length in the lower left corner."""
+    width = extent[2] - extent[0]
+    length = next(v for v in (100, 50, 20, 10, 5, 2, 1) if v <= max(width / 4.0, 1.0))
+    x, y = extent[0] + 0.04 * width, extent[1] + 0.04 * (extent[3] - extent[1])
+    axes.plot([x, x + length], [y, y], color="black", linewidth=2, zorder=9)
+    box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.0}
+    place = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+    axes.annotate(f"{length} m", (x + length / 2.0, y), fontsize=SMALL, bbox=box, zorder=9, **place)
+
+
+def draw_paths(axes: Any, shown: Sequence[Shown], styles: Mapping[str, Style]) -> None:
+    """The recorded driver's path, and those of the rollouts with what a legend says of them."""
+    draw_recorded(axes, shown[0].log)
+    for number, item in enumerate(shown):
+        ego, style = item.log.ego, styles[item.planner]
+        every = (min(10 + number * _EVERY // len(shown), len(ego) - 1), _EVERY)
+        look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
+        look |= style.marks(item.noise, 5.5)
+        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item), **look)
+
+
+def draw_recorded(axes: Any, log: SimulationLog) -> None:
+    """The recorded driver's path."""
+    dotted = {"color": RECORDED, "linewidth": 1.1, "linestyle": ":", "zorder": 6.5}
+    axes.plot(log.expert_ego[:, 0], log.expert_ego[:, 1], label="recorded driver", **dotted)
+
+
+def caption(item: Shown) -> str:
+    """Planner, noise, score, and what cost most of it."""
+    name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
+    score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
+    found = gravest(item)
+    return f"{name}{score}; {told(found)}" if found else f"{name}{score}"
+
+
+def told(found: Mapping[str, Any]) -> str:
+    """What was violated and when, as "at-fault collision (NCR), pedestrian 17, … at 4.3 s"."""
+    what, comma, more = found["words"].partition(",")
+    return f"{what} ({found['short']}){comma}{more} at {found['t']:.1f} s"
+
+
+def gravest(item: Shown) -> dict[str, Any] | None:
+    """The violation that cost most: the first of a multiplier, else the first."""
+    found = violations(item)
+    return next((one for one in found if one["multiplier"]), found[0] if found else None)
+
+
+class Mark(NamedTuple):
+    """A violation that is marked."""
+
+    time: float  # when it began [s from the start]
+    cross: Any  # the mark
+    label: Any  # its words
+
+
+def draw_violation(axes: Any, item: Shown, style: Style, words: str = "words") -> Mark | None:
+    """A cross where the gravest violation began, and what it was: `words`, or `short`."""
+    found = gravest(item)
+    if found is None:
+        return None
+    time_us = item.log.time_us
+    row = int(np.searchsorted(time_us, time_us[0] + found["t"] * 1e6 - 1.0))
+    place = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
+    look = {"linestyle": "none", "marker": "x", "markersize": 8, "markeredgewidth": 2.2}
+    (cross,) = axes.plot(*place[:, None], color=ALARM, zorder=9, **look)
+    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": style.colour, "lw": 0.9}
+    leader = {"arrowstyle": "-", "color": style.colour, "lw": 0.8, "shrinkA": 0, "shrinkB": 4}
+    label = axes.annotate(
+        found[words],
+        place,
+        xytext=(6, 6),
+        textcoords="offset points",
+        fontsize=SMALL - 1,
+        bbox=box,
+        arrowprops=leader,
+        zorder=10,
+    )
+    return Mark(found["t"], cross, label)
+
+
+def draw_boxes(
+    axes: Any, shown: Sequence[Shown], row: int, styles: Mapping[str, Style]
+) -> list[Any]:
+    """All that moves, at one sample: the others, and the egos of the rollouts."""
+    drawn = draw_others(axes, shown[0].log, row)
+    for item in shown:
+        is_clean = item.noise == "none"
+        drawn += draw_ego(axes, item.log, row, styles[item.planner].colour, filled=is_clean)
+    return drawn
+
+
+def draw_ego(
+    axes: Any, log: SimulationLog, row: int, colour: str, *, filled: bool = True
+) -> list[Any]:
+    """The ego's box at one sample; hollow and dashed when it is disturbed."""
+    pose, size = center_poses(log.ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
+    hollow: dict[str, Any] = {"facecolors": "#ffffffd0", "edgecolors": colour, "linewidths": 1.6}
+    look = {"facecolors": colour} if filled else {**hollow, "linestyles": [(0, (2.2, 1.0))]}
+    return _boxes(axes, pose, np.array(size), zorder=7, **look)
+
+
+def draw_others(axes: Any, log: SimulationLog, row: int) -> list[Any]:
+    """The tracks at one sample."""
+    tracks = log.tracks
+    drawn: list[Any] = []
+    for kind in np.unique(tracks.kinds):
+        there = tracks.valid[row] & (tracks.kinds == kind)
+        colour = AGENTS.get(AgentKind(int(kind)), OTHER_AGENT)
+        drawn += _boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], facecolors=colour)
+    return drawn
+
+
+def _boxes(
+    axes: Any, poses: FloatArray, sizes: FloatArray, *, zorder: float = 3.0, **look: Any
+) -> list[Any]:
+    """(N, 3) centre poses and (N, 2) lengths and widths as boxes."""
+    from matplotlib.collections import PolyCollection
+
+    if not len(poses):
+        return []
+    look = {"edgecolors": _EDGE, "linewidths": 0.6, **look}
+    boxes = PolyCollection(list(boxes_to_corners(poses, sizes)), zorder=zorder, **look)
+    return [axes.add_collection(boxes, autolim=False)]
+
+
+def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
+    """Move the labels of marks to where they cover neither one another nor marks nor paths.
+
+    Each takes the best of some places around its mark, the nearest one where several are as good.
+    """
+    from matplotlib.transforms import Bbox
+
+    figure.draw_without_rendering()
+    renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
+    unit = figure.dpi / 72.0  # pixels per point
+    paths = axes.transData.transform(np.concatenate([line.get_xydata() for line in axes.lines]))
+    taken = [mark.cross.get_window_extent(renderer).padded(6.0 * unit) for mark in marks]
+
+    def cost(spot: Any) -> float:
+        inside = Bbox.intersection(spot, frame)
+        cut = 1.0 - (inside.width * inside.height / (spot.width * spot.height) if inside else 0.0)
+        covered = min(spot.count_contains(paths) / 20.0, 0.9)
+        return float(sum(map(spot.overlaps, taken)) + 9.0 * cut + covered)
+
+    for mark in marks:
+        box = mark.label.get_bbox_patch().get_window_extent(renderer)
+        x, y = axes.transData.transform(mark.label.xy)
+        corners = [
+            (x + away * unit * cos + side * box.width, y + away * unit * sin + level * box.height)
+            for away in _AWAY
+            for (cos, sin), (side, level) in _AROUND.items()
+        ]
+        best = min((Bbox.from_bounds(*at, box.width, box.height) for at in corners), key=cost)
+        mark.label.set_position(((best.x0 - x) / unit, (best.y0 - y) / unit))
+        taken.append(best.padded(2.0 * unit))

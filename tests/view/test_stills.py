@@ -1,0 +1,124 @@
+"""Stills, grids and films: what is marked, what is said, and that it can be read."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pictures import cut_off, overlaps, written
+from worlds import cruise_scenario, standing_tracks
+
+from shiftsim.planners.registry import load_planner
+from shiftsim.report.palette import ALARM, RECORDED, planner_styles
+from shiftsim.sim.loop import simulate
+from shiftsim.view.scene import Shown
+from shiftsim.view.still import grid, overview, save_figure, still
+from shiftsim.world.state import AgentKind
+
+pytest.importorskip("matplotlib")
+COLLISION = {
+    "metric": "no_ego_at_fault_collisions",
+    "score": 0.0,
+    "unit": "count",
+    "threshold": 0.0,
+    "first_violation_s": 2.0,
+    "first_violation_value": 3.14,
+}
+SAID = "at-fault collision, pedestrian agent-1, Δv 3.1 m/s"
+IN_FULL = "at-fault collision (NCR), pedestrian agent-1, Δv 3.1 m/s at 2.0 s"
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    bare = cruise_scenario(iterations=41)
+    poses = np.array([[40.0, 3.5, 0.1], [25.0, -4.0, 1.0]])
+    kinds = [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
+    return replace(bare, tracks=standing_tracks(len(bare.time_us), poses, kinds))
+
+
+@pytest.fixture(scope="module")
+def shown(scenario):
+    """Three planners, clean and disturbed; every second one hits a pedestrian."""
+    hit = [{**COLLISION, "partner_token": scenario.tracks.tokens[1]}]
+    out = []
+    for planner in ("constant-velocity", "log-future", "idm"):
+        for noise in ("none", "ou-high"):
+            log = simulate(scenario, load_planner("constant-velocity"), noise=noise)
+            metrics = hit if noise != "none" else []
+            out.append(Shown(planner, noise, 0, log, 0.0 if metrics else 0.87, metrics))
+    return out
+
+
+def said(scenario, text):
+    return text.replace("agent-1", scenario.tracks.tokens[1])
+
+
+def test_a_still_says_planner_noise_score_and_metric_in_words(scenario, shown):
+    words = " ".join(text for text, _ in written(still(scenario, shown, at=1.0)))
+    plain = " ".join(words.split())
+    assert "idm: score 87" in plain
+    assert said(scenario, f"idm, ou-high: score 0; {IN_FULL}") in plain
+    assert plain.count(said(scenario, SAID)) == 3
+
+
+def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
+    for figure in (
+        still(scenario, shown, at=1.0),
+        still(scenario, shown[:1], at=0.0),
+        still(scenario, [replace(shown[1], planner="my_package.my_module:MyPlanner")], at=0.0),
+        grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]),
+        overview(scenario),
+        overview(scenario.map),
+    ):
+        assert overlaps(figure) == []
+        assert cut_off(figure) == []
+
+
+def test_the_scene_fills_most_of_a_still(scenario, shown):
+    figure = still(scenario, shown[:2], at=1.0)
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    frame = axes.get_window_extent()
+    assert frame.width * frame.height > 0.6 * figure.bbox.width * figure.bbox.height
+
+
+def test_noise_and_the_recorded_driver_look_the_same_in_every_picture(scenario, shown):
+    colour = planner_styles(item.planner for item in shown)["idm"].colour
+    for figure in (still(scenario, shown, at=1.0), grid(scenario, shown, at=[1.0, 2.0])):
+        lines = [line for axes in figure.axes for line in axes.lines]
+        mine = {
+            (x.get_linestyle(), x.get_markerfacecolor()) for x in lines if x.get_color() == colour
+        }
+        assert mine == {("-", colour), ("--", "white")}
+        dotted = {line.get_color() for line in lines if line.get_linestyle() == ":"}
+        assert dotted == {RECORDED}
+
+
+def test_the_ego_under_noise_is_hollow(scenario, shown):
+    from matplotlib.colors import to_hex
+
+    colour = planner_styles(["idm"])["idm"].colour
+    faces = []
+    for item in shown[-2:]:
+        (axes,) = still(scenario, [item], at=1.0).axes
+        faces.append({to_hex(box.get_facecolor()[0]) for box in axes.collections[1:]})
+    assert colour in faces[0]
+    assert colour not in faces[1]
+    assert "#ffffff" in faces[1]
+
+
+def test_a_film_marks_a_violation_from_its_first_moment_on(scenario, shown, tmp_path, monkeypatch):
+    from matplotlib.animation import PillowWriter
+
+    seen = []
+
+    def look(writer, **settings):
+        (axes,) = writer.fig.axes
+        crosses = [line for line in axes.lines if line.get_color() == ALARM]
+        words = [text for text in axes.texts if text.get_text() == said(scenario, SAID)]
+        seen.append([artist.get_visible() for artist in (*crosses, *words)])
+        assert overlaps(writer.fig) == []
+
+    monkeypatch.setattr(PillowWriter, "grab_frame", look)
+    monkeypatch.setattr(PillowWriter, "finish", lambda writer: None)
+    save_figure(tmp_path / "film.gif", scenario, shown)
+    assert seen == [[False] * 6] * 20 + [[True] * 6] * (len(shown[0].log.time_us) - 20)
