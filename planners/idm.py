@@ -10,21 +10,17 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.boxes import box_corners, boxes_to_corners, circle_around, wrap_angle
-from shiftsim.geometry.polylines import (
-    CLEAR,
-    HIT,
-    OPEN,
-    RUN,
-    Path,
-    Stretch,
-    bound_runs,
-    corridor_polygon,
-    pose_at,
-    side_of,
-    without_repeats,
+from shiftsim.geometry.boxes import box_corners, boxes_to_corners, wrap_angle
+from shiftsim.geometry.polylines import CLEAR, HIT, OPEN, Path, corridor_polygon, pose_at
+from shiftsim.planners.routes.corridor import (
+    UNKNOWN,
+    Objects,
+    Survey,
+    find_lead,
+    find_sides,
+    make_survey,
+    start_survey,
 )
-from shiftsim.geometry.rings import point_segment_distance, rings_touch
 from shiftsim.planners.routes.graph import (
     HINT,
     LanePath,
@@ -32,10 +28,10 @@ from shiftsim.planners.routes.graph import (
     lane_at,
     lane_path,
     lanes_of,
-    red_lanes,
     search_levels,
     sub_path,
 )
+from shiftsim.planners.routes.lights import LightWatch, RedLights
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import NONE, VectorMap
@@ -54,7 +50,6 @@ STEP_US = 500_000
 HORIZON = STEPS * STEP  # s
 RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
 _EGO_TOKEN = "ego_token"
-UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet
 
 
 def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
@@ -123,95 +118,18 @@ def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
     return path
 
 
-class Objects(NamedTuple):
-    """Polygons around the ego. M objects."""
-
-    xy: FloatArray  # (V, 2) vertices of all rings, not closed [m]
-    ptr: IntArray  # (M + 1,) first vertex of each ring
-    circles: FloatArray  # (M, 3) x, y, radius of a circle around each ring [m]
-    headings: FloatArray  # (M,) heading, 0 for a red light [rad]
-    speeds: FloatArray  # (M,) speed, 0 for static objects and red lights [m/s]
-
-
-@kernel
-def find_sides(
-    line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, out: IntArray
-) -> None:
-    """Decide which objects touch the corridor, as far as distances can.
-
-    The corridor is the stretch of path (K, 2) or (K, 3), buffered by `half_width` [m], and the
-    `footprint` (4, 2) of the ego. CLEAR, HIT or OPEN is written to `out` (M,) where UNKNOWN stands.
-    """
-    runs = np.empty(((len(line) - 2) // RUN + 1, 4))
-    bound_runs(line, runs)
-    begin, end = without_repeats(line, 0, len(line))
-    stretch = Stretch(line, runs, begin, end, half_width)
-    ego_x, ego_y, reach = circle_around(footprint)
-    for index in range(len(out)):
-        if out[index] != UNKNOWN:
-            continue
-        ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
-        x, y, radius = objects.circles[index]
-        if np.hypot(x - ego_x, y - ego_y) <= radius + reach and rings_touch(ring, footprint):
-            out[index] = HIT
-        else:
-            out[index] = side_of(stretch, ring, x, y, radius)
-
-
 def exact_side(
     line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, index: int
 ) -> int:
-    """The side of an OPEN object, by the polygon nuPlan uses; arguments as for `find_sides`."""
+    """The side of an OPEN object, by the polygon nuPlan uses.
+
+    The corridor is the stretch of path (K, 3), buffered by `half_width` [m], and the `footprint`
+    (4, 2) of the ego.
+    """
     corridor = corridor_polygon(shapely.LineString(line[:, :2]), half_width)
     corridor = corridor.union(shapely.Polygon(footprint))
     ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
     return HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR
-
-
-@lean_kernel
-def find_lead(footprint: FloatArray, objects: Objects, sides: IntArray) -> tuple[int, float]:
-    """The object nearest to the footprint (4, 2) and its gap [m]; (-1, inf) if all are CLEAR.
-
-    It may be OPEN; those farther away need not be decided.
-    """
-    found, best, best_gap = -1, np.inf, np.inf
-    for index in range(len(sides)):
-        if sides[index] != CLEAR:
-            ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
-            distance, gap = _ring_gap(footprint, ring)
-            if distance < best:
-                found, best, best_gap = index, distance, gap
-    return found, best_gap
-
-
-@lean_kernel
-def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """Distance between two rings, and the same measured between their nearest points [m]."""
-    # nuPlan rule 154: the gap is the latter, and the nearest point on an edge is rounded to what a
-    # coordinate in UTM can hold; hence not `ring_distance`
-    if rings_touch(a, b):
-        return 0.0, 0.0
-    best, gap = np.inf, np.inf
-    for swap in range(2):
-        points, ring = (a, b) if swap == 0 else (b, a)
-        for i in range(len(points)):
-            for j in range(len(ring)):
-                p, c, d = points[i], ring[j - 1], ring[j]
-                distance = point_segment_distance(p[0], p[1], c[0], c[1], d[0], d[1])
-                if distance < best:
-                    best, gap = distance, _gap_to_edge(p, c, d)
-    return best, gap
-
-
-@lean_kernel
-def _gap_to_edge(p: FloatArray, a: FloatArray, b: FloatArray) -> float:
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    square = dx * dx + dy * dy
-    along = ((p[0] - a[0]) * dx + (p[1] - a[1]) * dy) / square if square > 0.0 else 0.0
-    along = min(max(along, 0.0), 1.0)
-    x = b[0] if along == 1.0 else a[0] + along * dx
-    y = b[1] if along == 1.0 else a[1] + along * dy
-    return np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2)
 
 
 class Policy(NamedTuple):
@@ -253,7 +171,7 @@ class Idm:
         self._limits = (min_gap, headway, accel_max, decel_max)
         self._scene: SceneInfo | None = None
         self._blocks: list[int] = []
-        self._route_lanes: set[int] = set()
+        self._lights: LightWatch | None = None
         self.route_plan: Search | None = None
         self.path: LanePath | None = None
         self.target_velocity = target_velocity
@@ -266,7 +184,7 @@ class Idm:
         """
         self._scene = scene
         self._blocks = route_blocks(scene.map, scene.route, scene.token)
-        self._route_lanes = set(lanes_of(scene.map, self._blocks))
+        self._lights = LightWatch(scene.map, lanes_of(scene.map, self._blocks))
         self.route_plan = self.path = None
 
     def plan(self, observation: Observation) -> Trajectory:
@@ -280,7 +198,7 @@ class Idm:
     def roll_out(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
         """Box centres (17, 3) x [m], y [m], heading [rad] and speeds (17,) [m/s] of the plan."""
         scene = self._scene
-        if scene is None:
+        if scene is None or self._lights is None:
             raise PlannerError("idm: plan() was called before reset()")
         ego = observation.ego
         path = self.path or self._make_path(scene, observation)
@@ -291,11 +209,15 @@ class Idm:
         centers[0] = ego.center
         start = path.project(centers[0, 0], centers[0, 1])
         motion[0] = start, ego.values[VX]
-        objects = self._objects(scene, observation)
-        sides = np.full((STEPS, len(objects.speeds)), UNKNOWN)
+        objects = objects_around(observation, self._lights.at(observation.lights))
+        count = len(objects.speeds)
+        survey = make_survey(path.driven, 0.5 * policy.width, count)
+        sides = np.full((STEPS, count), UNKNOWN)
         step = 0
         while True:
-            step, lead = _roll_on(step, path.driven, objects, policy, centers, motion, sides)
+            step, lead = _roll_on(
+                step, path.driven, objects, policy, centers, motion, survey, sides
+            )
             if lead < 0:
                 break
             line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
@@ -323,45 +245,39 @@ class Idm:
             )
         return self.path
 
-    def _objects(self, scene: SceneInfo, observation: Observation) -> Objects:
-        """Objects around the ego, and the red lights of the route."""
-        tracks, center = observation.history.tracks, observation.ego.center
-        poses, sizes = tracks.poses[-1], tracks.sizes[-1]
-        distance = np.hypot(poses[:, 0] - center[0], poses[:, 1] - center[1])
-        near = np.flatnonzero(tracks.valid[-1] & (distance < RADIUS))
-        # nuPlan rule 157: whatever has a part of "ego_token" for a token is overlooked
+
+def objects_around(observation: Observation, red: RedLights) -> Objects:
+    """What the ego sees around it, then red lights."""
+    tracks, center = observation.history.tracks, observation.ego.center
+    poses, sizes = tracks.poses[-1], tracks.sizes[-1]
+    distance = np.hypot(poses[:, 0] - center[0], poses[:, 1] - center[1])
+    near = np.flatnonzero(tracks.valid[-1] & (distance < RADIUS))
+    # nuPlan rule 157: whatever has a part of "ego_token" for a token is overlooked
+    if any(tracks.tokens[i] in _EGO_TOKEN for i in near.tolist()):
         near = near[[tracks.tokens[i] not in _EGO_TOKEN for i in near.tolist()]]
-        is_agent = tracks.kinds[near] <= LAST_AGENT_KIND
-        velocities = tracks.velocities[-1, near]
-        speeds = np.where(is_agent, np.hypot(velocities[:, 0], velocities[:, 1]), 0.0)
-        lanes = scene.map.edges
-        red = [i for i in red_lanes(scene.map, observation.lights) if i in self._route_lanes]
-        lights = [lanes.rings(lane)[0] for lane in red]
-        rings = [*boxes_to_corners(poses[near], sizes[near]), *lights]
-        radii = 0.5 * np.hypot(sizes[near, 0], sizes[near, 1])
-        circles = [np.column_stack([poses[near, :2], radii]), *map(_circle, lights)]
-        nothing = np.zeros(len(lights))
-        return Objects(
-            np.concatenate([np.zeros((0, 2)), *rings]),
-            np.cumsum([0, *map(len, rings)]),
-            np.concatenate(circles),
-            np.concatenate([poses[near, 2], nothing]),
-            np.concatenate([speeds, nothing]),
-        )
+    poses, sizes, velocities = poses[near], sizes[near], tracks.velocities[-1, near]
+    speeds = np.hypot(velocities[:, 0], velocities[:, 1])
+    speeds[tracks.kinds[near] > LAST_AGENT_KIND] = 0.0
+    count, nothing = len(near), np.zeros(len(red.lanes))
+    return Objects(
+        np.concatenate([boxes_to_corners(poses, sizes).reshape(-1, 2), red.xy]),
+        np.concatenate([4 * np.arange(count), 4 * count + red.ptr]),
+        np.concatenate([poses[:, 2], nothing]),
+        np.concatenate([speeds, nothing]),
+    )
 
 
-def _circle(ring: FloatArray) -> FloatArray:
-    middle = 0.5 * (ring.min(axis=0) + ring.max(axis=0))
-    radius = np.hypot(ring[:, 0] - middle[0], ring[:, 1] - middle[1]).max()
-    return np.array([[middle[0], middle[1], radius]])
-
-
-@kernel
 def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
     """(K, 3) the stretch of path that the ego would cover at its target velocity."""
+    stretch: FloatArray = sub_path(path, *_reach(path, progress, target))
+    return stretch
+
+
+@lean_kernel
+def _reach(path: Path, progress: float, target: float) -> tuple[float, float]:
+    """Progress at the start and at the end of the stretch that would be covered [m]."""
     end = path.progress[-1]
-    low = min(max(progress, 0.0), end)
-    return sub_path(path, low, min(max(progress + abs(target) * HORIZON, 0.0), end))
+    return min(max(progress, 0.0), end), min(max(progress + abs(target) * HORIZON, 0.0), end)
 
 
 @kernel
@@ -378,6 +294,7 @@ def _roll_on(
     policy: Policy,
     centers: FloatArray,  # (17, 3) box centres x [m], y [m], heading [rad]
     motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
+    survey: Survey,
     sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
 ) -> tuple[int, int]:
     """Fill the rows behind `first` until the end, or until an OPEN object would be the lead.
@@ -386,15 +303,17 @@ def _roll_on(
         The row and the object to decide, or -1 for the object at the end.
     """
     length, width, target, min_gap, headway, accel_max, decel_max = policy
-    footprint = np.empty((4, 2))
+    footprint, ends = np.empty((4, 2)), np.empty((4, 2))
+    if first == 0:
+        start_survey(survey, path, objects, motion[0, 0] + STEP * min(motion[0, 1], 0.0))
     for step in range(first, STEPS):
         x, y, heading = centers[step, 0], centers[step, 1], centers[step, 2]
         progress, speed = motion[step, 0], motion[step, 1]
         box_corners(x, y, heading, length, width, footprint)
-        line = _look_ahead(path, progress, target)
-        find_sides(line, 0.5 * width, footprint, objects, sides[step])
+        low, high = _reach(path, progress, target)
+        find_sides(path, low, high, footprint, objects, survey, ends, sides[step])
         # nuPlan rule 158: all objects stand still during the roll-out; their speeds count only here
-        lead, gap = find_lead(footprint, objects, sides[step])
+        lead, gap = find_lead(footprint, objects, survey.bounds, sides[step])
         lead_speed = 0.0
         if lead < 0:
             gap = path.progress[-1] - progress - 0.5 * length

@@ -19,7 +19,7 @@ from shiftsim.data.deepplan.windows import ROW_S
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks, TrafficLights
+from shiftsim.world.state import AgentKind, LightStatus, Tracks, TrafficLights
 
 _NODES = 26  # junctions along each axis: 2600 roadblocks of two lanes
 _SPACING, _HALF = 72.0, 15.0  # m between junctions, m from a junction's middle to its streets
@@ -30,6 +30,9 @@ _LIMIT = 13.9  # m/s
 _HEADINGS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # east, north, west, south
 _SPAN = (3.0, 15.0, 8.0)  # s of history, scenario and future
 _RADIUS = 50.0  # m around the ego in which agents start
+_LIGHTS_RADIUS = 150.0  # m around the ego in which lights are listed
+_LIGHTS_SECONDS = 10.0  # s for which lights stay as they are
+_FEW, _MANY = 11, 75  # points of a connector's border
 _ROUTE = ("right", "straight", "left", "right", "straight")
 _TURNS = {"right": -1, "straight": 0, "left": 1}
 _LANES_OF = {"straight": (0, 1), "left": (0,), "right": (1,)}  # lanes that turn, left first
@@ -83,14 +86,15 @@ class _City:
     lines: dict[str, FloatArray] = field(default_factory=dict)
 
 
-def bench_scene(num_agents: int, seed: int) -> Scenario:
+def bench_scene(num_agents: int, seed: int, *, lights: bool = False) -> Scenario:
     """A 15 s scenario in a city of 5200 lanes, with 3 s of history and 8 s of future.
 
     Vehicles, pedestrians, bicycles and objects start within 50 m of the ego, as the seed wants; the
-    city and the ego are always the same.
+    city and the ego are always the same. With `lights` they hang at every junction, those the ego
+    drives up to are red, and connectors have the many vertices (150) of a real map's.
     """
     city = _city()
-    road = _map(city)
+    road = _map(city, lights)
     path, route = _ego_path(city)
     rows = round(sum(_SPAN) / ROW_S) + 1
     ego = _drive(path, rows)
@@ -106,7 +110,9 @@ def bench_scene(num_agents: int, seed: int) -> Scenario:
         time_us=1_700_000_000_000_000 + np.arange(rows) * 50_000,
         ego=ego,
         tracks=_agents(num_agents, rng, ego, start, list(city.lines.values())),
-        traffic_lights=TrafficLights.empty(rows),
+        traffic_lights=(
+            _lights(city, ego[start, :2], rows) if lights else TrafficLights.empty(rows)
+        ),
         iteration_rows=iterations,
         row_step=2,
         route=route,
@@ -127,8 +133,22 @@ def _city() -> _City:
     return _City(streets, turns)
 
 
-def _map(city: _City) -> VectorMap:
+def _lights(city: _City, here: FloatArray, rows: int) -> TrafficLights:
+    """Lights of the junctions around a point: red along one axis and green along the other."""
+    names, axes = [], []
+    for number, (street, turn) in enumerate(city.turns):
+        if np.hypot(*(_middle(street.end) - here)) < _LIGHTS_RADIUS:
+            names += [_connector(number, index) for index in _LANES_OF[turn]]
+            axes += [street.direction % 2] * len(_LANES_OF[turn])
+    phase = (np.arange(rows) * ROW_S // _LIGHTS_SECONDS).astype(np.int64)
+    is_red = np.array(axes) == phase[:, None] % 2
+    status = np.where(is_red, LightStatus.RED, LightStatus.GREEN).astype(np.int8)
+    return TrafficLights(tuple(names), status)
+
+
+def _map(city: _City, lights: bool) -> VectorMap:
     """The map; fills the baselines of the city."""
+    border = _MANY if lights else _FEW
     into: dict[str, list[str]] = defaultdict(list)  # connectors by the lane or block they lead to
     out_of: dict[str, list[str]] = defaultdict(list)
     edges: list[EdgeSpec] = []
@@ -140,9 +160,9 @@ def _map(city: _City) -> VectorMap:
         target, middle = city.streets[street.after(turn)], _middle(street.end)
         block, junction = str(20_000 + number), _junction(street.end)
         for index in _LANES_OF[turn]:
-            name = f"{200_000 + 2 * number + index}"
+            name = _connector(number, index)
             source, goal = street.lanes[index], target.lanes[index]
-            shape = _turn_shape(street.direction, turn, index)
+            shape = _turn_shape(street.direction, turn, index, border)
             city.lines[name] = shape.line + middle
             into[goal].append(name)
             out_of[source].append(name)
@@ -153,6 +173,7 @@ def _map(city: _City) -> VectorMap:
                     shape,
                     middle,
                     is_connector=True,
+                    has_traffic_lights=lights,
                     baseline=city.lines[name],
                     incoming=[source],
                     outgoing=[goal],
@@ -219,6 +240,10 @@ def _junction(node: tuple[int, ...]) -> str:
     return str(1_000 + node[0] * _NODES + node[1])
 
 
+def _connector(turn: int, index: int) -> str:
+    return f"{200_000 + 2 * turn + index}"
+
+
 def _middle(node: tuple[int, ...]) -> FloatArray:
     return _ORIGIN + _SPACING * np.array(node, np.float64)
 
@@ -240,10 +265,11 @@ def _lane_shape(direction: int, index: int | None) -> _Shape:
 
 
 @cache
-def _turn_shape(direction: int, turn: str, index: int | None) -> _Shape:
+def _turn_shape(direction: int, turn: str, index: int | None, border: int = _FEW) -> _Shape:
     """A connector from a street of some direction; without an index, the whole roadblock.
 
-    A quadratic Bezier curve through a junction, `offset` to the right of both streets.
+    A quadratic Bezier curve through a junction, `offset` to the right of both streets. Each of its
+    borders has `border` points.
     """
     center, share = _BLOCK_TURNS[turn] if index is None else (index + 0.5, 0.5)
     offset, half = center * _WIDTH, share * _WIDTH
@@ -252,13 +278,16 @@ def _turn_shape(direction: int, turn: str, index: int | None) -> _Shape:
     a = -_HALF * u + offset * _to_right(direction)
     b = _HALF * v + offset * _to_right(target)
     corner = 0.5 * (a + b) if turn == "straight" else a + u * ((b - a) @ u)
-    t = np.linspace(0.0, 1.0, 41)[:, None]
-    line = (1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b
-    tangent = 2 * (1 - t) * (corner - a) + 2 * t * (b - corner)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    every = slice(None, None, 4)
-    return _Shape(line, (line + half * normal)[every], (line - half * normal)[every])
+
+    def curve(points: int) -> tuple[FloatArray, FloatArray]:
+        t = np.linspace(0.0, 1.0, points)[:, None]
+        tangent = 2 * (1 - t) * (corner - a) + 2 * t * (b - corner)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        line = (1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b
+        return line, np.column_stack([-tangent[:, 1], tangent[:, 0]])
+
+    line, normal = curve(border)
+    return _Shape(curve(41)[0], line + half * normal, line - half * normal)
 
 
 def _ego_path(city: _City) -> tuple[FloatArray, tuple[str, ...]]:

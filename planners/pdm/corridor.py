@@ -97,16 +97,13 @@ def _fill(path: Path, corridor: Corridor, forecast: Forecast, first: int, last: 
                 and path.progress[begin] <= along <= path.progress[end - 1]
                 and distance <= (1.0 - BAND) * stretch.half_width
             )
-            side = HIT if is_inside else side_of(stretch, others.boxes[row, index], x, y, radius)
+            side = HIT if is_inside else side_of(stretch, others.boxes[row, index])
             sides[row, index], progress[row, index] = side, along
             is_open = is_open or side == OPEN
     for light in range(len(forecast.light_ptr) - 1):
         ring = forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
         x, y = centroid(ring)
-        radius = 0.0
-        for vertex in range(len(ring)):
-            radius = max(radius, np.hypot(ring[vertex, 0] - x, ring[vertex, 1] - y))
-        side = side_of(stretch, ring, x, y, radius)
+        side = side_of(stretch, ring)
         is_open = is_open or side == OPEN
         along = project(path, x, y, 0)[0]
         for row in range(first, last):

@@ -1,6 +1,5 @@
 """What PDM-Closed sees, and where it will be: boxes moved along their axes, red lights."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks
 from shiftsim.planners.proposals.contacts import Others, touches_boxes
 from shiftsim.planners.proposals.tracker import STEPS
+from shiftsim.planners.routes.lights import RedLights
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
 
 LIGHT_TOKEN = "red_light_"
@@ -29,6 +29,7 @@ class Forecast(NamedTuple):
     ignored: BoolArray
     light_xy: FloatArray  # (V, 2) vertices of the red connectors, not closed [m]
     light_ptr: IntArray  # (lights + 1,) first vertex of each
+    light_bounds: FloatArray  # (lights, 4) min x, min y, max x, max y of each [m]
 
 
 def select_tracks(
@@ -57,11 +58,11 @@ def select_tracks(
     return np.concatenate(parts)
 
 
-def make_forecast(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray]) -> Forecast:
-    """From tracks of the last row and rings (V, 2) of red connectors; none ignored."""
+def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Forecast:
+    """From tracks of the last row and red lights; none ignored."""
     count = len(chosen)
     shape = (NUM_FORECASTS, count)
-    ignored = np.zeros(count + len(lights), np.bool_)
+    ignored = np.zeros(count + len(lights.bounds), np.bool_)
     is_agent = tracks.kinds[chosen] <= LAST_AGENT_KIND
     others = Others(
         boxes=np.empty((*shape, 4, 2)),
@@ -78,8 +79,9 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: Sequence[FloatArray]
         np.empty(count, np.bool_),
         np.ascontiguousarray(poses[:, 2]),
         ignored,
-        np.concatenate([np.zeros((0, 2)), *lights]),
-        np.cumsum([0, *(len(ring) for ring in lights)]),
+        lights.xy,
+        lights.ptr,
+        lights.bounds,
     )
     _forecast(poses, tracks.velocities[-1, chosen], tracks.sizes[-1, chosen], made)
     return made
@@ -123,10 +125,11 @@ def touched(forecast: Forecast, footprint: FloatArray) -> list[int]:
     """
     boxes = forecast.others.boxes[0]
     chosen = np.flatnonzero(touches_boxes(footprint, boxes)).tolist()
-    lights = range(len(boxes), len(forecast.ignored))
-    if lights:
-        ego = shapely.Polygon(footprint)
-        chosen += [i for i in lights if ego.within(shapely.Polygon(ring_of(forecast, i)))]
+    low, high, bounds = footprint.min(axis=0), footprint.max(axis=0), forecast.light_bounds
+    around = (bounds[:, :2] <= low).all(axis=1) & (bounds[:, 2:] >= high).all(axis=1)
+    for index in (np.flatnonzero(around) + len(boxes)).tolist():
+        if shapely.Polygon(footprint).within(shapely.Polygon(ring_of(forecast, index))):
+            chosen.append(index)
     if len(chosen) > 1:
         ranks = forecast_ranks(forecast, 0)
         chosen.sort(key=lambda i: int(ranks[i]))
@@ -146,8 +149,4 @@ def forecast_ranks(forecast: Forecast, row: int) -> IntArray:
     """(M,) place of each box and light among the results of nuPlan's index of a forecast map."""
     boxes = forecast.others.boxes[row]
     bounds = np.hstack([boxes.min(axis=1), boxes.max(axis=1)])
-    if len(forecast.light_ptr) > 1:
-        starts, xy = forecast.light_ptr[:-1], forecast.light_xy
-        lights = np.hstack([np.minimum.reduceat(xy, starts), np.maximum.reduceat(xy, starts)])
-        bounds = np.concatenate([bounds, lights])
-    return index_ranks(bounds)
+    return index_ranks(np.concatenate([bounds, forecast.light_bounds]))

@@ -30,7 +30,8 @@ from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import known_blocks
-from shiftsim.planners.routes.graph import centerline, red_lanes
+from shiftsim.planners.routes.graph import centerline
+from shiftsim.planners.routes.lights import LightWatch
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import NUM_STATE, Trajectory
@@ -84,6 +85,7 @@ class PdmClosed:
         )
         self._scene: SceneInfo | None = None
         self._paths: list[Path] = []
+        self._lights: LightWatch | None = None
         self.collided: list[str] = []
         self.route: Route | None = None
         self.centerline: FloatArray | None = None
@@ -98,7 +100,7 @@ class PdmClosed:
         known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
         self._paths, self.collided = [], []
-        self.route = self.centerline = self.seen = None
+        self.route = self.centerline = self.seen = self._lights = None
 
     def plan(self, observation: Observation) -> Trajectory:
         """81 poses, 0.1 s apart, without speeds."""
@@ -140,11 +142,12 @@ class PdmClosed:
         """What is around, and the tokens of tracks and red lights."""
         tracks, center = observation.history.tracks, observation.ego.center
         chosen = select_tracks(tracks, center[0], center[1], set(self.collided), self.parameters)
-        red = red_lanes(road, observation.lights)
-        red = [lane for lane in red if route.areas.on_route[lane]]
+        if self._lights is None:
+            self._lights = LightWatch(road, route.lanes.tolist())
+        red = self._lights.at(observation.lights)
         tokens = [tracks.tokens[i] for i in chosen.tolist()]
-        tokens += [LIGHT_TOKEN + road.edges.ids[i] for i in red]
-        return make_forecast(tracks, chosen, [road.edges.rings(i)[0] for i in red]), tokens
+        tokens += [LIGHT_TOKEN + road.edges.ids[i] for i in red.lanes]
+        return make_forecast(tracks, chosen, red), tokens
 
     def _follow(self, road: VectorMap, route: Route, lane: int) -> None:
         """Lay the centerline and the paths beside it, once per scenario."""

@@ -165,6 +165,7 @@ def _roll(
                         others.radii,
                         forecast.light_xy,
                         forecast.light_ptr,
+                        forecast.light_bounds,
                         ranks[row],
                     )
                     if found == _TIED:
@@ -192,6 +193,7 @@ def _nearest(
     radii: FloatArray,
     light_xy: FloatArray,
     light_ptr: IntArray,
+    light_bounds: FloatArray,
     ranks: IntArray,
 ) -> tuple[int, float]:
     """What is nearest to the footprint (4, 2) of all ahead, by rank on ties, and its distance [m].
@@ -206,6 +208,11 @@ def _nearest(
             continue
         light = index - len(radii)
         if light >= 0:
+            bounds = light_bounds[light]
+            apart_x = max(bounds[0] - x, x - bounds[2])
+            apart_y = max(bounds[1] - y, y - bounds[3])
+            if max(apart_x, apart_y) - radius > best:
+                continue
             ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
         else:
             ring, center = boxes[index], centers[index]
@@ -216,7 +223,8 @@ def _nearest(
             best, found, is_tied = distance, index, False
         elif distance == best:
             if ranks[index] < 0:
-                is_tied = True
+                # which of two lights it is makes no difference
+                is_tied = is_tied or light < 0 or found < len(radii)
             elif ranks[index] < ranks[found]:
                 found = index
     if is_tied:

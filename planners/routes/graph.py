@@ -20,7 +20,6 @@ from shiftsim.geometry.polylines import (
 from shiftsim.geometry.rings import ring_distance
 from shiftsim.world.layers import Polylines, contains
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.state import LightStatus, TrafficLights
 
 HINT = "correct the route of the scenario, or leave it out"  # of errors about routes
 SAME_POINT = 1e-8  # m, vertices closer than this are one
@@ -111,13 +110,6 @@ def _ancestry(parent: dict[int, int], lane: int) -> list[int]:
 def lanes_of(road: VectorMap, blocks: Iterable[int]) -> list[int]:
     """Lanes and connectors of blocks, in their order; blocks that are NONE are passed over."""
     return [e for block in blocks if block != NONE for e in road.block_edges.at(block).tolist()]
-
-
-def red_lanes(road: VectorMap, lights: TrafficLights) -> list[int]:
-    """Lanes and connectors of the map whose light is red in one row, in the order of the lights."""
-    # nuPlan rule 429: one red entry is enough, whatever else is listed
-    red = [name for name, status in lights.listed(0) if status == LightStatus.RED]
-    return [road.edges.index[name] for name in red if name in road.edges.index]
 
 
 @lean_kernel

@@ -15,10 +15,15 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.rings import point_segment_distance, ring_segment_distance, rings_touch
+from shiftsim.geometry.rings import (
+    SLACK,
+    point_segment_distance,
+    ring_bounds,
+    ring_segment_distance,
+    rings_touch,
+)
 
 RUN = 8  # segments per bounding box
-_SLACK = 1e-6  # m, more than rounding can change a distance by
 CLEAR, HIT, OPEN = 0, 1, 2
 # GEOS drops vertices of the line within 1 % of the radius, and its arcs (16 segments per quarter)
 # lie 0.1 % inside the circle; twice that is safe
@@ -179,10 +184,10 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     """
     num_runs = len(path.runs)
     guess = min(max(guess, 0), num_runs - 1)
-    bound = _project_on_run(path, guess, x, y)[0] + _SLACK
+    bound = _project_on_run(path, guess, x, y)[0] + SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        if not is_run_within(path.runs, run, x, y, min(bound, best + _SLACK)):
+        if not is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
             continue
         distance, progress = _project_on_run(path, run, x, y)
         if distance < best:
@@ -237,35 +242,68 @@ def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
 
 
 @lean_kernel
-def side_of(stretch: Stretch, ring: FloatArray, x: float, y: float, radius: float) -> int:
+def side_of(stretch: Stretch, ring: FloatArray) -> int:
     """CLEAR, HIT or OPEN: whether a ring (V, 2) touches the corridor of a stretch.
 
-    The ring lies in the circle x, y, `radius` [m]. The stretch ends `without_repeats`; OPEN where
-    it has a single vertex.
+    The stretch ends `without_repeats`; OPEN where it has a single vertex.
     """
     xy, begin, end = stretch.xy, stretch.begin, stretch.end
     if end - begin < 2:
         return OPEN
     inner, outer = (1.0 - BAND) * stretch.half_width, (1.0 + BAND) * stretch.half_width
-    nearest = np.inf
+    bounds = ring_bounds(ring)
+    nearest, starts_outside = np.inf, False
     for run in range(begin // RUN, (end - 2) // RUN + 1):
-        if not is_run_within(stretch.runs, run, x, y, radius + outer):
+        if not is_run_near(stretch.runs, run, bounds, outer):
+            starts_outside = False
             continue
         for index in range(max(begin, run * RUN), min(end - 1, (run + 1) * RUN)):
-            a, b = xy[index], xy[index + 1]
-            if point_segment_distance(x, y, a[0], a[1], b[0], b[1]) > radius + outer:
-                continue
-            nearest = min(nearest, ring_segment_distance(ring, a, b))
+            distance = ring_segment_distance(ring, xy[index], xy[index + 1], outer, starts_outside)
+            nearest, starts_outside = min(nearest, distance), True
             if nearest <= inner:
                 return HIT
-    # beyond the first and the last vertex the corridor goes on straight by half a width
-    is_open = nearest <= outer
-    for last, before in ((begin, begin + 1), (end - 1, end - 2)):
-        if np.hypot(x - xy[last, 0], y - xy[last, 1]) <= radius + 2.0 * outer:
-            if _touches_cap(xy[before], xy[last], inner, ring):
-                return HIT
-            is_open = is_open or _touches_cap(xy[before], xy[last], outer, ring)
-    return OPEN if is_open else CLEAR
+    first = side_of_cap(xy[begin + 1], xy[begin], stretch.half_width, ring, bounds)
+    last = side_of_cap(xy[end - 2], xy[end - 1], stretch.half_width, ring, bounds)
+    if first == HIT or last == HIT:
+        return HIT
+    return CLEAR if first == last == CLEAR and nearest > outer else OPEN
+
+
+@lean_kernel
+def is_run_near(
+    runs: FloatArray, run: int, bounds: tuple[float, float, float, float], reach: float
+) -> bool:
+    """Whether a run and what lies in `bounds` may come within `reach` [m] of one another."""
+    return (
+        runs[run, 0] <= bounds[2] + reach
+        and runs[run, 1] <= bounds[3] + reach
+        and runs[run, 2] >= bounds[0] - reach
+        and runs[run, 3] >= bounds[1] - reach
+    )
+
+
+@lean_kernel
+def side_of_cap(
+    a: FloatArray,
+    b: FloatArray,
+    half_width: float,
+    ring: FloatArray,
+    bounds: tuple[float, float, float, float],
+) -> int:
+    """As `side_of`, for the end of the corridor: beyond b it goes on straight by half a width.
+
+    Before b (2,) comes a (2,); `bounds` are those of the ring.
+    """
+    inner, outer = (1.0 - BAND) * half_width, (1.0 + BAND) * half_width
+    reach = 2.0 * outer  # more than to the corners
+    if not (
+        bounds[0] - reach <= b[0] <= bounds[2] + reach
+        and bounds[1] - reach <= b[1] <= bounds[3] + reach
+    ):
+        return CLEAR
+    if _touches_cap(a, b, inner, ring):
+        return HIT
+    return OPEN if _touches_cap(a, b, outer, ring) else CLEAR
 
 
 @kernel

@@ -14,6 +14,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 
 INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
+SLACK = 1e-6  # m, more than rounding can change a distance by
 _SPLITTER = 134217729.0  # 2**27 + 1
 _ERROR_BOUND = 3.3306690738754716e-16  # (3 + 16 eps) eps, eps = 2**-53
 
@@ -270,16 +271,40 @@ def boundary_distance_below(
 @lean_kernel
 def rings_touch(a: FloatArray, b: FloatArray) -> bool:
     """Whether the areas of two simple rings (V, 2) share a point; touching counts."""
+    ax, ay, bx, by = ring_bounds(a)
+    cx, cy, dx, dy = ring_bounds(b)
+    low_x, low_y, high_x, high_y = max(ax, cx), max(ay, cy), min(bx, dx), min(by, dy)
+    if low_x > high_x or low_y > high_y:
+        return False
     if (
         locate_in_ring(a, b[0, 0], b[0, 1]) != EXTERIOR
         or locate_in_ring(b, a[0, 0], a[0, 1]) != EXTERIOR
     ):
         return True
-    for i in range(len(a)):
-        for j in range(len(b)):
-            if segments_intersect(a[i - 1], a[i], b[j - 1], b[j]):
-                return True
+    before = len(b) - 1
+    for j in range(len(b)):
+        if not (
+            max(b[before, 0], b[j, 0]) < low_x
+            or min(b[before, 0], b[j, 0]) > high_x
+            or max(b[before, 1], b[j, 1]) < low_y
+            or min(b[before, 1], b[j, 1]) > high_y
+        ):
+            for i in range(len(a)):
+                if segments_intersect(a[i - 1], a[i], b[before], b[j]):
+                    return True
+        before = j
     return False
+
+
+@lean_kernel
+def ring_bounds(ring: FloatArray) -> tuple[float, float, float, float]:
+    """Bounds of a ring (V, 2): min x, min y, max x, max y [m]."""
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for index in range(len(ring)):
+        x, y = ring[index, 0], ring[index, 1]
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+    return low_x, low_y, high_x, high_y
 
 
 @lean_kernel
@@ -287,29 +312,67 @@ def ring_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between the areas of two simple rings (V, 2); 0 when they share a point [m]."""
     if rings_touch(a, b):
         return 0.0
+    low_x, low_y, high_x, high_y = ring_bounds(a)
+    reach = distance_bound(a, b)
     best = np.inf
-    for i in range(len(a)):
-        for j in range(len(b)):
-            p, q, c, d = a[i - 1], a[i], b[j - 1], b[j]
-            best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
-            best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
+    before = len(b) - 1
+    for j in range(len(b)):
+        c, d = b[before], b[j]
+        if not (
+            max(c[0], d[0]) < low_x - reach
+            or min(c[0], d[0]) > high_x + reach
+            or max(c[1], d[1]) < low_y - reach
+            or min(c[1], d[1]) > high_y + reach
+        ):
+            for i in range(len(a)):
+                p, q = a[i - 1], a[i]
+                best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
+                best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
+            reach = min(reach, best + SLACK)
+        before = j
     return best
 
 
 @lean_kernel
-def ring_segment_distance(ring: FloatArray, a: FloatArray, b: FloatArray) -> float:
-    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m]."""
-    if locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
+def distance_bound(a: FloatArray, b: FloatArray) -> float:
+    """More than the distance between two rings (V, 2): that between two of their vertices [m]."""
+    square = np.inf
+    for j in range(len(b)):
+        dx, dy = b[j, 0] - a[0, 0], b[j, 1] - a[0, 1]
+        square = min(square, dx * dx + dy * dy)
+    return np.sqrt(square) + SLACK
+
+
+@lean_kernel
+def ring_segment_distance(
+    ring: FloatArray, a: FloatArray, b: FloatArray, limit: float, starts_outside: bool
+) -> float:
+    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m].
+
+    Infinite where it is more than `limit`. `starts_outside` where a is known to be outside.
+    """
+    if not starts_outside and locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
         return 0.0
+    low_x, high_x = min(a[0], b[0]) - limit, max(a[0], b[0]) + limit
+    low_y, high_y = min(a[1], b[1]) - limit, max(a[1], b[1]) + limit
     best = np.inf
+    before = len(ring) - 1
     for index in range(len(ring)):
-        c, d = ring[index - 1], ring[index]
+        c, d = ring[before], ring[index]
+        before = index
+        if (
+            max(c[0], d[0]) < low_x
+            or min(c[0], d[0]) > high_x
+            or max(c[1], d[1]) < low_y
+            or min(c[1], d[1]) > high_y
+        ):
+            continue
         if segments_intersect(a, b, c, d):
             return 0.0
         best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
         best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
         best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
-    return best
+    return best if best <= limit else np.inf
 
 
 @lean_kernel

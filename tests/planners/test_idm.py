@@ -4,15 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.polylines import CLEAR, HIT, OPEN
-from shiftsim.planners.idm import UNKNOWN, Idm, Objects, find_lead, find_sides
+from shiftsim.planners.idm import Idm
 from shiftsim.planners.routes.graph import search_levels
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.layers import make_lists
@@ -219,58 +216,6 @@ def test_the_search_by_levels_equals_the_queue_without_a_visited_set(case):
         only_last=True,
     )
     assert plan == (path, found)
-
-
-def objects_of(poses, sizes) -> Objects:
-    boxes = boxes_to_corners(poses, sizes)
-    radii = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
-    nothing = np.zeros(len(poses))
-    return Objects(
-        boxes.reshape(-1, 2),
-        np.arange(len(poses) + 1) * 4,
-        np.column_stack([poses[:, :2], radii]),
-        nothing,
-        nothing,
-    )
-
-
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (587_430.0, 4_475_309.0)])
-def test_distances_decide_as_the_buffered_path_does(rng, offset):
-    half_width, num_open, count = 1.1485, 0, 0
-    for _ in range(60):
-        turns = np.cumsum(rng.normal(0.0, rng.choice([0.0, 0.05, 0.8]), 30))
-        steps = rng.uniform(0.2, 2.0, 30)
-        line = np.cumsum(np.c_[steps * np.cos(turns), steps * np.sin(turns)], axis=0) + offset
-        center = np.array([*line[0], turns[0]])
-        footprint = boxes_to_corners(center, np.array([5.176, 2.297]))
-        index = rng.integers(0, 30, 150)
-        poses = np.c_[line[index] + rng.normal(0.0, 3.0, (150, 2)), rng.uniform(-3, 3, 150)]
-        sizes = rng.uniform(0.2, 5.0, (150, 2))
-        objects = objects_of(poses, sizes)
-        sides = np.full(150, UNKNOWN)
-        find_sides(line, half_width, footprint, objects, sides)
-        corridor = shapely.LineString(line).buffer(half_width, cap_style="square")
-        corridor = corridor.union(shapely.Polygon(footprint))
-        truth = shapely.intersects(shapely.polygons(boxes_to_corners(poses, sizes)), corridor)
-        np.testing.assert_array_equal(sides[sides != OPEN] == HIT, truth[sides != OPEN])
-        num_open += int((sides == OPEN).sum())
-        count += 150
-    assert 0 < num_open < 0.05 * count
-
-
-def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
-    footprint = boxes_to_corners(np.array([0.0, 0.0, 0.3]), np.array([5.176, 2.297]))
-    poses = np.c_[rng.uniform(-12, 12, (500, 2)), rng.uniform(-3, 3, 500)]
-    sizes = rng.uniform(0.2, 5.0, (500, 2))
-    objects = objects_of(poses, sizes)
-    polygons = shapely.polygons(boxes_to_corners(poses, sizes))
-    truth = shapely.distance(polygons, shapely.Polygon(footprint))
-    for index in range(500):
-        sides = np.full(500, CLEAR)
-        sides[index] = HIT
-        found, gap = find_lead(footprint, objects, sides)
-        assert found == index
-        assert gap == pytest.approx(truth[index], abs=1e-12)
 
 
 def test_speed_backwards_and_standing_still_give_finite_plans():

@@ -9,7 +9,7 @@ from shiftsim.geometry.boxes import box_corners, boxes_to_corners, meets_bounds
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
 from shiftsim.planners.proposals.contacts import Others, touches_boxes
 from shiftsim.planners.proposals.tracker import SCORED
-from shiftsim.planners.routes.graph import red_lanes
+from shiftsim.planners.routes.lights import red_lanes
 from shiftsim.sim.planner import Observation
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import VectorMap

@@ -19,6 +19,7 @@ from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.contacts import Others
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
+from shiftsim.planners.routes.lights import red_lights
 from shiftsim.verify.files import TOLERANCE, Source, read_arrays, read_fields, read_json
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
@@ -89,7 +90,7 @@ def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
     reds = {around.LIGHT_TOKEN + name: rings[name] for name in inputs["red_light_lane_ids"]}
     is_closed = {name: int((ring[0] == ring[-1]).all()) for name, ring in reds.items()}
     lights = [ring[: len(ring) - is_closed[name]] for name, ring in reds.items()]
-    forecast = around.make_forecast(tracks, chosen, lights)
+    forecast = around.make_forecast(tracks, chosen, red_lights([], lights))
     tokens = [*(tracks.tokens[i] for i in chosen.tolist()), *reds]
     size = np.array([PACIFICA.length, PACIFICA.width])
     hit = around.touched(forecast, boxes_to_corners(center, size))

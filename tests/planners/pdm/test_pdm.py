@@ -23,6 +23,7 @@ from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.registry import load_planner
+from shiftsim.planners.routes.lights import red_lights
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 
@@ -184,7 +185,7 @@ def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
     poses[:, :2] = path.xy[rng.integers(0, 60, 40)] + rng.uniform(-4, 4, (40, 2))
     tracks = standing_tracks(1, poses, [VEHICLE] * 40)
     tracks.velocities[:] = rng.normal(0.0, 3.0, (1, 40, 2))
-    forecast = make_forecast(tracks, np.arange(40), [])
+    forecast = make_forecast(tracks, np.arange(40), red_lights([], []))
     corridor = make_corridor(10.3, 42.0, 1.1485, 40)
     fill_corridor(path, corridor, forecast, 0, 21)
     polygon = corridor_shape(path, corridor)

@@ -1,0 +1,55 @@
+"""Red lights on a route, looked up again only when the lights change."""
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.world.map import VectorMap
+from shiftsim.world.state import LightStatus, TrafficLights
+
+
+class RedLights(NamedTuple):
+    """Lanes and connectors with a red light, in the order of the lights. L of them."""
+
+    lanes: list[int]  # their indices
+    xy: FloatArray  # (V, 2) vertices of their shells, not closed [m]
+    ptr: IntArray  # (L + 1,) first vertex of each
+    bounds: FloatArray  # (L, 4) min x, min y, max x, max y of each [m]
+
+
+class LightWatch:
+    """Tells which lights are red among some lanes and connectors of a map."""
+
+    def __init__(self, road: VectorMap, lanes: Collection[int]) -> None:
+        """Take the map and the lanes and connectors."""
+        self._road, self._lanes = road, frozenset(lanes)
+        self._lights, self._red = TrafficLights.empty(1), red_lights([], [])
+
+    def at(self, lights: TrafficLights) -> RedLights:
+        """The red ones in a row of lights; what cannot be written is not looked at twice."""
+        if lights is not self._lights or lights.status.flags.writeable:
+            red = [lane for lane in red_lanes(self._road, lights) if lane in self._lanes]
+            rings = [self._road.edges.rings(lane)[0] for lane in red]
+            self._lights, self._red = lights, red_lights(red, rings)
+        return self._red
+
+
+def red_lanes(road: VectorMap, lights: TrafficLights) -> list[int]:
+    """Lanes and connectors of the map whose light is red in one row, in the order of the lights."""
+    # nuPlan rule 429: one red entry is enough, whatever else is listed
+    names, index = lights.connector_ids, road.edges.index
+    red = np.flatnonzero(lights.status[0] == LightStatus.RED).tolist()
+    return [index[names[i]] for i in red if names[i] in index]
+
+
+def red_lights(lanes: list[int], rings: Sequence[FloatArray]) -> RedLights:
+    """Red lights of some lanes and connectors with the shells (V, 2)."""
+    xy = np.concatenate([np.zeros((0, 2)), *rings])
+    ptr = np.cumsum([0, *map(len, rings)])
+    bounds = np.zeros((len(rings), 4))
+    if len(rings):
+        bounds[:, :2] = np.minimum.reduceat(xy, ptr[:-1])
+        bounds[:, 2:] = np.maximum.reduceat(xy, ptr[:-1])
+    return RedLights(lanes, xy, ptr, bounds)
