@@ -46,7 +46,6 @@ def make_samples(
     headings: FloatArray | None = None,
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
-    trusts_velocities: bool = False,
     derived: FloatArray | None = None,
     kind_of: Mapping[str, AgentKind] = CATEGORIES,
 ) -> TrackSamples:
@@ -64,7 +63,6 @@ def make_samples(
             where they are not given, and for tracks where they contradict the positions.
         sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
             NaN or 0. A track gets the median.
-        trusts_velocities: Whether velocities are kept where they contradict the positions.
         derived: (A, 2) `fitted_velocities` of rows sorted by id and time, where they are known.
         kind_of: AgentKind by name of a category.
 
@@ -99,7 +97,7 @@ def make_samples(
     named, kinds = _kinds(name, category, categories, kind_of, track, warnings)
     if derived is None:
         derived = fitted_velocities(xy, time, track, period)
-    speeds = believed(velocities, derived, time, track, warnings, trusts=trusts_velocities)
+    speeds = believed(velocities, derived, time, track, warnings)
     raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
     samples = TrackSamples(
         name=name,

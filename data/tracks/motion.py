@@ -60,13 +60,8 @@ def believed(
     time: FloatArray,
     track: IntArray,
     warnings: Counter[str],
-    *,
-    trusts: bool = False,
 ) -> FloatArray:
-    """Stored velocities (A, 2) of the tracks where they fit the positions, else the derived.
-
-    Those that do not fit are kept if `trusts`; NaN is replaced all the same.
-    """
+    """Stored velocities (A, 2) of the tracks where they fit the positions, else the derived."""
     num_tracks = int(track[-1]) + 1
     if stored is None:
         warnings["tracks without stored velocity (derived)"] += num_tracks
@@ -74,7 +69,7 @@ def believed(
     lacking = np.zeros(num_tracks, np.bool_)
     lacking[track[~np.isfinite(stored).all(axis=1)]] = True
     warnings["tracks without stored velocity (derived)"] += int(lacking.sum())
-    wrong = contradiction(stored, derived, time, track)[0] & ~lacking & (not trusts)
+    wrong = contradiction(stored, derived, time, track)[0] & ~lacking
     warnings["tracks whose stored velocity does not fit (derived)"] += int(wrong.sum())
     if not (lacking | wrong).any():
         return stored

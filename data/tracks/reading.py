@@ -56,7 +56,8 @@ def read_tracks(
         ConfigError: What was said does not fit the file.
     """
     if not path.is_file():
-        raise ConversionError(f"{path} does not exist", "check the path")
+        what = "is no file" if path.exists() else "does not exist"
+        raise ConversionError(f"{path} {what}", "give a CSV or Parquet file")
     is_csv = path.suffix.lower() not in (".parquet", ".pq")
     options = _csv_options(path) if is_csv else None
     names = _names(path, options)
@@ -125,7 +126,8 @@ def _csv_options(path: Path) -> tuple[pc.ReadOptions, pc.ParseOptions, str]:
             start = stream.read(1 << 16)
         lines = start.decode("utf-8-sig").splitlines()[:2]
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        raise ConversionError(f"{path}: not readable as CSV ({error})", _REPAIR) from error
+        what = f"{path}: not readable as CSV ({error})"
+        raise ConversionError(what, "give CSV in UTF-8, or Parquet (.parquet)") from error
     if not lines:
         raise ConversionError(f"{path} is empty", "export the tracks again")
     delimiter = max(_DELIMITERS, key=lines[0].count)
@@ -200,7 +202,7 @@ def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatA
 
 def _floats(column: pa.ChunkedArray) -> FloatArray:
     """(A,) numbers that may be written; NaN where there is none."""
-    values: FloatArray = column.cast(pa.float64()).to_numpy()
+    values: FloatArray = column.cast(pa.float64(), safe=False).to_numpy()  # ns have 64 bits
     return values if values.flags.writeable else values.copy()
 
 
@@ -222,13 +224,14 @@ def _times(
     if values is None:
         raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
     try:
-        if pa.types.is_timestamp(values.type):
-            values = values.cast(pa.timestamp("us")).cast(pa.int64())
-            column = replace(column, unit="us")
+        if pa.types.is_timestamp(values.type) or pa.types.is_duration(values.type):
+            column = replace(column, unit=values.type.unit)
+            values = values.cast(pa.int64())
         stamps = _floats(values)
     except (pa.ArrowException, ValueError) as error:
         what = f"{path}: column {column.name!r} is {values.type}, need times"
-        raise ConversionError(what, _REPAIR) from error
+        hint = "give seconds, or dates and times such as 2024-05-01T13:02:03.040"
+        raise ConversionError(what, hint) from error
     stamps *= 1e6 if role == "frame" else column.factor(role)
     stamps /= rate if role == "frame" and rate else 1.0
     bad = np.flatnonzero(~(np.abs(stamps) < 2.0**55))
@@ -244,9 +247,9 @@ def _times(
 def _ids(table: pa.Table, name: str, path: Path) -> pa.ChunkedArray:
     """Integers or texts."""
     column = table[name]
-    if column.null_count:
+    if empty := int(column.is_null(nan_is_null=True).to_numpy().sum()):
         raise ConversionError(
-            f"{path}: column {name!r} is empty in {column.null_count} rows", "give objects ids"
+            f"{path}: column {name!r} is empty in {empty} rows", "give objects ids"
         )
     if pa.types.is_floating(column.type):
         values = column.to_numpy()
