@@ -225,8 +225,11 @@ class _Conversion:
     def _rows_outside_map(self) -> int:
         bounds = self.road.edges.polygons.bounds
         low, high = bounds[:, :2].min(axis=0) - _MAP_MARGIN, bounds[:, 2:].max(axis=0) + _MAP_MARGIN
-        xy = self.source.centers[:, :2] + self.offset
-        return int(((xy < low) | (xy > high)).any(axis=1).sum())
+        outside = np.zeros(len(self.source.centers), np.bool_)
+        for axis in (0, 1):
+            place = self.source.centers[:, axis] + self.offset[axis]
+            outside |= (place < low[axis]) | (place > high[axis])
+        return int(outside.sum())
 
 
 def _duration_note(rows: int) -> dict[str, object]:

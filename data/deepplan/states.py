@@ -8,16 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.data.deepplan.windows import ROW_S, Runs, rows_of
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 
 _EPS = 1e-9  # s
 ROW_US = 50_000  # us, as `ROW_S`
+_BLOCK_ROWS = 256  # rows that are sampled at once
 _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second order
 
 
@@ -36,29 +37,61 @@ def sample_runs(recording: TrackSamples, runs: Runs, run: IntArray, time: FloatA
     Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
     heading. Callers decide how far that is allowed.
     """
-    num_frames = len(recording.clock)
-    frame = np.searchsorted(recording.clock, time + _EPS, side="right") - 1
-    row = np.searchsorted(runs.row_key, run * num_frames + frame, side="right") - 1
-    row = np.clip(row, runs.first[run], np.maximum(runs.last[run] - 1, runs.first[run]))
-    following = np.minimum(row + 1, runs.last[run])
-    row_time = recording.time
-    span = np.where(following > row, row_time[following] - row_time[row], recording.period)
-    share = (time - row_time[row]) / span
-    reach = recording.period / span
-    linear = np.clip(share, -reach, 1.0 + reach)
-    beyond = ((share - linear) * span)[:, None]  # s
-    end_velocity = recording.velocities[np.where(share < 0, row, following)]
-    center = recording.centers
-    place = center[row] + linear[:, None] * (center[following] - center[row])
-    turn = wrap_angles(recording.headings[following] - recording.headings[row])
-    heading = wrap_angles(recording.headings[row] + linear * turn)
-    inside = np.clip(share, 0.0, 1.0)[:, None]
-    change = recording.velocities[following] - recording.velocities[row]
-    return Samples(
-        np.column_stack([place[:, :2] + beyond * end_velocity, heading]),
-        recording.velocities[row] + inside * change,
-        place[:, 2],
+    out = Samples(np.empty((len(time), 3)), np.empty((len(time), 2)), np.empty(len(time)))
+    _sample(
+        recording.time,
+        recording.centers,
+        recording.headings,
+        recording.velocities,
+        runs.first,
+        runs.last,
+        run,
+        time,
+        recording.period,
+        out.poses,
+        out.velocities,
+        out.heights,
     )
+    return out
+
+
+@kernel
+def _sample(
+    row_time: FloatArray,
+    centers: FloatArray,
+    headings: FloatArray,
+    velocities: FloatArray,
+    firsts: IntArray,
+    lasts: IntArray,
+    runs: IntArray,
+    times: FloatArray,
+    period: float,
+    out_poses: FloatArray,
+    out_velocities: FloatArray,
+    out_heights: FloatArray,
+) -> None:
+    """Write boxes at times (G,) of runs (G,); rows are as in `TrackSamples`."""
+    for index in range(len(times)):
+        run, time = runs[index], times[index]
+        first, last = firsts[run], lasts[run]
+        row = first + np.searchsorted(row_time[first : last + 1], time + _EPS, side="right") - 1
+        row = min(max(row, first), max(last - 1, first))
+        following = min(row + 1, last)
+        span = row_time[following] - row_time[row] if following > row else period
+        share = (time - row_time[row]) / span
+        reach = period / span
+        linear = min(max(share, -reach), 1.0 + reach)
+        inside = min(max(share, 0.0), 1.0)
+        beyond = (share - linear) * span  # s
+        end = row if share < 0 else following
+        for axis in range(2):
+            place = centers[row, axis] + linear * (centers[following, axis] - centers[row, axis])
+            out_poses[index, axis] = place + beyond * velocities[end, axis]
+            change = velocities[following, axis] - velocities[row, axis]
+            out_velocities[index, axis] = velocities[row, axis] + inside * change
+        out_heights[index] = centers[row, 2] + linear * (centers[following, 2] - centers[row, 2])
+        turn = wrap_angle(headings[following] - headings[row])
+        out_poses[index, 2] = wrap_angle(headings[row] + linear * turn)
 
 
 def rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, IntArray]:
@@ -94,7 +127,6 @@ def resample(
     first = np.where(recording.frame[runs.first] == 0, -padding, first)
     kept = np.flatnonzero(last >= first)
     kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
-    lengths = last[kept] - first[kept] + 1
     kinds = recording.kinds[runs.track[kept]]
     tracks = Tracks(
         np.zeros((num_rows, len(kept)), np.bool_),
@@ -104,16 +136,19 @@ def resample(
         kinds,
         tuple(run_token(recording, runs, run) for run in kept.tolist()),
     )
-    for column, run in enumerate(kept.tolist()):  # all at once would need a multiple of the memory
-        row = first[run] + np.arange(lengths[column])
-        samples = sample_runs(recording, runs, np.full(len(row), run), row * ROW_S)
-        here = slice(int(first[run]) + padding, int(last[run]) + 1 + padding)
-        tracks.valid[here, column] = True
-        tracks.poses[here, column] = samples.poses
-        tracks.poses[here, column, :2] += offset
-        if kinds[column] <= LAST_AGENT_KIND:
-            tracks.velocities[here, column] = samples.velocities
-        tracks.sizes[here, column] = recording.sizes[runs.track[run], :2]
+    for start in range(-padding, num_rows - padding, _BLOCK_ROWS):  # more would need more memory
+        low = np.maximum(first[kept], start)
+        counts = np.maximum(np.minimum(last[kept] + 1, start + _BLOCK_ROWS) - low, 0)
+        column = np.repeat(np.arange(len(kept)), counts)
+        row = np.arange(len(column)) + np.repeat(low - np.cumsum(counts) + counts, counts)
+        samples = sample_runs(recording, runs, kept[column], row * ROW_S)
+        samples.poses[:, :2] += offset
+        samples.velocities[kinds[column] > LAST_AGENT_KIND] = np.nan
+        here = row + padding, column
+        tracks.valid[here] = True
+        tracks.poses[here] = samples.poses
+        tracks.velocities[here] = samples.velocities
+        tracks.sizes[here] = recording.sizes[runs.track[kept[column]], :2]
     times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
 

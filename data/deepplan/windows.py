@@ -128,7 +128,6 @@ class Runs:
     last: IntArray  # (U,) last row
     track: IntArray  # (U,) track
     number: IntArray  # (U,) how many runs of the same track came before
-    row_key: IntArray  # (A,) run of a row times the number of frames, plus its frame: increasing
 
 
 @dataclass(frozen=True)
@@ -157,8 +156,7 @@ def find_runs(recording: TrackSamples, max_hole_s: float) -> Runs:
     last = np.r_[first[1:] - 1, len(time) - 1]
     track = recording.track[first]
     first_run = np.searchsorted(track, track)
-    row_key = (np.cumsum(starts) - 1) * len(recording.clock) + recording.frame
-    return Runs(first, last, track, np.arange(len(first)) - first_run, row_key)
+    return Runs(first, last, track, np.arange(len(first)) - first_run)
 
 
 def window_starts(duration: float, config: ConversionConfig) -> FloatArray:
@@ -205,15 +203,13 @@ def overlap_partners(
     nuPlan rule 451: with the recorded sizes, and tracks of all categories. Only rows of the
     `candidates` (N,) are looked at.
     """
-    by_frame = np.lexsort((recording.track, recording.frame))
-    frame_ptr = np.searchsorted(recording.frame[by_frame], np.arange(len(recording.clock) + 1))
     return _first_overlaps(
         recording.centers,
         recording.raw_headings,
         np.ascontiguousarray(recording.sizes[:, :2]),
         recording.track,
-        by_frame,
-        frame_ptr,
+        recording.by_frame,
+        recording.frame_ptr,
         candidates,
         max_overlap,
     )
@@ -231,11 +227,11 @@ def _judge(
     num_tracks = len(recording.track_ids)
     first = int(np.searchsorted(recording.clock, span.start_s - _EPS))
     last = int(np.searchsorted(recording.clock, span.start_s + span.length_s - _EPS)) - 1
-    rows = np.flatnonzero((recording.frame >= first) & (recording.frame <= last))
+    rows = recording.by_frame[recording.frame_ptr[first] : recording.frame_ptr[last + 1]]
     if span.only >= 0:
         allowed = np.arange(num_tracks) == span.only
         rows = rows[recording.track[rows] == span.only]
-    tracks = np.unique(recording.track[rows])
+    tracks = np.flatnonzero(np.bincount(recording.track[rows], minlength=num_tracks))
     peak = np.zeros(num_tracks)
     np.maximum.at(peak, recording.track[rows], speed[rows])
     covering = (recording.frame[runs.first] <= first) & (recording.frame[runs.last] >= last)
@@ -259,13 +255,15 @@ def _judge(
     return WindowVerdicts(span, tracks, run[tracks], tuple(found.tolist()), partners)
 
 
+@kernel
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:
     """Median of each row and its neighbours of the same track; the ends keep their value."""
-    same_before = np.r_[False, track[1:] == track[:-1]]
-    same_after = np.r_[track[1:] == track[:-1], False]
-    inside = same_before & same_after
-    stack = np.stack([np.roll(values, 1), values, np.roll(values, -1)])
-    return np.where(inside, np.median(stack, axis=0), values)
+    out = values.copy()
+    for row in range(1, len(values) - 1):
+        if track[row - 1] == track[row] == track[row + 1]:
+            low, high = min(values[row - 1], values[row]), max(values[row - 1], values[row])
+            out[row] = max(low, min(high, values[row + 1]))
+    return out
 
 
 @kernel

@@ -4,11 +4,12 @@ Rows are sorted by track, then time, as in `dsc3d.Annotations`.
 """
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angle
 
 _MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
 _MAX_SPEED = 200.0  # m/s along an axis
@@ -58,10 +59,17 @@ def believed_velocities(
 
 def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
     """(N,) median of the rows of each track; values and track: (A,), sorted by track."""
-    ranked = values[np.lexsort((values, track))]
-    first = np.searchsorted(track, np.arange(track[-1] + 1))
-    last = np.searchsorted(track, np.arange(track[-1] + 1), side="right") - 1
-    return 0.5 * (ranked[(first + last) // 2] + ranked[(first + last + 1) // 2])
+    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2)).tolist()
+    return np.array([median(values[low:high]) for low, high in pairwise(ends)])
+
+
+def median(values: FloatArray) -> float:
+    """Median of values (n,); NaN of none, and NaN counts as larger than all numbers."""
+    if not len(values):
+        return float("nan")
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ranked = np.partition(values, (low, high))
+    return 0.5 * float(ranked[low] + ranked[high])
 
 
 def _central_differences(xy: FloatArray, time: FloatArray, track: IntArray) -> FloatArray:
@@ -81,17 +89,32 @@ def held_headings(
     warnings: Counter[str],
 ) -> FloatArray:
     """Headings; where a standing object's spins, the one before (nuPlan rule 460)."""
-    standing = np.hypot(velocities[:, 0], velocities[:, 1]) < _STANDSTILL
-    same = np.r_[False, track[1:] == track[:-1]]
-    turn = np.r_[0.0, np.abs(wrap_angles(np.diff(yaw)))]
-    fast = turn > _MAX_STANDING_TURN * np.r_[np.inf, np.diff(time)]
-    spins = standing & same & fast
-    starts = ~(standing & same & np.r_[False, standing[:-1]]) | ~standing
-    stretch = np.cumsum(starts)  # rows of one standstill share a number
-    index = np.arange(len(yaw))
-    first_spin = np.full(stretch[-1] + 1, len(yaw), np.int64)
-    np.minimum.at(first_spin, stretch[spins], index[spins])
-    held = standing & (index >= first_spin[stretch])
-    warnings["rows with a heading that spins at standstill (held)"] += int(held.sum())
-    source = np.where(held, np.maximum(first_spin[stretch] - 1, 0), index)
+    source = np.arange(len(yaw))
+    held = _hold(yaw, velocities, time, track, source)
+    warnings["rows with a heading that spins at standstill (held)"] += held
     return yaw[source]
+
+
+@kernel
+def _hold(
+    yaw: FloatArray, velocities: FloatArray, time: FloatArray, track: IntArray, source: IntArray
+) -> int:
+    """Replace the rows `source` (A,) of headings where they spin; how many these are."""
+    held, before = 0, -1  # row before the first that spins
+    was_standing = False
+    for row in range(len(yaw)):
+        is_standing = np.hypot(velocities[row, 0], velocities[row, 1]) < _STANDSTILL
+        if row == 0 or track[row] != track[row - 1]:
+            before, was_standing = -1, is_standing
+            continue
+        if not (is_standing and was_standing):
+            before = -1
+        if is_standing and before < 0:
+            turn = abs(wrap_angle(yaw[row] - yaw[row - 1]))
+            if turn > _MAX_STANDING_TURN * (time[row] - time[row - 1]):
+                before = row - 1
+        if before >= 0:
+            source[row] = before
+            held += 1
+        was_standing = is_standing
+    return held

@@ -2,7 +2,8 @@
 
 The files have no sizes of objects (the usual ones by type are taken), no speed limits and no
 lights. Ends of tracks are squeezed: positions move up to 45 % slower than the stored speed. So
-stored velocities are taken, and the last 0.5 s belong to no scenario.
+stored velocities are taken, except those of tracks that they contradict throughout, and the last
+0.5 s belong to no scenario.
 """
 
 import json
@@ -129,7 +130,6 @@ def _read_tracks(path: Path) -> TrackSamples:
         xy=np.column_stack([read["position_x"], read["position_y"]]),
         headings=read["heading"],
         velocities=np.column_stack([read["velocity_x"], read["velocity_y"]]),
-        trusts_velocities=True,
         sizes=sizes[category],
         kind_of={name: kind for name, (kind, *_) in TYPES.items()},
     )

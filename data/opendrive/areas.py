@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive import records
@@ -66,10 +64,17 @@ def group_connectors(
 
 def linked_groups(links: Sequence[tuple[int, int]], count: int) -> IntArray:
     """(count,) a label for each item; linked ones share it."""
-    one, two = np.array(links, np.int64).reshape(-1, 2).T
-    matrix = coo_array((np.ones(len(one)), (one, two)), (count, count))
-    labels: IntArray = connected_components(matrix, directed=False)[1]
-    return labels
+    above = list(range(count))  # an item of the same group with a smaller number, or itself
+
+    def first(item: int) -> int:
+        while above[item] != item:
+            above[item] = item = above[above[item]]
+        return item
+
+    for one, two in links:
+        low, high = sorted((first(one), first(two)))
+        above[high] = low
+    return np.unique([first(item) for item in range(count)], return_inverse=True)[1]
 
 
 def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.Polygon:

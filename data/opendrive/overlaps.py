@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, LaneRun, Piece, split_pieces
@@ -39,6 +38,8 @@ class Trace:
 
     def nearest(self, points: FloatArray) -> list[int]:
         """Index of the nearest point for each of `points` (N, 2)."""
+        from scipy.spatial import cKDTree  # takes long to import, and few maps need it
+
         index: list[int] = cKDTree(self.xy).query(points)[1].tolist()
         return index
 

@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -98,13 +99,15 @@ def read_manifest(store: Path) -> dict[str, Any]:
 
 
 def write_blocks(
-    path: Path, blocks: list[pa.Table], footer: Mapping[str, object] | None = None
+    path: Path, blocks: Iterable[pa.Table], footer: Mapping[str, object] | None = None
 ) -> None:
-    """Write tables of one schema as one file with a row group each, in one step.
+    """Write tables of one schema, at least one, as one file with a row group each, in one step.
 
     Equal content gives equal bytes.
     """
-    described = blocks[0].schema
+    remaining = iter(blocks)
+    first = next(remaining)
+    described = first.schema
     names = described.names
     notes = json.dumps({} if footer is None else footer, sort_keys=True)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +124,7 @@ def write_blocks(
             store_schema=False,
         ) as writer,
     ):
-        for block in blocks:
+        for block in chain([first], remaining):
             writer.write_table(block, row_group_size=max(len(block), 1))
         writer.add_key_value_metadata({_FOOTER: notes})
 

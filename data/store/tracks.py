@@ -41,7 +41,7 @@ def write_recording(folder: Path, recording: Recording) -> None:
     write_blocks(folder / FRAMES, _split(frames, schema.FRAME_BLOCK), footer)
     tracks = recording.tracks
     starts = range(0, max(len(tracks), 1), schema.BLOCK_ROWS)
-    blocks = [_track_block(tracks, start) for start in starts]
+    blocks = (_track_block(tracks, start) for start in starts)
     footer = {"tokens": list(tracks.tokens), "kinds": tracks.kinds.tolist()}
     write_blocks(folder / TRACKS, blocks, footer)
 
@@ -67,11 +67,9 @@ def _track_block(tracks: Tracks, start: int) -> pa.Table:
     """Boxes of some rows, track by track: neighbours in time compress well."""
     part = tracks.rows(slice(start, start + schema.BLOCK_ROWS))
     track, row = np.nonzero(part.valid.T)
-    boxes = np.column_stack(
-        [part.poses[row, track], part.velocities[row, track], part.sizes[row, track]]
-    )
     columns = [pa.array((row + start).astype(np.int32)), pa.array(track.astype(np.int32))]
-    columns += [pa.array(np.ascontiguousarray(boxes[:, i])) for i in range(boxes.shape[1])]
+    for values in (part.poses, part.velocities, part.sizes):
+        columns += [pa.array(values[row, track, axis]) for axis in range(values.shape[2])]
     return pa.Table.from_arrays(columns, schema=schema.TRACKS)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.dsc3d.motion import track_medians
 from shiftsim.data.tracks.columns import UNITS
 from shiftsim.data.tracks.evidence import (
@@ -139,16 +139,18 @@ def check_reference(motion: Motion, out: Doubts) -> None:
     table = motion.table
     if table.headings is None or table.sizes is None or table.columns.reference:
         return
-    same = np.diff(table.track) == 0
-    step = np.r_[0.0, np.where(same, wrap_angles(np.diff(table.headings)), 0.0)]
     number = len(table.track_ids)
     fast = motion.is_vehicle & (motion.speed > FAST)
-    turned = np.bincount(table.track[fast], np.abs(step[fast]), number)
+    rows = np.flatnonzero(fast)
+    turns = _turns(table.track, table.headings, rows)
+    turned = np.bincount(table.track[rows], np.abs(turns), number)
     rows = np.flatnonzero(motion.is_vehicle & (turned > _LEAST_TURN)[table.track])
     if not len(rows):
         return
     track, fast = table.track[rows], fast[rows]
-    angle = np.column_stack([np.cumsum(step[rows]), np.zeros(len(rows))])
+    angle = np.column_stack(
+        [np.cumsum(_turns(table.track, table.headings, rows)), np.zeros(len(rows))]
+    )
     numbers = np.unique(track, return_inverse=True)[1]
     rate = fitted_velocities(angle, motion.time[rows], numbers, motion.period)[:, 0]
     cos, sin = np.cos(table.headings[rows]), np.sin(table.headings[rows])
@@ -173,6 +175,13 @@ def check_reference(motion: Motion, out: Doubts) -> None:
         f"they look like the {name} of the vehicles: reference = {name!r} in a TOML file; if they"
         " are the middle: reference = 'center'",
     )
+
+
+def _turns(track: IntArray, headings: FloatArray, rows: IntArray) -> FloatArray:
+    """(n,) by how much the heading of a row differs from the one before of its object [rad]."""
+    before = np.maximum(rows - 1, 0)
+    before = np.where(track[before] == track[rows], before, rows)
+    return wrap_angles(headings[rows] - headings[before])
 
 
 def _median(values: FloatArray) -> float:

@@ -46,7 +46,6 @@ def make_samples(
     headings: FloatArray | None = None,
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
-    trusts_velocities: bool = False,
     derived: FloatArray | None = None,
     kind_of: Mapping[str, AgentKind] = CATEGORIES,
 ) -> TrackSamples:
@@ -64,7 +63,6 @@ def make_samples(
             where they are not given, and for tracks where they contradict the positions.
         sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
             NaN or 0. A track gets the median.
-        trusts_velocities: Whether velocities are kept where they contradict the positions.
         derived: (A, 2) `fitted_velocities` of rows sorted by id and time, where they are known.
         kind_of: AgentKind by name of a category.
 
@@ -84,14 +82,14 @@ def make_samples(
             f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
         )
     track_ids, track = numbered(ids)
-    if (np.diff(track) < 0).any() or ((np.diff(track) == 0) & (np.diff(time_us) <= 0)).any():
-        order = np.lexsort((time_us, track))
+    order = order_of_rows(track, time_us)
+    if order is not None:
         time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
         headings, velocities, sizes = (
             None if part is None else part[order] for part in (headings, velocities, sizes)
         )
-        _refuse_twice(name, track_ids, track, time_us)
         derived = None
+    _refuse_twice(name, track_ids, track, time_us)
     stamps, frame = numbered(time_us)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[np.diff(track) == 0]
@@ -99,7 +97,7 @@ def make_samples(
     named, kinds = _kinds(name, category, categories, kind_of, track, warnings)
     if derived is None:
         derived = fitted_velocities(xy, time, track, period)
-    speeds = believed(velocities, derived, time, track, warnings, trusts=trusts_velocities)
+    speeds = believed(velocities, derived, time, track, warnings)
     raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
     samples = TrackSamples(
         name=name,
@@ -108,7 +106,7 @@ def make_samples(
         clock=(stamps - stamps[0]) / 1e6,
         frame=frame,
         track=track,
-        centers=np.column_stack([xy, np.zeros(len(xy))]),
+        centers=np.pad(xy, ((0, 0), (0, 1))),
         raw_headings=raw,
         headings=held_headings(raw, speeds, time, track, warnings),
         velocities=speeds,
@@ -169,11 +167,22 @@ def numbered(ids: Any) -> tuple[NDArray[Any], IntArray]:
     encoded = pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
     encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
     names = encoded.dictionary.to_numpy(zero_copy_only=False)
+    number = encoded.indices.to_numpy()
     order = np.argsort(names, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
+    if number.dtype != rank.dtype or (rank != np.arange(len(order))).any():
+        number = rank[number]
     found = names[order]
-    return found.astype(str) if found.dtype == object else found, rank[encoded.indices.to_numpy()]
+    return found.astype(str) if found.dtype == object else found, number
+
+
+def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
+    """(A,) rows in the order of tracks and times; nothing where they have it."""
+    step = np.diff(track)
+    if (step >= 0).all() and (np.diff(time_us)[step == 0] >= 0).all():
+        return None
+    return np.lexsort((time_us, track))
 
 
 def _refuse_twice(name: str, ids: NDArray[Any], track: IntArray, time_us: IntArray) -> None:

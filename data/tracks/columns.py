@@ -106,7 +106,7 @@ def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Colu
 
     Raises:
         ConfigError: The TOML file names something that does not exist.
-        ConversionError: A column that is needed is missing.
+        ConversionError: A column that is needed is missing, or there twice.
     """
     for key in said:
         one_of("setting", key, ("columns", "units", "kinds", "hz", "shift_m", "reference"))
@@ -132,6 +132,12 @@ def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Colu
         for role in [r for r in found if _ROLES[r][0] == quantity]:
             found[role] = replace(found[role], unit=unit)
     _require_columns(found, names, where)
+    for column in found.values():
+        if names.count(column.name) > 1:
+            raise ConversionError(
+                f"{where} has {names.count(column.name)} columns {column.name!r}",
+                "give each a name of its own",
+            )
     shift = said.get("shift_m", (0.0, 0.0))
     if len(shift) != 2 or not all(isinstance(v, int | float) for v in shift):
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")

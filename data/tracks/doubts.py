@@ -22,9 +22,11 @@ _MAX_SPEED = 60.0  # m/s, of 95 % of the vehicles' rows
 _LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
 _MOVING = 1.0  # m/s
 _MAX_GAP = 1.0  # s without a row of any object
+_LEAST_OBJECTS = 5  # that begin at once
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
+_LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
 
@@ -57,11 +59,11 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
         return out
     time = (table.time_us - table.time_us.min()) / 1e6
     motion = Motion(table, is_vehicle, time, float(np.median(step)))
-    _check_jumps(motion, same, out)
-    if not _check_speeds(motion, out):
+    if not (_check_jumps(motion, same, out) and _check_speeds(motion, out)):
         return out
     moving = motion.rows(_MOVING)
     _check_gaps(table, out)
+    _check_starts(motion, out)
     # another unit of length would show elsewhere, too
     is_metric = _has_usual_sizes(motion) and _velocities_fit(motion)
     fit = fit_map(road, table.xy[moving], motion.derived[moving], min_share, only_metres=is_metric)
@@ -136,22 +138,49 @@ def _check_gaps(table: TrackTable, out: Doubts) -> None:
         )
 
 
-def _check_jumps(motion: Motion, same: BoolArray, out: Doubts) -> None:
-    """Single rows that are far from their neighbours."""
+def _check_starts(motion: Motion, out: Doubts) -> None:
+    """Objects that all begin at once and end one after another."""
+    first, last = motion.time[motion.ends[:-1]], motion.time[motion.ends[1:] - 1]
+    vanish = (last < last.max() - 1.0).mean()
+    if len(first) >= _LEAST_OBJECTS and first.max() == 0.0 and vanish > 0.5:
+        out.note(
+            f"all {len(first)} objects appear at the first time, none later, and {vanish:.0%} of"
+            " them are gone before the last second",
+            "if time counts from the first sight of each object, give one clock for all",
+        )
+
+
+def _check_jumps(motion: Motion, same: BoolArray, out: Doubts) -> bool:
+    """Single rows that are far from their neighbours; whether speeds tell anything beside them."""
     table = motion.table
     way = np.hypot(*np.diff(table.xy, axis=0).T)
     far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(motion.time))
-    share = far.sum() / max(1, same.sum())
-    out.figures["jumps"] = float(far.sum())
-    if 0.0 < share < 0.01:
-        row = int(np.flatnonzero(far)[0])
-        name = table.track_ids[table.track[row]].item()
-        out.say(
-            f"object {name!r} jumps {way[row]:.1f} m within"
-            f" {motion.time[row + 1] - motion.time[row]:g} s at {motion.time[row]:g} s ({far.sum()}"
-            f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
-            "one id names two objects, or a row is wrong: give objects ids of their own",
-        )
+    count = int(far.sum())
+    out.figures["jumps"] = float(count)
+    if not count:
+        return True
+    speed = way[same] / np.diff(motion.time)[same]
+    if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
+        return True  # all do: a matter of units
+    row = int(np.flatnonzero(far)[0])
+    name = table.track_ids[table.track[row]].item()
+    remedy = "one id names two objects, or a row is wrong: give objects ids of their own"
+    ends = table.xy[np.flatnonzero(far) + 1]
+    for axis, column in enumerate("xy"):
+        values, counts = np.unique(ends[:, axis], return_counts=True)
+        if counts.max() > 0.2 * count and count > 10:
+            common = values[counts.argmax()]
+            remedy = (
+                f"many of them lead to {column} = {common:g} m, which looks like a place that is"
+                " not known: leave these rows out"
+            )
+    out.say(
+        f"object {name!r} jumps {way[row]:.1f} m within"
+        f" {motion.time[row + 1] - motion.time[row]:g} s at {motion.time[row]:g} s ({count}"
+        f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
+        remedy,
+    )
+    return count < 0.01 * same.sum()
 
 
 def _check_speeds(motion: Motion, out: Doubts) -> bool:
@@ -233,6 +262,23 @@ def _velocities_fit(motion: Motion) -> bool:
 
 
 def _check_sizes(motion: Motion, out: Doubts) -> None:
+    sizes = motion.table.sizes
+    if sizes is None:
+        return
+    large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
+    if 0 < len(large) < 0.5 * len(sizes):
+        row = large[0]
+        name = motion.table.track_ids[motion.table.track[row]].item()
+        out.say(
+            f"object {name!r} is {sizes[row, 0]:.4g} m long and {sizes[row, 1]:.4g} m wide"
+            f" ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
+            "correct its size, or leave it empty for the usual one of its kind",
+        )
+    if (sizes < 0.0).all():
+        out.say(
+            "all lengths and widths are negative",
+            "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
+        )
     if motion.vehicle_size is None:
         return
     length, width = motion.vehicle_size

@@ -47,7 +47,7 @@ class Guess:
         parts += [f"in {self.unit}"] if self.unit != "m" else []
         if self.shift.any():
             parts.append(f"when shifted by ({self.shift[0]:+.1f}, {self.shift[1]:+.1f}) m")
-        return " ".join(parts) or "as it is"
+        return " ".join(parts)
 
     def remedies(self, x: str, y: str) -> list[str]:
         """What to write into the TOML file, by the names of the columns."""
@@ -112,7 +112,7 @@ def fit_map(
         speeds = np.hypot(*ways[limited].T) / limits[limited]
         over = float(np.percentile(speeds, 90)) if limited.any() else 0.0
         return Fit(share, along, True, overspeed=over)
-    best, value = None, 0.0
+    best, value = None, share * along
     speed = float(np.median(np.hypot(*ways.T)))
     for unit, scale in _SCALES.items():
         if not _SPEEDS[0] <= scale * speed <= _SPEEDS[1] or (only_metres and unit != "m"):

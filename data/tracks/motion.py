@@ -4,11 +4,12 @@ Rows are sorted by track, then time, as in `TrackSamples`.
 """
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.data.dsc3d.motion import track_medians
+from shiftsim.data.dsc3d.motion import median
 
 _HALF_WINDOW = 0.25  # s on each side of a fit
 _EPS = 1e-6  # s
@@ -37,18 +38,19 @@ def contradiction(
     They do where the median over the track differs by more than 10 % of the median speed and 0.3
     m/s; the first and the last second are left out of tracks that are longer.
     """
-    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2))
-    first, last = time[ends[:-1]][track], time[ends[1:] - 1][track]
-    inner = (time >= first + _END) & (time <= last - _END)
-    used = inner | (last - first <= 3.0 * _END)
-    error = np.hypot(*(stored - derived)[used].T)
-    speed = np.hypot(*derived[used].T)
+    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2)).tolist()
     wrong, share = np.zeros(len(ends) - 1, np.bool_), np.zeros(len(ends) - 1)
-    if used.any():
-        seen, part = np.unique(track[used], return_inverse=True)
-        errors, speeds = track_medians(error, part), track_medians(speed, part)
-        wrong[seen] = ~(errors <= np.maximum(_LEAST_ERROR, MAX_SHARE * speeds))
-        share[seen] = errors / np.maximum(speeds, _SLOW)
+    for one, (low, high) in enumerate(pairwise(ends)):
+        times = time[low:high]
+        if len(times) and times[-1] - times[0] > 3.0 * _END:
+            high = low + int(np.searchsorted(times, times[-1] - _END, side="right"))
+            low += int(np.searchsorted(times, times[0] + _END))
+        if low >= high:  # nothing to compare
+            continue
+        error = median(np.hypot(*(stored[low:high] - derived[low:high]).T))
+        speed = median(np.hypot(*derived[low:high].T))
+        wrong[one] = not error <= max(_LEAST_ERROR, MAX_SHARE * speed)
+        share[one] = error / max(speed, _SLOW)
     return wrong, share
 
 
@@ -58,13 +60,8 @@ def believed(
     time: FloatArray,
     track: IntArray,
     warnings: Counter[str],
-    *,
-    trusts: bool = False,
 ) -> FloatArray:
-    """Stored velocities (A, 2) of the tracks where they fit the positions, else the derived.
-
-    Those that do not fit are kept if `trusts`; NaN is replaced all the same.
-    """
+    """Stored velocities (A, 2) of the tracks where they fit the positions, else the derived."""
     num_tracks = int(track[-1]) + 1
     if stored is None:
         warnings["tracks without stored velocity (derived)"] += num_tracks
@@ -72,9 +69,16 @@ def believed(
     lacking = np.zeros(num_tracks, np.bool_)
     lacking[track[~np.isfinite(stored).all(axis=1)]] = True
     warnings["tracks without stored velocity (derived)"] += int(lacking.sum())
-    wrong = contradiction(stored, derived, time, track)[0] & ~lacking & (not trusts)
+    wrong = contradiction(stored, derived, time, track)[0] & ~lacking
     warnings["tracks whose stored velocity does not fit (derived)"] += int(wrong.sum())
+    if not (lacking | wrong).any():
+        return stored
     return np.where((lacking | wrong)[track][:, None], derived, stored)
+
+
+def unit_vectors(headings: FloatArray) -> FloatArray:
+    """(A, 2) vectors of length 1 in the directions (A,) [rad]."""
+    return np.column_stack([np.cos(headings), np.sin(headings)])
 
 
 def headings_of_motion(

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.dsc3d.recording import normalise_category
-from shiftsim.data.tracks.build import numbered
+from shiftsim.data.tracks.build import numbered, order_of_rows
 from shiftsim.data.tracks.columns import Columns, recognise
+from shiftsim.data.tracks.motion import unit_vectors
 from shiftsim.errors import ConfigError, ConversionError
 
 _REPAIR = "repair the file, or name other columns with --columns"
@@ -39,14 +40,6 @@ class TrackTable:
     velocities: FloatArray | None  # (A, 2) [m/s]
     sizes: FloatArray | None  # (A, 2) length, width [m]
 
-    def at(self, rows: IntArray) -> "TrackTable":
-        """Some rows, in the order given."""
-        parts = ("time_us", "track", "category", "xy", "headings", "velocities", "sizes")
-        kept: dict[str, Any] = {
-            n: None if (v := getattr(self, n)) is None else v[rows] for n in parts
-        }
-        return replace(self, **kept)
-
 
 def read_tracks(
     path: Path, *, said: Mapping[str, Any] | None = None, hz: float | None = None
@@ -63,7 +56,8 @@ def read_tracks(
         ConfigError: What was said does not fit the file.
     """
     if not path.is_file():
-        raise ConversionError(f"{path} does not exist", "check the path")
+        what = "is no file" if path.exists() else "does not exist"
+        raise ConversionError(f"{path} {what}", "give a CSV or Parquet file")
     is_csv = path.suffix.lower() not in (".parquet", ".pq")
     options = _csv_options(path) if is_csv else None
     names = _names(path, options)
@@ -75,25 +69,32 @@ def read_tracks(
     table = _read(path, columns, options)
     if not len(table):
         raise ConversionError(f"{path} has no rows", "export the tracks again")
-    numbers = {
-        role: _numbers(table, role, columns, path)
-        for role in ("x", "y", "heading", "length", "width", "vx", "vy", "speed")
-        if role in columns.found
-    }
     time_us, rate = _times(table, columns, hz, path)
     track_ids, track = numbered(_ids(table, columns.found["id"].name, path))
     category, categories = _categories(table, columns, track_ids, track, meta)
-    order = np.lexsort((time_us, track))
-    heading = numbers.get("heading")
-    velocity = None
-    if "vx" in numbers and "vy" in numbers:
-        velocity = np.column_stack([numbers["vx"], numbers["vy"]])
-    elif "speed" in numbers and heading is not None:
-        velocity = numbers["speed"][:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    size = None
-    if "length" in numbers and "width" in numbers:
-        size = np.column_stack([numbers["length"], numbers["width"]])
-    xy = np.column_stack([numbers["x"], numbers["y"]]) + np.array(columns.shift)
+    order = order_of_rows(track, time_us)
+    if order is not None:
+        time_us, track, category = time_us[order], track[order], category[order]
+
+    def stacked(*roles: str) -> FloatArray | None:
+        """(A, number of roles) their values, or nothing where one is missing."""
+        if not all(role in columns.found for role in roles):
+            return None
+        out = np.empty((len(track), len(roles)))
+        for place, role in enumerate(roles):
+            values = _numbers(table, role, columns, path)
+            out[:, place] = values if order is None else values[order]
+        return out
+
+    xy = stacked("x", "y")
+    heading = stacked("heading")
+    heading = None if heading is None else heading[:, 0]
+    size, velocity = stacked("length", "width"), stacked("vx", "vy")
+    speed = stacked("speed") if velocity is None else None
+    assert xy is not None  # `recognise` has found them
+    xy += columns.shift
+    if speed is not None and heading is not None:
+        velocity = speed * unit_vectors(heading)
     if columns.reference in ("front", "rear"):
         if heading is None or size is None:
             raise ConfigError(
@@ -101,8 +102,8 @@ def read_tracks(
                 "name these columns",
             )
         back = -0.5 if columns.reference == "front" else 0.5
-        xy += back * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
-    out = TrackTable(
+        xy += back * size[:, :1] * unit_vectors(heading)
+    return TrackTable(
         path.name.partition(".")[0],
         columns,
         rate,
@@ -116,7 +117,6 @@ def read_tracks(
         velocity,
         size,
     )
-    return out if (np.diff(order) == 1).all() else out.at(order)
 
 
 def _csv_options(path: Path) -> tuple[pc.ReadOptions, pc.ParseOptions, str]:
@@ -126,7 +126,8 @@ def _csv_options(path: Path) -> tuple[pc.ReadOptions, pc.ParseOptions, str]:
             start = stream.read(1 << 16)
         lines = start.decode("utf-8-sig").splitlines()[:2]
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        raise ConversionError(f"{path}: not readable as CSV ({error})", _REPAIR) from error
+        what = f"{path}: not readable as CSV ({error})"
+        raise ConversionError(what, "give CSV in UTF-8, or Parquet (.parquet)") from error
     if not lines:
         raise ConversionError(f"{path} is empty", "export the tracks again")
     delimiter = max(_DELIMITERS, key=lines[0].count)
@@ -164,7 +165,12 @@ def _read(path: Path, columns: Columns, options: Any) -> pa.Table:
             },
             decimal_point=point,
         )
-        return pc.read_csv(path, read_options=read, parse_options=parse, convert_options=convert)
+        how = {"read_options": read, "parse_options": parse, "convert_options": convert}
+        try:  # block by block takes half the memory; types are those of the first block
+            with pc.open_csv(path, **how) as stream:
+                return stream.read_all()
+        except pa.ArrowInvalid:
+            return pc.read_csv(path, **how)
     except (OSError, pa.ArrowException, ValueError) as error:
         raise ConversionError(f"{path}: not readable ({error})", _REPAIR) from error
 
@@ -179,7 +185,7 @@ def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatA
             what = f"column {role!r} is {column.constant!r} for all rows"
             raise ConfigError(what, f"{role} = '=NUMBER'") from None
     try:
-        values = table[column.name].cast(pa.float64()).to_numpy().astype(np.float64, copy=True)
+        values = _floats(table[column.name])
     except (pa.ArrowException, ValueError) as error:
         what = f"{path}: column {column.name!r} is {table[column.name].type}, need numbers"
         raise ConversionError(what, _REPAIR) from error
@@ -192,6 +198,12 @@ def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatA
         )
     values *= column.factor(role)
     return np.pi / 2 - values if column.unit == "compass" else values
+
+
+def _floats(column: pa.ChunkedArray) -> FloatArray:
+    """(A,) numbers that may be written; NaN where there is none."""
+    values: FloatArray = column.cast(pa.float64(), safe=False).to_numpy()  # ns have 64 bits
+    return values if values.flags.writeable else values.copy()
 
 
 def _times(
@@ -212,14 +224,16 @@ def _times(
     if values is None:
         raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
     try:
-        if pa.types.is_timestamp(values.type):
-            values = values.cast(pa.timestamp("us")).cast(pa.int64())
-            column = replace(column, unit="us")
-        exact = values.cast(pa.float64()).to_numpy()
-        stamps = exact * 1e6 / rate if role == "frame" and rate else exact * column.factor(role)
+        if pa.types.is_timestamp(values.type) or pa.types.is_duration(values.type):
+            column = replace(column, unit=values.type.unit)
+            values = values.cast(pa.int64())
+        stamps = _floats(values)
     except (pa.ArrowException, ValueError) as error:
         what = f"{path}: column {column.name!r} is {values.type}, need times"
-        raise ConversionError(what, _REPAIR) from error
+        hint = "give seconds, or dates and times such as 2024-05-01T13:02:03.040"
+        raise ConversionError(what, hint) from error
+    stamps *= 1e6 if role == "frame" else column.factor(role)
+    stamps /= rate if role == "frame" and rate else 1.0
     bad = np.flatnonzero(~(np.abs(stamps) < 2.0**55))
     if len(bad):
         raise ConversionError(
@@ -227,15 +241,15 @@ def _times(
             f" in data row {bad[0] + 1}",
             "check its unit: [units] time = 's', 'ms', 'us' or 'ns'; leave empty rows out",
         )
-    return np.rint(stamps).astype(np.int64), rate if role == "frame" else None
+    return np.rint(stamps, out=stamps).astype(np.int64), rate if role == "frame" else None
 
 
 def _ids(table: pa.Table, name: str, path: Path) -> pa.ChunkedArray:
     """Integers or texts."""
     column = table[name]
-    if column.null_count:
+    if empty := int(column.is_null(nan_is_null=True).to_numpy().sum()):
         raise ConversionError(
-            f"{path}: column {name!r} is empty in {column.null_count} rows", "give objects ids"
+            f"{path}: column {name!r} is empty in {empty} rows", "give objects ids"
         )
     if pa.types.is_floating(column.type):
         values = column.to_numpy()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from shiftsim.arrays import FloatArray, IntArray
@@ -36,6 +37,17 @@ class TrackSamples:
     def time(self) -> FloatArray:
         """(A,) time of the rows since the first frame [s]."""
         return self.clock[self.frame]
+
+    @cached_property
+    def by_frame(self) -> IntArray:
+        """(A,) rows sorted by frame, then track."""
+        return np.argsort(self.frame, kind="stable")
+
+    @cached_property
+    def frame_ptr(self) -> IntArray:
+        """(F + 1,) where the rows of each frame begin in `by_frame`, and the number of rows."""
+        counts = np.bincount(self.frame, minlength=len(self.clock))
+        return np.concatenate([[0], np.cumsum(counts)])
 
     @property
     def duration(self) -> float:

@@ -2,6 +2,8 @@
 
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +23,13 @@ _DATA, PARTIAL, _INTERRUPTED = 2, 3, 130
 
 
 Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
+_Window = Annotated[
+    float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
+]
+_Overlap = Annotated[float | None, typer.Option(help="Overlap of windows [s]. [6]")]
+_History = Annotated[
+    float | None, typer.Option(help="Part of a window before iteration 0 [s]. [3]")
+]
 MAX_NAMED = 20
 
 
@@ -106,13 +115,9 @@ def dsc3d(
     country: Annotated[
         str | None, typer.Option(help="Whose speed limits hold where the map has none. [DE]")
     ] = None,
-    window_s: Annotated[
-        float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
-    ] = None,
-    overlap_s: Annotated[float | None, typer.Option(help="Overlap of windows [s]. [6]")] = None,
-    history_s: Annotated[
-        float | None, typer.Option(help="Part of a window before iteration 0 [s]. [3]")
-    ] = None,
+    window_s: _Window = None,
+    overlap_s: _Overlap = None,
+    history_s: _History = None,
     padding_s: Annotated[
         float | None, typer.Option(help="History made up before the first frame [s]. [0]")
     ] = None,
@@ -134,12 +139,8 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
-    from functools import partial
-
     from shiftsim.data.deepplan.convert import convert_dsc3d
     from shiftsim.files import store_path
-    from shiftsim.runs.config import default_workers
-    from shiftsim.runs.workers import map_unordered
 
     flags = {
         "country": country,
@@ -152,20 +153,16 @@ def dsc3d(
     }
     options = _options(config, {name: value for name, value in flags.items() if value is not None})
     folder = store_path(store)
-    count = settings.get("workers") or default_workers()
-    with progress_bar(quiet=quiet or as_json) as advance:
-        try:
-            report = convert_dsc3d(
-                source,
-                folder,
-                site=site,
-                map_path=map_path,
-                options=options,
-                progress=advance,
-                spread=partial(map_unordered, workers=count),
-            )
-        except KeyboardInterrupt:
-            raise interrupted() from None
+    with in_parts(settings, quiet=quiet or as_json) as (advance, spread):
+        report = convert_dsc3d(
+            source,
+            folder,
+            site=site,
+            map_path=map_path,
+            options=options,
+            progress=advance,
+            spread=spread,
+        )
     if as_json:
         from dataclasses import asdict
 
@@ -198,13 +195,9 @@ def tracks(
         Path | None, typer.Option(help="Names, units and kinds of the columns in TOML.")
     ] = None,
     city: Annotated[str | None, typer.Option(help="Name of the map. [name of MAP]")] = None,
-    window_s: Annotated[
-        float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
-    ] = None,
-    overlap_s: Annotated[float | None, typer.Option(help="Overlap of windows [s]. [6]")] = None,
-    history_s: Annotated[
-        float | None, typer.Option(help="Part of a window before iteration 0 [s]. [3]")
-    ] = None,
+    window_s: _Window = None,
+    overlap_s: _Overlap = None,
+    history_s: _History = None,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -273,12 +266,23 @@ def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None
         typer.echo(f" picture: {path}", err=True)
 
 
-def interrupted() -> typer.Exit:
-    """What ends a conversion that was stopped by hand."""
-    again = shlex.join(["shiftsim", *sys.argv[1:]])
-    typer.echo("error: interrupted", err=True)
-    typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
-    return typer.Exit(_INTERRUPTED)
+@contextmanager
+def in_parts(settings: cli.Settings, *, quiet: bool) -> Iterator[tuple[Any, Any]]:
+    """A progress bar and what spreads work over processes; a stop by hand says how to go on."""
+    from functools import partial
+
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
+
+    count = settings.get("workers") or default_workers()
+    with progress_bar(quiet=quiet) as advance:
+        try:
+            yield advance, partial(map_unordered, workers=count)
+        except KeyboardInterrupt:
+            again = shlex.join(["shiftsim", *sys.argv[1:]])
+            typer.echo("error: interrupted", err=True)
+            typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
+            raise typer.Exit(_INTERRUPTED) from None
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.convert import MAX_NAMED, PARTIAL, Store, app, interrupted
+from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json
+from shiftsim.cli.convert import MAX_NAMED, PARTIAL, Store, app, in_parts
 
 if TYPE_CHECKING:
     from shiftsim.data.open_data.scenes import Reader
@@ -93,29 +93,16 @@ def _convert_scenes(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    from functools import partial
-
     from shiftsim.data.open_data.scenes import convert_scenes
     from shiftsim.errors import one_of
     from shiftsim.files import store_path
-    from shiftsim.runs.config import default_workers
-    from shiftsim.runs.workers import map_unordered
 
     vehicles = one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
     folder = store_path(store)
-    count = settings.get("workers") or default_workers()
-    with progress_bar(quiet=quiet or as_json) as advance:
-        try:
-            report = convert_scenes(
-                reader,
-                source,
-                folder,
-                vehicles=vehicles,
-                progress=advance,
-                spread=partial(map_unordered, workers=count),
-            )
-        except KeyboardInterrupt:
-            raise interrupted() from None
+    with in_parts(settings, quiet=quiet or as_json) as (advance, spread):
+        report = convert_scenes(
+            reader, source, folder, vehicles=vehicles, progress=advance, spread=spread
+        )
     if as_json:
         from dataclasses import asdict
 

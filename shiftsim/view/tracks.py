@@ -16,7 +16,7 @@ from shiftsim.world.state import AgentKind
 
 _ROAD, _LINE = "#dcdcd8", "#b8b8b2"
 _MARGIN = 0.05  # of the extent
-_MAX_POINTS = 300_000
+_MAX_POINTS = 200_000
 _MAX_EGOS = 40
 
 
@@ -31,7 +31,7 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
     road, table = looked.road, looked.table
     bounds = road.edges.polygons.bounds
     whole = np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
-    own = np.concatenate([*np.percentile(table.xy, (0.1, 99.9), axis=0)])
+    own = np.concatenate([*np.percentile(table.xy[:: _step(table)], (0.1, 99.9), axis=0)])
     inside = (own[:2] >= whole[:2] - 100.0).all() and (own[2:] <= whole[2:] + 100.0).all()
     alone = not inside or (own[2:] - own[:2]).max() < 0.2 * (whole[2:] - whole[:2]).max()
     both = np.concatenate([np.minimum(whole[:2], own[:2]), np.maximum(whole[2:], own[2:])])
@@ -99,16 +99,22 @@ def _draw_road(axes: Any, road: VectorMap, box: FloatArray) -> None:
 
 def _draw_tracks(axes: Any, table: TrackTable) -> None:
     """One line per object, broken between objects."""
-    kinds = np.array([KINDS.get(name, -1) for name in table.categories])[table.category]
-    every = max(1, len(table.xy) // _MAX_POINTS)
+    shown = np.arange(0, len(table.xy), _step(table))
+    codes = np.array([KINDS.get(name, -1) for name in table.categories])
+    kinds = codes[table.category[shown]]
     for kind in np.unique(kinds).tolist():
-        rows = np.flatnonzero(kinds == kind)[::every]
+        rows = shown[kinds == kind]
         breaks = np.flatnonzero(np.diff(table.track[rows])) + 1
         xy = np.insert(table.xy[rows], breaks, np.nan, axis=0)
         known = AgentKind(kind) if kind >= 0 else None
         colour = OTHER_AGENT if known is None else AGENTS.get(known, OTHER_AGENT)
         name = known.name.lower().replace("_", " ") if known is not None else "unknown kind"
         axes.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=0.6, zorder=3, label=name)
+
+
+def _step(table: TrackTable) -> int:
+    """Every how many rows are drawn."""
+    return max(1, len(table.xy) // _MAX_POINTS)
 
 
 def _draw_egos(axes: Any, made: Converted) -> None:

@@ -1,6 +1,8 @@
 """Tables with wrong units, axes, orders or origins: each is named, and its remedy repairs it."""
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from track_files import export_town, write_tracks
 
@@ -183,6 +185,30 @@ SPOILT = {
     "places of the rear": (_along(-0.5), "in turns", "reference = 'rear'", {"reference": "rear"}),
     "one id for two objects": (_merged, "has two rows", "ids of their own", None),
     "a row far away": (_jumping, "jumps 79.6 m", "a row is wrong", None),
+    "a place of -9999 for what is not known": (
+        lambda c: {"x_m": np.where(np.arange(len(c["x_m"])) % 33 == 5, -9999.0, c["x_m"])},
+        "jumps",
+        "lead to x = -9999 m",
+        None,
+    ),
+    "negative sizes": (
+        _times(SIZES, -1),
+        "lengths and widths are negative",
+        "length = '-NAME'",
+        {"columns": {"length": "-length_m", "width": "-width_m"}},
+    ),
+    "one car of 300 m": (
+        lambda c: {"length_m": np.where(c["track"] == c["track"][0], 300.0, c["length_m"])},
+        "300 m long",
+        "correct its size",
+        None,
+    ),
+    "yards": (
+        _times(PLACES + SPEEDS, 1 / 0.9144),
+        "91% of the moving vehicles are on drivable area",
+        "no other unit, axis or origin fits better",
+        None,
+    ),
     "numbers for kinds": (
         lambda c: {"kind": np.where(c["kind"] == "pedestrian", 1, 2)},
         "kinds '1', '2' are unknown",
@@ -312,3 +338,55 @@ def test_repeated_rows_are_named(town, tmp_path):
 def test_what_is_said_wrongly_is_named(said, what, town, tmp_path):
     with pytest.raises(ConfigError, match=what):
         read_tracks(write_tracks(tmp_path / "t.csv", town[0]), said=said)
+
+
+def test_a_clock_of_its_own_for_every_object_is_named(town, tmp_path):
+    columns, road = town
+    first = {name: columns["time_s"][columns["track"] == name].min() for name in columns["track"]}
+    since = columns["time_s"] - np.array([first[name] for name in columns["track"].tolist()])
+    path = write_tracks(tmp_path / "t.csv", columns, frame=None, time_s=np.round(since, 3))
+    (note,) = _doubts(path, road).notes
+    assert "24 objects appear at the first time" in note.what
+    assert "one clock for all" in note.remedy
+
+
+def test_a_column_that_is_there_twice_is_named(town, tmp_path):
+    path = write_tracks(tmp_path / "t.csv", town[0])
+    path.write_text(path.read_text().replace("heading_rad", "x_m", 1))
+    with pytest.raises(ConversionError, match="2 columns 'x_m'"):
+        read_tracks(path)
+
+
+@pytest.mark.parametrize("kind", ["timestamp[ns, tz=UTC]", "timestamp[s]", "duration[us]", "int64"])
+def test_times_may_be_dates_or_durations(kind, town, tmp_path):
+    columns, _ = town
+    time = pa.array(np.rint(columns["frame"] / 12.5).astype(np.int64) + 1_700_000_000)
+    types = {"timestamp[ns, tz=UTC]": pa.timestamp("ns", "UTC"), "timestamp[s]": pa.timestamp("s")}
+    if kind == "int64":
+        time, unit = pa.array(time.to_numpy() * 10**9), "ns"
+    elif kind == "duration[us]":
+        time, unit = pa.array(time.to_numpy() * 10**6).cast(pa.duration("us")), "s"
+    else:
+        time, unit = time.cast(pa.timestamp("s")).cast(types[kind]), "s"
+    table = pa.table({**columns, "time_s": time, "frame": columns["frame"]}).drop_columns("frame")
+    pq.write_table(table, tmp_path / "t.parquet")
+    found = read_tracks(tmp_path / "t.parquet", said={"units": {"time": unit}})
+    assert set(np.diff(np.unique(found.time_us)).tolist()) == {1_000_000}
+    assert found.time_us.min() == 1_700_000_000_000_000
+
+
+def test_objects_without_an_id_are_named(town, tmp_path):
+    columns, _ = town
+    ids = np.where(columns["track"] == 4, np.nan, columns["track"])
+    pq.write_table(pa.table({**columns, "track": ids}), tmp_path / "t.parquet")
+    with pytest.raises(ConversionError, match="'track' is empty in"):
+        read_tracks(tmp_path / "t.parquet")
+
+
+def test_a_clock_of_twelve_hours_is_refused_with_what_is_right(town, tmp_path):
+    columns, _ = town
+    names = np.array([f"01:00:{second:06.3f} PM" for second in columns["time_s"]])
+    path = write_tracks(tmp_path / "t.csv", columns, frame=None, time_s=names)
+    with pytest.raises(ConversionError, match="need times") as error:
+        read_tracks(path)
+    assert "2024-05-01T13" in error.value.hint
