@@ -5,7 +5,9 @@ import subprocess
 import sys
 import tarfile
 from pathlib import Path
+from time import process_time
 
+import numpy as np
 import pytest
 
 from shiftsim.data.demo.store import bench_scene
@@ -16,12 +18,14 @@ from shiftsim.planners.registry import run_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.task import Batch, TaskRunner
+from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
+from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
 from shiftsim.verify.scenes import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
-WHOLE_TARGET, METRICS_TARGET = 25e-3, 5e-3  # s
+WHOLE_TARGET, METRICS_TARGET, SEALING_TARGET = 25e-3, 5e-3, 1e-6  # s
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +81,46 @@ def test_whole_scenario(measure, runner, name):
 def test_step_loop(measure, scenes, runner, name):
     planner = runner.planners["constant-velocity"].make()
     measure(lambda: simulate(scenes[name], planner), calls=1)
+
+
+class PlainSight(Sight):
+    """Shows views of the rows of the rollout, writable as they are: what costs least to write."""
+
+    def __init__(self, *arrays):
+        super().__init__(*arrays)  # takes its time once per rollout
+        self._plain = arrays
+
+    def at(self, iteration, row):
+        time_us, ego, tracks, lights = self._plain
+        past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
+        history = History(time_us[past], ego[past], tracks.rows(past))
+        return Observation(iteration, self._times[row], history, lights.rows(slice(row, row + 1)))
+
+
+@pytest.mark.parametrize("agents", [10, 100, 300])
+def test_sealed_observations(size, note, monkeypatch, agents):
+    """What a step takes more than with plain views, as processor time of alternating rollouts."""
+    scene, planner = bench_scene(agents, 0), run_planner("constant-velocity", {}).make()
+
+    def step_seconds(sight):
+        monkeypatch.setattr(loop, "Sight", sight)
+        began = process_time()
+        for _ in range(size(4)):
+            simulate(scene, planner)
+        return (process_time() - began) / size(4) / (scene.num_iterations - 1)
+
+    def pair(number):  # each goes first as often as the other
+        first, second = (Sight, PlainSight) if number % 2 else (PlainSight, Sight)
+        taken = {first: step_seconds(first), second: step_seconds(second)}
+        return taken[Sight], taken[PlainSight]
+
+    pair(0)
+    sealed, plain = np.array([pair(number) for number in range(size(60, 2))]).T
+    more = float(np.median(sealed - plain))
+    note(step=float(np.median(sealed)))
+    print(f"\nsealed observations, {agents} agents: {more * 1e6:+.2f} µs of a step of", end="")
+    print(f" {np.median(sealed) * 1e6:.1f} µs", end="")
+    assert more <= SEALING_TARGET or size(0, 1)
 
 
 @pytest.mark.parametrize("name", NAMES)

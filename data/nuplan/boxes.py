@@ -12,10 +12,7 @@ from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import STORE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
 
-_COLUMNS = {
-    **{"x": "x_m", "y": "y_m", "heading": "heading_rad", "vx": "vx_mps", "vy": "vy_mps"},
-    **{"length": "length_m", "width": "width_m"},
-}
+_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
 _KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
 
 
@@ -60,8 +57,22 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
     boxes = Boxes(row[order].astype(np.int64), token, kind[order], values[order])
     counts = Counter[str]() if flaws is None else flaws
     boxes = _checked(log, boxes, counts)
-    note_implausible(log, "lidar_box", _COLUMNS, boxes.values[:, :7], counts)
+    note_implausible("lidar_box", _COLUMNS, boxes.values[:, :7], counts)
+    _bound(boxes.values)
     return boxes
+
+
+def _bound(values: FloatArray) -> None:
+    """Bring boxes, as in `Boxes.values`, into the ranges that a store can hold.
+
+    These are so wide that a box is on the whole map, or off it after the first step, before and
+    after; headings keep their directions.
+    """
+    heading, speed, size = (STORE[name] for name in ("heading_rad", "vx_mps", "length_m"))
+    turned = ~heading.holds(values[:, 2])
+    values[turned, 2] = np.arctan2(np.sin(values[turned, 2]), np.cos(values[turned, 2]))
+    np.clip(values[:, 3:5], speed.low, speed.high, out=values[:, 3:5])  # NaN stays
+    np.minimum(values[:, 5:7], size.high, out=values[:, 5:7])
 
 
 def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
@@ -72,6 +83,7 @@ def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
             np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2]),
             "a pose that is not finite",
         ),
+        (np.isinf(boxes.values[:, 3:5]).any(axis=1), "an infinite velocity"),
         (~np.isfinite(sizes).all(axis=1), "no finite length or width"),
     ):
         if bad.any():

@@ -24,6 +24,7 @@ from shiftsim.data.recording import Window
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
+from shiftsim.world.ranges import STORE
 
 _LOG = logging.getLogger(__name__)
 _MAX_ROWS = 1800  # of one stored part of a log, 90 s: dense tracks of an hour would not fit
@@ -245,6 +246,10 @@ class _Conversion:
         self.writer.add_ego(ego)
         for window in windows:
             flaws["unknown route ids"] += sum(block not in blocks for block in window.route)
+            goal = window.mission_goal
+            if goal is not None and not STORE["goal_pose"].holds(goal).all():
+                flaws["scene: goals off the earth are left out"] += 1
+                window = replace(window, mission_goal=None)
             names = ("first_row", "last_row", "iteration_rows")
             rows = {name: getattr(window, name) - first for name in names}
             self.writer.add_window(replace(window, log_name=name, ego=EGO, **rows))

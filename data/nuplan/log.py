@@ -4,7 +4,7 @@ Columns with pickled content are never read.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -169,19 +169,10 @@ def as_numbers(path: Path, what: str, rows: Sequence[Sequence[object]]) -> Float
 
 
 def note_implausible(
-    log: Log, table: str, columns: Mapping[str, str], values: FloatArray, flaws: Counter[str]
+    table: str, columns: Iterable[str], values: FloatArray, flaws: Counter[str]
 ) -> None:
-    """Count what is implausible in rows (K, C) of a table, as nuPlan runs it.
-
-    `columns` names the C columns, each with the one of a store that must be able to hold it.
-
-    Raises:
-        ConversionError: It cannot.
-    """
-    for index, (name, stored) in enumerate(columns.items()):
-        where = f"{log.path}: {table} {name!r} as"
-        is_speed = stored.endswith("_mps")
-        require(STORE, stored, values[:, index], where, error=ConversionError, may_be_nan=is_speed)
+    """Count what is implausible in rows (K, C) of a table with these columns, as nuPlan runs it."""
+    for index, name in enumerate(columns):
         allowed = NUPLAN_LOG[f"{table} {name}"]
         beyond = int((~allowed.holds(values[:, index])).sum())
         flaws[f"{table}: {name} beyond {allowed}"] += beyond
@@ -257,7 +248,10 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
             hint="leave this scenario out or repair the log",
         )
     counts = Counter[str]() if flaws is None else flaws
-    note_implausible(log, "ego_pose", _EGO_COLUMNS, states[:, :7], counts)
+    note_implausible("ego_pose", _EGO_COLUMNS, states[:, :7], counts)
+    for name, values in zip(_EGO_COLUMNS, states.T, strict=False):
+        where = f"{log.path}: ego_pose {name!r} as"
+        require(STORE, _EGO_COLUMNS[name], values, where, error=ConversionError)
     return states
 
 

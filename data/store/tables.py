@@ -26,6 +26,7 @@ REPAIR = "the store is damaged: convert it again"
 _SHA256 = re.compile("[0-9a-f]{64}")
 _FOOTER = "shiftsim"
 _COMPRESSION, _LEVEL = "zstd", 1
+_BUFFER = 1 << 20  # bytes
 _REPEATING = ("length_m", "width_m", "log", "type", "city")  # columns of few values
 
 
@@ -98,6 +99,22 @@ def read_manifest(store: Path) -> dict[str, Any]:
     return manifest
 
 
+class TableWriter(pq.ParquetWriter):  # type: ignore[misc]
+    """Writes a Parquet file in few large pieces, where Arrow would write each part of a column."""
+
+    def __init__(self, path: Path, described: pa.Schema, **options: Any) -> None:
+        """Begin the file; the options are those of Arrow's writer."""
+        self._stream = pa.output_stream(path, compression=None, buffer_size=_BUFFER)
+        super().__init__(self._stream, described, **options)
+
+    def close(self) -> None:
+        """Finish the file."""
+        try:
+            super().close()
+        finally:
+            self._stream.close()
+
+
 def write_blocks(
     path: Path, blocks: Iterable[pa.Table], footer: Mapping[str, object] | None = None
 ) -> None:
@@ -113,7 +130,7 @@ def write_blocks(
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         whole_file(path) as partial,
-        pq.ParquetWriter(
+        TableWriter(
             partial,
             described,
             compression=_COMPRESSION,

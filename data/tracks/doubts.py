@@ -37,10 +37,10 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
     if unknown := [
         name for i, name in enumerate(table.categories) if i in used and name not in KINDS
     ]:
-        names = ", ".join(map(repr, unknown))
+        names = ", ".join(repr(name[:40]) for name in unknown[:8])
         out.say(
             f"kinds {names} are unknown",
-            f"say what they are in a TOML file for --columns: [kinds] {unknown[0]!r} = 'car';"
+            f"say what they are in a TOML file for --columns: [kinds] {unknown[0][:40]!r} = 'car';"
             f" known are {', '.join(sorted(KINDS))}",
         )
         return out

@@ -18,9 +18,11 @@ from shiftsim.data.tracks.build import numbered, order_of_rows
 from shiftsim.data.tracks.columns import Columns, recognise
 from shiftsim.data.tracks.motion import unit_vectors
 from shiftsim.errors import ConfigError, ConversionError
+from shiftsim.world.ranges import OPEN_DATA, require
 
 _REPAIR = "repair the file, or name other columns with --columns"
 _DELIMITERS = ",;\t|"
+_FIELDS = {"x": "position", "y": "position", "heading": "heading"}  # what nothing can make up for
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,9 @@ def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatA
             "leave these rows out of the file",
         )
     values *= column.factor(role)
+    if role in _FIELDS:
+        where = f"{path}: column {column.name!r} as"
+        require(OPEN_DATA, _FIELDS[role], values, where, error=ConversionError)
     return np.pi / 2 - values if column.unit == "compass" else values
 
 
@@ -219,7 +224,7 @@ def _times(
             "say how many there are per second: --hz 25",
         )
     if role == "frame" and not 0.0 < float(rate or 0.0) < np.inf:
-        raise ConfigError(f"hz is {rate!r}", "--hz 25")
+        raise ConfigError(f"{path}: hz is {rate!r}", "--hz 25")
     values = table[column.name] if column.name else None
     if values is None:
         raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
@@ -291,17 +296,19 @@ def _beside(
     prefix: Path, said: dict[str, Any], names: list[str]
 ) -> tuple[dict[str, Any], dict[int, str] | None]:
     """Rate and kinds from the files of levelXdata beside the tracks; the user's word goes first."""
-    meta = None
+    meta, file = None, prefix
     rates, kinds = (prefix.with_name(f"{prefix.name}{n}Meta.csv") for n in ("recording", "tracks"))
     try:
-        if os.path.isfile(rates) and "hz" not in said:
+        if os.path.isfile(file := rates) and "hz" not in said:
             found = pc.read_csv(rates).to_pydict()
             said["hz"] = float(found["frameRate"][0])
-        if os.path.isfile(kinds) and not {"class", "kind"} & {name.lower() for name in names}:
+        if os.path.isfile(file := kinds) and not {"class", "kind"} & {
+            name.lower() for name in names
+        }:
             found = pc.read_csv(kinds).to_pydict()
             number = "trackId" if "trackId" in found else "id"
             meta = dict(zip(found[number], map(str, found["class"]), strict=True))
             said["columns"] = {"kind": "=meta"} | said.get("columns", {})
     except (OSError, pa.ArrowException, KeyError, ValueError, IndexError, TypeError) as error:
-        raise ConversionError(f"{prefix}*Meta.csv: not readable ({error!r})", _REPAIR) from error
+        raise ConversionError(f"{file}: not readable ({error!r})", _REPAIR) from error
     return said, meta

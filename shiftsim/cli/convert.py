@@ -210,7 +210,7 @@ def tracks(
     """
     from shiftsim.data.store.tables import picture_file
     from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
-    from shiftsim.errors import ConversionError
+    from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml, store_path
 
     flags = {"window_s": window_s, "overlap_s": overlap_s, "history_s": history_s}
@@ -218,7 +218,10 @@ def tracks(
     said = read_toml(columns) if columns else {}
     egos = None if ego is None or "all" in ego else ego
     folder = store_path(store)
-    looked = look_at(source, map_path, city=city, said=said, hz=hz, config=config)
+    try:
+        looked = look_at(source, map_path, city=city, said=said, hz=hz, config=config)
+    except ConfigError as error:
+        raise ConfigError(f"{columns or source}: {error.message}", error.hint) from error
     picture = picture_file(folder, looked.road.name, looked.table.name)
     try:
         report, made = convert_tracks(looked, folder, egos=egos, config=config)

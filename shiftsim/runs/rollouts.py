@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.data.store.schema import EGO_COLUMNS
+from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import DataError
 from shiftsim.files import draft
 from shiftsim.sim.log import SimulationLog
@@ -264,7 +265,7 @@ class PartWriter:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._number = next_number(folder)
-        self._writer: pq.ParquetWriter | None = None
+        self._writer: TableWriter | None = None
         self._partial = folder  # what it writes to
         self._pending: list[tuple[Task, pa.RecordBatch]] = []
         self._count = self._rows = self._bytes = 0  # in the file under way
@@ -300,7 +301,7 @@ class PartWriter:
         schema = pa.schema([*_KEY, *rows.schema])
         if self._writer is None:
             self._partial = draft(self._path)
-            self._writer = pq.ParquetWriter(self._partial, schema, **_WRITE_OPTIONS)
+            self._writer = TableWriter(self._partial, schema, **_WRITE_OPTIONS)
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))
         self._pending.clear()

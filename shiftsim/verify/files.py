@@ -23,6 +23,7 @@ from shiftsim.verify.report import Report
 EXACT = 0.0
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 RUN_KEY = ("scene", "challenge", "planner")
+DAMAGED = "the file is damaged, or not what its name says; make it or get it again"
 # Tolerance of all, or by name, "" being that of all others; exact where there is none
 Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
 
@@ -186,7 +187,7 @@ def read_table(path: Path, report: Report) -> Source:
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable Parquet file ({error})") from error
+        raise DataError(f"{path}: not a readable Parquet file ({error})", DAMAGED) from error
     columns = {name: table[name].to_numpy() for name in table.column_names}
     return Source(path.stem, "column", columns, report)
 

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import lzma
 import re
 import sqlite3
 from contextlib import closing
@@ -285,6 +286,25 @@ def _checkpoint(path: Path, random: Random) -> str:
     return what
 
 
+def _header(path: Path, random: Random) -> str:
+    """A value of the header of a safetensors file away or changed."""
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end])
+    what = change_value(header, random)
+    new = json.dumps(header).encode()
+    path.write_bytes(len(new).to_bytes(8, "little") + new + data[end:])
+    return what
+
+
+def _packed(path: Path, random: Random) -> str:
+    """What an xz file holds, damaged as bytes."""
+    path.write_bytes(lzma.decompress(path.read_bytes()))
+    what = _bytes(path, random)
+    path.write_bytes(lzma.compress(path.read_bytes(), preset=0))
+    return f"inside: {what}"
+
+
 _WAYS: dict[str, Any] = {
     ".xodr": (_xml, _xml, _text),
     ".db": (_database,),
@@ -296,4 +316,7 @@ _WAYS: dict[str, Any] = {
     ".txt": (_text, _lines),
     ".pth": (_checkpoint,),
     ".ckpt": (_checkpoint,),
+    ".safetensors": (_header,),
+    ".csv": (_text, _text, _lines),
+    ".xz": (_packed,),
 }

@@ -15,11 +15,13 @@ import dsc3d_writer
 import numpy as np
 import open_data_files
 import opendrive_xml
+from fuzz.tables import read_results, read_track_table, write_results, write_track_tables
 from places import GOLDEN
 from stores import write_toy_store
 
 from shiftsim.data.store.plausible import require_plausible, require_sound
 from shiftsim.errors import DataError
+from shiftsim.planners.table import shipped_file
 from shiftsim.runs.results import _RANGES as RUN_COLUMNS
 from shiftsim.world.map import LAYERS, VectorMap
 from shiftsim.world.ranges import (
@@ -265,7 +267,7 @@ def _read_site(folder: Path) -> Any:
     recordings = [read_recording(site, name) for name in site.recordings]
     short = ConversionConfig(window_s=4.0, overlap_s=1.0, history_s=1.0, min_drivable_share=0.0)
     convert_dsc3d(folder, folder / "store", options=short)
-    return site, recordings, _read_store(folder / "store")
+    return site, recordings, read_store(folder / "store")
 
 
 def _open_data(folder: Path) -> None:
@@ -290,7 +292,8 @@ def _stores(folder: Path) -> None:
     write_toy_store(folder / "toy", count=2)
 
 
-def _read_store(folder: Path) -> Any:
+def read_store(folder: Path) -> Any:
+    """A store, its maps and scenarios, looked at as `shiftsim check` does."""
     from shiftsim.data.store.check import check_store
     from shiftsim.data.store.reading import ScenarioStore
 
@@ -349,6 +352,8 @@ def _checkpoints(folder: Path) -> None:
     save({"state_dict": few}, folder / "legacy/model.pth", _use_new_zipfile_serialization=False)
     save({"state_dict": few, "x": Path("y")}, folder / "object/model.pth")
     save_file(few, folder / "safetensors/model.safetensors", {"args": '{"x": 1}'})
+    (folder / "own").mkdir()
+    shutil.copy(shipped_file("carl"), folder / "own")
 
 
 def _read_checkpoint(folder: Path) -> Any:
@@ -363,7 +368,8 @@ def _read_checkpoint(folder: Path) -> Any:
     found = open_checkpoint(find_checkpoint(str(folder)))
     if len(found.state) < 10:  # of no planner
         return {"args": found.args}
-    planner = "diffusion-planner" if (folder / "args.json").exists() else "plantf"
+    known = {"args.json": "diffusion-planner", shipped_file("carl").name: "carl"}
+    planner = next((name for file, name in known.items() if (folder / file).exists()), "plantf")
     args = needed_args(found, planner)
     state = checked_state(found, planner, args)
     network_module(planner).build_network(args).load_state_dict(state)
@@ -457,10 +463,12 @@ TARGETS = {
     "nuplan-map": Target(_packages, _read_package),
     "dsc3d": Target(_sites, _read_site, "*.[jp]*"),
     "open-data": Target(_open_data, _read_open_data, "*.[ajpx]*"),
-    "store": Target(_stores, _read_store),
+    "store": Target(_stores, read_store),
     "run-folder": Target(_runs, _read_run),
     "checkpoint": Target(_checkpoints, _read_checkpoint),
     "settings": Target(_settings, _read_settings),
     "split": Target(_splits, _read_split),
     "reviews": Target(_reviews, _read_reviews),
+    "tracks": Target(write_track_tables, read_track_table),
+    "experiment": Target(write_results, read_results),
 }

@@ -208,7 +208,8 @@ def _compare_means(table: Source) -> Source:
             values = table[metric][members].astype(np.float64)
             total = float(np.nansum(values)) if not np.isnan(values).all() else np.nan
             # nuPlan rule 606: metrics of a scenario type are added up, only the score is a mean
-            means[metric] = total / len(values) if is_final or metric == "score" else total
+            is_mean = is_final or metric == "score"
+            means[metric] = total / max(len(values), 1) if is_mean else total
         for column, mean in means.items():
             where, theirs = f"{name} {planner} {column}", table[column][row]
             table.report.compare("scores of several", where, mean, theirs, atol=TOLERANCE)

@@ -22,7 +22,7 @@ import numpy as np
 from shiftsim.arrays import IntArray
 from shiftsim.errors import DataError, MissingExtraError
 from shiftsim.planners.learned.reader import BROKEN, PlainReader
-from shiftsim.verify.files import Source
+from shiftsim.verify.files import DAMAGED, Source
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import CENTER_COLUMNS
 from shiftsim.world.state import AgentKind, LightStatus, rear_poses
@@ -31,6 +31,7 @@ DEVKIT = "nuPlan's devkit 1.2.2"  # whose folders are known here
 OTHER_VERSION = f"another version than {DEVKIT}, the one known here, wrote this folder"
 _PACKED = ".msgpack"  # in the name of a log
 _MAX_BYTES = 1 << 30  # of a log, unpacked
+_MAX_MEMORY = 1 << 28  # bytes to unpack it with: the highest level of xz needs a quarter
 _CLASSES = (  # of nuPlan: what is read, and what holds it
     *("Agent", "CarFootprint", "DetectionsTracks", "DynamicCarState", "EgoState", "IDMPlanner"),
     *("InterpolatedTrajectory", "LogFuturePlanner", "NuPlanScenario", "OrientedBox"),
@@ -145,17 +146,19 @@ def read_simulation_log(path: Path, report: Report) -> Recorded:
     except AttributeError as error:
         raise DataError(f"{path}: {error}", OTHER_VERSION) from error
     except (*BROKEN, OSError, lzma.LZMAError, StructError) as error:
-        raise DataError(f"{path}: not a readable simulation log ({error})") from error
+        raise DataError(f"{path}: not a readable simulation log ({error})", DAMAGED) from error
     finally:
         if collects:
             gc.enable()
 
 
 def _unpacked(path: Path) -> bytes:
-    with lzma.open(path) as file:
-        content: Any = file.read(_MAX_BYTES + 1)
+    unpacker = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
+    content: Any = unpacker.decompress(path.read_bytes(), _MAX_BYTES + 1)
     if len(content) > _MAX_BYTES:
         raise ValueError(f"it holds more than {_MAX_BYTES} bytes")
+    if not unpacker.eof:
+        raise ValueError("its end is missing")
     if _PACKED in path.suffixes:
         import msgpack
 

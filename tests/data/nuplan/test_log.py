@@ -12,10 +12,13 @@ import places
 import pytest
 
 from shiftsim.data.nuplan.boxes import read_boxes
+from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.log import open_log, read_ego
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
 from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scenario
+from shiftsim.data.store.plausible import require_plausible
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError, DataError
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.sim.planner import observe_log, past_rows, scene_info
@@ -339,6 +342,47 @@ def test_a_log_of_many_parts_is_warned_of_once(log_path: Path) -> None:
         for first in (0, 100):
             assert not read_boxes(log, first, first + 100, flaws).token
     assert len(+flaws) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "column", "kept"),
+    [
+        ("yaw = 7.0e6", "heading", "poses", np.arctan2(np.sin(7.0e6), np.cos(7.0e6))),
+        ("vx = -3e200", "vx", "velocities", -1e6),
+        ("width = 2e7", "width", "sizes", 1e6),
+    ],
+)
+def test_a_box_that_a_store_could_not_hold_is_brought_into_its_range(
+    log_path: Path, road: VectorMap, change: str, field: str, column: str, kept: float
+) -> None:
+    edit(log_path, f"UPDATE lidar_box SET {change}")
+    flaws: Counter[str] = Counter()
+    scene = read(log_path, road, flaws)
+    (flaw,) = +flaws
+    assert flaw.startswith(f"lidar_box: {field} beyond")
+    found = getattr(scene.tracks, column)[scene.tracks.valid]
+    assert (found == kept).any(axis=1).sum() > 100
+    require_plausible(scene, "ego", log_path)
+
+
+def test_a_goal_off_the_earth_is_left_out_with_one_warning(log_path: Path, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(log_path)) as base:
+        names = ", ".join(row[1] for row in base.execute("PRAGMA table_info(ego_pose)"))
+    others = names.replace("token", "x'0f'", 1).replace(" x,", " 2e9,", 1)
+    edit(
+        log_path,
+        f"INSERT INTO ego_pose ({names}) SELECT {others} FROM ego_pose LIMIT 1",
+        "UPDATE scene SET goal_ego_pose_token = x'0f'",
+    )
+    report = convert_nuplan(log_path, GOLDEN / "maps", tmp_path / "store", tokens=[TOKEN])
+    assert report.flaws == {"log log: scene: goals off the earth are left out": 1}
+    assert ScenarioStore(tmp_path / "store").read(TOKEN).mission_goal is None
+
+
+def test_an_infinite_velocity_is_refused(log_path: Path, road: VectorMap) -> None:
+    edit(log_path, "UPDATE lidar_box SET vy = 9e999")
+    with pytest.raises(ConversionError, match="has an infinite velocity"):
+        read(log_path, road)
 
 
 def test_a_number_that_no_store_can_hold_is_refused(log_path: Path, road: VectorMap) -> None:
