@@ -135,6 +135,16 @@ def test_a_scenario_under_three_seconds_is_an_error(tmp_path):
     assert check_store(_write(tmp_path / "t", scene=cruise_scenario(iterations=31))) == []
 
 
+@pytest.mark.parametrize(
+    ("wanted", "what"), [(3.9, "it lasts 3.9 s"), (15.0, "the log ended before the scenario did")]
+)
+def test_a_short_scenario_is_cut_off_only_where_its_log_ended_early(wanted, what, tmp_path):
+    _write(tmp_path / "s", is_short=True, mapping=(wanted, 0.0, 0.5))
+    problem = _only(tmp_path / "s")
+    assert what in problem.what
+    assert not problem.is_error
+
+
 def test_an_ego_beside_the_map_is_an_error(tmp_path):
     scene = cruise_scenario(iterations=LONG, start=(10.0, 40.0, 0.0))
     problem = _only(_write(tmp_path / "s", scene=scene))
