@@ -51,7 +51,9 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
         words.append(f"{len(made.windows)} scenarios, {len(made.egos)} egos")
     words += [doubt.what for doubt in (*looked.doubts.found, *looked.doubts.notes)]
     handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    look = {"loc": "outside lower center", "ncols": 5, "fontsize": 8, "frameon": False}
+    for sample in figure.legend(handles, labels, **look).get_lines():
+        sample.set_linewidth(2.0)  # lines of the tracks are too thin to tell colours
     figure.suptitle("\n".join(words).replace("$", r"\$"), fontsize=9, wrap=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_picture(figure, path)
@@ -128,4 +130,5 @@ def _draw_egos(axes: Any, made: Converted) -> None:
             to = x[-1] + 6.0 * np.cos(heading), y[-1] + 6.0 * np.sin(heading)
             style = {"arrowstyle": "-|>", "color": RECORDED}
             axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
-            axes.annotate(ego.name, (x[0], y[0]), fontsize=6, color=RECORDED, zorder=6)
+            name = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 6}
+            axes.annotate(ego.name, (x[0], y[0]), color=RECORDED, zorder=6, **name)
