@@ -85,6 +85,11 @@ def planner_factory(spec: str) -> Any:
             compat.install()
             return compat.factory(planner_factory(spec.removeprefix(prefix)))
     entry = PLANNERS.get(spec)
+    if entry is None and spec.endswith(".py"):
+        raise ConfigError(
+            f"planner {spec!r} is a file: which of its classes is meant?",
+            hint=f"write {spec}:MyPlanner",
+        )
     if entry is None and ":" not in spec:
         one_of("planner", spec, PLANNERS)
     module_name, _, attribute = (spec if entry is None else entry.target).rpartition(":")
@@ -101,7 +106,9 @@ def planner_factory(spec: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
-            hint="install it, or run from the directory that holds it",
+            hint="check the path"
+            if in_file
+            else "install it, or run from the folder that holds it",
         ) from error
     factory = getattr(module, attribute, None)
     if not callable(factory):

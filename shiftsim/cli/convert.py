@@ -1,14 +1,22 @@
 """Commands that make scenario stores: convert nuplan, convert dsc3d, convert tracks."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim.cli import (
+    Debug,
+    Json,
+    Quiet,
+    completion,
+    new_app,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+)
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
@@ -17,10 +25,15 @@ if TYPE_CHECKING:
     from shiftsim.data.tracks.convert import Looked
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
-_DATA, PARTIAL, _INTERRUPTED = 2, 3, 130
+_DATA, PARTIAL = 2, 3
 
 
-Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
+Store = Annotated[
+    str,
+    typer.Option(
+        "--store", "-s", help="Name or folder of the store.", autocompletion=completion.stores
+    ),
+]
 MAX_NAMED = 20
 
 
@@ -154,18 +167,15 @@ def dsc3d(
     folder = store_path(store)
     count = settings.get("workers") or default_workers()
     with progress_bar(quiet=quiet or as_json) as advance:
-        try:
-            report = convert_dsc3d(
-                source,
-                folder,
-                site=site,
-                map_path=map_path,
-                options=options,
-                progress=advance,
-                spread=partial(map_unordered, workers=count),
-            )
-        except KeyboardInterrupt:
-            raise interrupted() from None
+        report = convert_dsc3d(
+            source,
+            folder,
+            site=site,
+            map_path=map_path,
+            options=options,
+            progress=advance,
+            spread=partial(map_unordered, workers=count),
+        )
     if as_json:
         from dataclasses import asdict
 
@@ -271,14 +281,6 @@ def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None
         typer.echo(f" no picture: {error.message} ({error.hint})", err=True)
     else:
         typer.echo(f" picture: {path}", err=True)
-
-
-def interrupted() -> typer.Exit:
-    """What ends a conversion that was stopped by hand."""
-    again = shlex.join(["shiftsim", *sys.argv[1:]])
-    typer.echo("error: interrupted", err=True)
-    typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
-    return typer.Exit(_INTERRUPTED)
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:

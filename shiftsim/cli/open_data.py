@@ -7,7 +7,7 @@ import typer
 
 from shiftsim import cli
 from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
-from shiftsim.cli.convert import MAX_NAMED, PARTIAL, Store, app, interrupted
+from shiftsim.cli.convert import MAX_NAMED, PARTIAL, Store, app
 
 if TYPE_CHECKING:
     from shiftsim.data.open_data.scenes import Reader
@@ -105,17 +105,14 @@ def _convert_scenes(
     folder = store_path(store)
     count = settings.get("workers") or default_workers()
     with progress_bar(quiet=quiet or as_json) as advance:
-        try:
-            report = convert_scenes(
-                reader,
-                source,
-                folder,
-                vehicles=vehicles,
-                progress=advance,
-                spread=partial(map_unordered, workers=count),
-            )
-        except KeyboardInterrupt:
-            raise interrupted() from None
+        report = convert_scenes(
+            reader,
+            source,
+            folder,
+            vehicles=vehicles,
+            progress=advance,
+            spread=partial(map_unordered, workers=count),
+        )
     if as_json:
         from dataclasses import asdict
 
