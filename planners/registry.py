@@ -106,9 +106,7 @@ def planner_factory(spec: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
-            hint="check the path"
-            if in_file
-            else "install it, or run from the folder that holds it",
+            hint=_import_hint(module_name),
         ) from error
     factory = getattr(module, attribute, None)
     if not callable(factory):
@@ -286,6 +284,12 @@ def _require_methods(name: str, planner: object) -> None:
                 f"planner {name!r}: {type(planner).__name__} has no method {method}()",
                 hint="a planner has reset(self, scene) and plan(self, observation)",
             )
+
+
+def _import_hint(module_name: str) -> str:
+    if not module_name.endswith(".py"):
+        return "install it, or run from the folder that holds it"
+    return "repair it" if Path(module_name).is_file() else "check the path"
 
 
 def _bind(spec: str, factory: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -89,7 +89,9 @@ def check_one_planner(
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
         findings = check_planner(make, scenario, next(others, None))
+    findings = list(dict.fromkeys(findings))  # what holds of every drive is said once
     errors = [finding for finding in findings if finding.severity == "error"]
+    doubts = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
         say_json([asdict(finding) for finding in findings])
     else:
@@ -98,6 +100,7 @@ def check_one_planner(
             if finding.hint:
                 say(f"   hint: {finding.hint}")
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
+        verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
     if errors:
         raise typer.Exit(_USAGE)

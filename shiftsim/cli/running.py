@@ -236,13 +236,20 @@ def _show(finished: "Run", *, allow_partial: bool) -> None:
         words = (f"{row['token']} {row['planner']} {row['cls']:.2f} {row['reason']}" for row in bad)
         say(f" worst: {' · '.join(words)}")
     lost = failures(finished)
-    for row in lost[:_MAX_NAMED_FAILURES]:
-        say(f" {row['status']}: {row['token']} {row['planner']} {row['noise']}: {row['error']}")
+    alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in lost:
+        alike.setdefault((row["status"], row["error"], row["hint"]), []).append(row)
+    for (status, error, hint), rows in list(alike.items())[:_MAX_NAMED_FAILURES]:
+        more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+        first = f"{rows[0]['token']} {rows[0]['planner']} {rows[0]['noise']}"
+        say(f" {status}: {first}{more}: {error}")
+        if hint:
+            say(f"   hint: {hint}")
     if lost:
         say(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
             f" of {counts['expected']} tasks — shiftsim explain {finished.path} TOKEN"
         )
     say(f" results: {finished.path}")
-    if finished.manifest["config"]["save_rollouts"] == "all":
+    if counts["ok"] and finished.manifest["config"]["save_rollouts"] == "all":
         say(f" replay:  shiftsim view {finished.path}")

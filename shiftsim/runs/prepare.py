@@ -363,5 +363,6 @@ def run_name(config: RunConfig, split: str, determining: dict[str, Any]) -> str:
 
 
 def _joined(names: Sequence[str], what: str) -> str:
-    text = "+".join(re.sub(r"[^A-Za-z0-9.-]+", "-", name) for name in names)
+    # without a dot in front, which would hide the folder
+    text = "+".join(re.sub(r"[^A-Za-z0-9.-]+", "-", name).lstrip(".-") for name in names)
     return text if len(text) <= _MAX_NAME else f"{len(names)}-{what}"
