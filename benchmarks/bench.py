@@ -21,7 +21,7 @@ from shiftsim.report.tables import Table
 from shiftsim.runs.config import DEFAULT_STORE, make_config
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, Prepared, prepare
-from shiftsim.runs.results import Run, open_run
+from shiftsim.runs.results import Run, open_run, stored_results
 
 MANIFEST = "bench.json"
 DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said
@@ -142,7 +142,8 @@ def run_bench(
     for prepared in plan.runs.values():
         if prepared.before == "complete":
             out.append(open_run(prepared.folder))
-            total.show(Progress(len(prepared.tasks), 0, 0))
+            stored = (result for result, _ in stored_results(prepared.folder))
+            total.show(Progress(len(prepared.tasks), 0, 0, news=stored))
         else:
             out.append(execute(prepared, on_progress=total.show, argv=argv))
         total.before = total.now

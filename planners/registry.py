@@ -85,6 +85,11 @@ def planner_factory(spec: str) -> Any:
             compat.install()
             return compat.factory(planner_factory(spec.removeprefix(prefix)))
     entry = PLANNERS.get(spec)
+    if entry is None and spec.endswith(".py"):
+        raise ConfigError(
+            f"planner {spec!r} is a file: which of its classes is meant?",
+            hint=f"write {spec}:MyPlanner",
+        )
     if entry is None and ":" not in spec:
         one_of("planner", spec, PLANNERS)
     module_name, _, attribute = (spec if entry is None else entry.target).rpartition(":")
@@ -101,7 +106,7 @@ def planner_factory(spec: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
-            hint="install it, or run from the directory that holds it",
+            hint=_import_hint(module_name),
         ) from error
     factory = getattr(module, attribute, None)
     if not callable(factory):
@@ -279,6 +284,12 @@ def _require_methods(name: str, planner: object) -> None:
                 f"planner {name!r}: {type(planner).__name__} has no method {method}()",
                 hint="a planner has reset(self, scene) and plan(self, observation)",
             )
+
+
+def _import_hint(module_name: str) -> str:
+    if not module_name.endswith(".py"):
+        return "install it, or run from the folder that holds it"
+    return "repair it" if Path(module_name).is_file() else "check the path"
 
 
 def _bind(spec: str, factory: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,9 @@ tasks, 130 interrupted; `verify` has its own.
 import inspect
 import json
 import os
+import shlex
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +25,7 @@ from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import typer
 
+from shiftsim.cli import completion
 from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.runs.config import RunConfig, parse_argument
 
@@ -66,6 +69,8 @@ def output_kept() -> Iterator[None]:
         with redirect_stdout(sys.stderr):
             yield
     finally:
+        if sys.__stdout__ is not None:
+            sys.__stdout__.flush()  # while it leads to the standard error still
         os.dup2(before, 1)
         os.close(before)
 
@@ -89,18 +94,56 @@ def terminal_width() -> int:
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
 
 
+def show_in_browser(address: str) -> None:
+    """Open an address in the browser, where there is a screen."""
+    import webbrowser
+
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if screen or sys.platform != "linux":
+        webbrowser.open(address)
+
+
 Advance = Callable[[int, int, str], None]
 
 
 @contextmanager
 def progress_bar(*, quiet: bool) -> Iterator[Advance]:
-    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
+    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines.
+
+    It ends the command where an interrupt came and got lost.
+    """
+    with _shown(quiet) as advance:
+
+        def checked(done: int, total: int, note: str) -> None:
+            if _has_come():
+                raise KeyboardInterrupt
+            advance(done, total, note)
+
+        yield checked
+
+
+@contextmanager
+def _shown(quiet: bool) -> Iterator[Advance]:
     if quiet:
         yield lambda done, total, note: None
     elif sys.stderr.isatty():
         yield from _bar()
     else:
         yield _lines()
+
+
+class _Interrupt:
+    """What an interrupt from the terminal does; remembers it, as libraries catch what is raised."""
+
+    came = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        self.came = True
+        raise KeyboardInterrupt
+
+
+def _has_come() -> bool:
+    return getattr(signal.getsignal(signal.SIGINT), "came", False)
 
 
 def _bar() -> Iterator[Advance]:
@@ -184,12 +227,9 @@ def _option(name: str, text: str | None) -> inspect.Parameter:
     elif option.parse:
         kind = str
     flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
-    return inspect.Parameter(
-        name,
-        _KIND,
-        default=None,
-        annotation=Annotated[kind | None, typer.Option(*flags, help=text or option.help)],
-    )
+    offered = completion.BY_SETTING.get(name) or completion.among(*option.choices)
+    words = typer.Option(*flags, help=text or option.help, autocompletion=offered)
+    return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[kind | None, words])
 
 
 def _parsed(name: str, value: Any) -> Any:
@@ -209,6 +249,11 @@ def planner_arguments(
 
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
+# commands that go on with what is finished, and the words that ask for it
+_GOES_ON = {
+    **dict.fromkeys(("filter", "dsc3d", "av2", "py123d", "commonroad"), ()),
+    "train": ("--resume",),
+}
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
@@ -239,6 +284,10 @@ _COMMANDS = {
     "train": "training:app",
     "realism": "training:realism",
 }
+
+
+class Interrupted(Exception):
+    """The user, or the machine, has stopped a command; the text says how to go on."""
 
 
 class _Commands(typer.core.TyperGroup):
@@ -293,11 +342,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _Interrupt())
     try:
         code = _run([word for word in words if word != "--debug"], debug)
     except BrokenPipeError:  # the reader of our output has left, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = _USAGE
+    finally:
+        signal.signal(signal.SIGINT, before)
     sys.exit(code)
 
 
@@ -306,7 +360,9 @@ def _run(words: list[str], debug: bool) -> int:
     try:
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted", "", _INTERRUPTED)
+        code = _INTERRUPTED
+    except Interrupted as error:
+        return _complain("interrupted", str(error), _INTERRUPTED)
     except ShiftsimError as error:
         if debug:
             raise
@@ -322,11 +378,27 @@ def _run(words: list[str], debug: bool) -> int:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "shiftsim"
         return _complain(error.format_message(), f"{path} --help", _USAGE)
+    except Exception:
+        if not _has_come():
+            raise
+        code = _INTERRUPTED  # a library has made something else of it
+    if code == _INTERRUPTED:  # typer has taken the interrupt for itself
+        return _complain("interrupted", _after_interrupt(words), _INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 
+def _after_interrupt(words: list[str]) -> str:
+    """What becomes of the work of a command that was interrupted, and how to go on."""
+    for name in words[:2]:
+        if name in _GOES_ON:
+            again = [*words, *(word for word in _GOES_ON[name] if word not in words)]
+            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *again])}"
+    return f"start again with: {shlex.join(['shiftsim', *words])}" if words else ""
+
+
 def _complain(fact: str, hint: str, code: int) -> int:
-    typer.echo(f"error: {fact}", err=True)
+    over = "\r" if code == _INTERRUPTED and sys.stderr.isatty() else ""  # the ^C of the terminal
+    typer.echo(f"{over}error: {fact}", err=True)
     if hint:
         typer.echo(f"hint: {hint}", err=True)
     return code

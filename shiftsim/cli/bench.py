@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json
-from shiftsim.cli.running import DryRun, interruptible
+from shiftsim.cli import Debug, Json, Quiet, completion, output_kept, plural, say, say_json
+from shiftsim.cli.running import DryRun, Live, announce_data, interruptible, say_dry_run, watched
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,7 +36,13 @@ allow_partial""".split()
     retry_failed="Do again what failed before.",
 )
 def bench(
-    track: Annotated[str, typer.Argument(help="semantic-shift or state-drift.")],
+    track: Annotated[
+        str,
+        typer.Argument(
+            help="semantic-shift or state-drift.",
+            autocompletion=completion.among("semantic-shift", "state-drift"),
+        ),
+    ],
     settings: cli.Settings,
     val14: Annotated[
         str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14 (left out).")
@@ -45,6 +51,7 @@ def bench(
         bool, typer.Option("--published", help="The paper's figures beside the own ones.")
     ] = False,
     dry_run: DryRun = False,
+    live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -63,14 +70,18 @@ def bench(
         settings["planner_args"] = cli.planner_arguments(texts, {}, planners)
     if published:  # beside the paper's figures nothing stands in for the paper's planners
         settings["checkpoints"] = (*settings.get("checkpoints", ()), *_official(settings))
-    plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
+    with output_kept():
+        plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
+    announce_data(list(plan.runs.values()), as_json=as_json)
     if not as_json:
         _announce(plan)
     if dry_run:
-        say("dry run: everything checked, nothing simulated")
+        say_dry_run(list(plan.runs.values()), as_json=as_json)
         return
-    with interruptible(plan.folder, sys.argv[1:], quiet=quiet or as_json) as show:
-        runs = run_bench(plan, on_progress=show, argv=sys.argv)
+    kept = interruptible(plan.folder, sys.argv[1:], quiet=quiet or as_json)
+    prepared = list(plan.runs.values())
+    with output_kept(), kept as show, watched(prepared, plan.folder, live, show) as tell:
+        runs = run_bench(plan, on_progress=tell, argv=sys.argv)
     allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
@@ -146,5 +157,5 @@ def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
     try:
         return figures(groups, allow_partial=allow_partial)
     except MissingExtraError as error:
-        say(f" no pictures: {error.message}; {error.hint}")
+        typer.echo(f" no pictures: {error.message}; {error.hint}", err=True)
         return []

@@ -1,7 +1,5 @@
 """Commands that make scenario stores: convert nuplan, convert dsc3d, convert tracks."""
 
-import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim.cli import (
+    Debug,
+    Json,
+    Quiet,
+    completion,
+    new_app,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+)
 
 if TYPE_CHECKING:
     from shiftsim.data.deepplan.convert import ConversionReport
@@ -19,10 +27,15 @@ if TYPE_CHECKING:
     from shiftsim.data.tracks.convert import Looked
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
-_DATA, PARTIAL, _INTERRUPTED = 2, 3, 130
+_DATA, PARTIAL = 2, 3
 
 
-Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder of the store.")]
+Store = Annotated[
+    str,
+    typer.Option(
+        "--store", "-s", help="Name or folder of the store.", autocompletion=completion.stores
+    ),
+]
 _Window = Annotated[
     float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
 ]
@@ -271,7 +284,7 @@ def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None
 
 @contextmanager
 def in_parts(settings: cli.Settings, *, quiet: bool) -> Iterator[tuple[Any, Any]]:
-    """A progress bar and what spreads work over processes; a stop by hand says how to go on."""
+    """A progress bar, and what spreads work over processes."""
     from functools import partial
 
     from shiftsim.runs.config import default_workers
@@ -279,13 +292,7 @@ def in_parts(settings: cli.Settings, *, quiet: bool) -> Iterator[tuple[Any, Any]
 
     count = settings.get("workers") or default_workers()
     with progress_bar(quiet=quiet) as advance:
-        try:
-            yield advance, partial(map_unordered, workers=count)
-        except KeyboardInterrupt:
-            again = shlex.join(["shiftsim", *sys.argv[1:]])
-            typer.echo("error: interrupted", err=True)
-            typer.echo(f"hint: what is converted is kept; start again with: {again}", err=True)
-            raise typer.Exit(_INTERRUPTED) from None
+        yield advance, partial(map_unordered, workers=count)
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:

@@ -57,7 +57,7 @@ def demo(
         **settings,
     }
     try:
-        run_config(make_config(values, where="demo"), dry_run=False, quiet=quiet, as_json=False)
+        run_config(make_config(values, where="demo"), quiet=quiet)
     finally:
         named = f" --store {folder}" if out else ""
         say()

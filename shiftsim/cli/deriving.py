@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, progress_bar
+from shiftsim.cli import Debug, Json, Quiet, output_kept, progress_bar
 from shiftsim.cli.running import leave_with
 
 
@@ -33,7 +33,7 @@ def score(
 
     run = open_run(source)
     allow_partial = settings.pop("allow_partial", False)
-    with progress_bar(quiet=quiet or as_json) as advance:
+    with output_kept(), progress_bar(quiet=quiet or as_json) as advance:
         finished = rescore(
             run,
             **{"thresholds": run.manifest["config"]["thresholds"], **settings},

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show
+from shiftsim.cli import Debug, Json, completion, new_app, output_kept, plural, say, say_json, show
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -57,11 +57,17 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
 
 @app.command("check")
 def check_one_planner(
-    planner: Annotated[str, typer.Argument(help="Name or package.module:Class.")],
+    planner: Annotated[
+        str,
+        typer.Argument(help="Name or package.module:Class.", autocompletion=completion.planners),
+    ],
     planner_arg: Annotated[
         list[str] | None, typer.Option("--planner-arg", help="key=value; repeatable.")
     ] = None,
-    store: Annotated[str, typer.Option(help="Store with scenarios to try it on.")] = "demo",
+    store: Annotated[
+        str,
+        typer.Option(help="Store with scenarios to try it on.", autocompletion=completion.stores),
+    ] = "demo",
     token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
     as_json: Json = False,
     debug: Debug = False,
@@ -77,13 +83,15 @@ def check_one_planner(
         _, name, value = parse_argument(text, (planner,))
         arguments[name] = value
     scenes = open_named_store(store)
-    scenario = scenes.read(token or scenes.tokens[0])
+    scenario = scenes[token or scenes.tokens[0]]
     others = (scenes.read(name) for name in scenes.tokens if name != scenario.token)
     with output_kept():
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
         findings = check_planner(make, scenario, next(others, None))
+    findings = list(dict.fromkeys(findings))  # what holds of every drive is said once
     errors = [finding for finding in findings if finding.severity == "error"]
+    doubts = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
         say_json([asdict(finding) for finding in findings])
     else:
@@ -92,6 +100,7 @@ def check_one_planner(
             if finding.hint:
                 say(f"   hint: {finding.hint}")
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
+        verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
     if errors:
         raise typer.Exit(_USAGE)

@@ -3,7 +3,7 @@
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,11 +14,12 @@ from shiftsim import cli
 from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
-    from shiftsim.runs.execute import Progress
+    from shiftsim.runs.execute import Progress, Watch
     from shiftsim.runs.prepare import Prepared
     from shiftsim.runs.results import Run
+    from shiftsim.world.scenario import Scenario
 
-_UNFINISHED, _INTERRUPTED = 3, 130
+_UNFINISHED = 3
 _MAX_NAMED_FAILURES = 5
 _BEFORE = {
     "new": "nothing there yet",
@@ -28,6 +29,9 @@ _BEFORE = {
 }
 
 Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win over it.")]
+Live = Annotated[
+    bool, typer.Option("--live", help="Show the run while it lasts, on a page of this machine.")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
@@ -36,6 +40,7 @@ def run(
     settings: cli.Settings,
     config: Config = None,
     dry_run: DryRun = False,
+    live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
     debug: Debug = False,
@@ -51,32 +56,34 @@ def run(
     if texts:
         values["planner_args"] = cli.planner_arguments(texts, before, values.get("planners", ()))
     made = make_config(values, where=str(config) if config else "run")
-    run_config(made, dry_run=dry_run, quiet=quiet, as_json=as_json)
+    run_config(made, dry_run=dry_run, live=live, quiet=quiet, as_json=as_json)
 
 
-def run_config(config: Any, *, dry_run: bool, quiet: bool, as_json: bool) -> None:
+def run_config(
+    config: Any, *, dry_run: bool = False, live: bool = False, quiet: bool, as_json: bool = False
+) -> None:
     """Run what the settings say, print what it gave, and leave with the right code."""
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
 
     with output_kept():
         prepared = prepare(config)
+    announce_data([prepared], as_json=as_json)
     if not as_json:
         _announce(prepared)
     if dry_run:
-        say("dry run: everything checked, nothing simulated")
+        say_dry_run([prepared], as_json=as_json)
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
     again = [*words, "--resume"]
-    with output_kept(), interruptible(prepared.folder, again, quiet=quiet or as_json) as show:
-        finished = execute(prepared, on_progress=show, argv=sys.argv)
+    kept = interruptible(prepared.folder, again, quiet=quiet or as_json)
+    with output_kept(), kept as show, watched([prepared], prepared.folder, live, show) as tell:
+        finished = execute(prepared, on_progress=tell, argv=sys.argv)
     leave_with(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
 
 
 @contextmanager
-def interruptible(
-    folder: Path, again: list[str], *, quiet: bool
-) -> Iterator[Callable[["Progress"], None]]:
+def interruptible(folder: Path, again: list[str], *, quiet: bool) -> "Iterator[Watch]":
     """Yields what shows progress; an interrupt, or a request to end, keeps what is finished.
 
     It then says in which folder that is kept, and the words of the command that goes on with it.
@@ -90,12 +97,37 @@ def interruptible(
         with progress_bar(quiet=quiet) as advance:
             yield lambda progress: advance(progress.done, progress.total, progress_note(progress))
     except KeyboardInterrupt:
-        typer.echo("error: interrupted", err=True)
         command = shlex.join(["shiftsim", *again])
-        typer.echo(f"hint: kept: {folder}; go on with: {command}", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+        raise cli.Interrupted(f"kept: {folder}; go on with: {command}") from None
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def watched(
+    runs: "Sequence[Prepared]", folder: Path, live: bool, show: "Watch"
+) -> "Iterator[Watch]":
+    """Yields what shows progress, on a page as well where that is wanted, as long as this lasts."""
+    if not live:
+        yield show
+        return
+    from shiftsim.runs.scenarios import open_named_store
+    from shiftsim.view.live import LiveRun, LiveServer
+
+    def read(token: str) -> "Scenario":
+        stores = [open_named_store(run.store) for run in runs if token in run.tokens]
+        return stores[0].read(token)
+
+    def tell(progress: "Progress") -> None:
+        page.add(progress)
+        show(progress)
+
+    planners = [name for run in runs for name in run.config.planners]
+    page = LiveRun(str(folder), sum(len(run.tasks) for run in runs), planners, read)
+    with LiveServer(page) as server:
+        typer.echo(f"live        {server.address}", err=True)
+        cli.show_in_browser(server.address)
+        yield tell
 
 
 def progress_note(progress: "Progress") -> str:
@@ -111,6 +143,21 @@ def progress_note(progress: "Progress") -> str:
     total = sum(times.values()) or 1.0
     text = " · ".join(f"{name} {100.0 * value / total:.0f} %" for name, value in times.items())
     return f"{text} · {progress.failed} failed" if progress.failed else text
+
+
+def announce_data(runs: "Sequence[Prepared]", *, as_json: bool) -> None:
+    """Say before anything else that scenarios were made up, where they were."""
+    for made in dict.fromkeys(tuple(run.generator.items()) for run in runs if run.generator):
+        told = ", ".join(str(value) if k == "name" else f"{k} {value}" for k, value in made)
+        typer.echo(f"data        generated, not recorded: {told}", err=as_json)
+
+
+def say_dry_run(runs: "Sequence[Prepared]", *, as_json: bool) -> None:
+    """What a run would have been."""
+    if as_json:
+        say_json([{"run": str(run.folder), "tasks": len(run.tasks)} for run in runs])
+    else:
+        say("dry run: everything checked, nothing simulated")
 
 
 def _announce(prepared: "Prepared") -> None:
@@ -129,9 +176,6 @@ def _announce(prepared: "Prepared") -> None:
         f"split       {prepared.split}  {found} of {plural(found + missing, 'scenario')} found"
         f"   store {prepared.store}"
     )
-    if prepared.generator:
-        told = (value if k == "name" else f"{k} {value}" for k, value in prepared.generator.items())
-        say(f"data        generated, not recorded: {', '.join(map(str, told))}")
     if prepared.num_dropped:
         say(f"filter      {prepared.num_dropped} dropped scenarios left out (--all keeps them)")
     say(
@@ -192,13 +236,20 @@ def _show(finished: "Run", *, allow_partial: bool) -> None:
         words = (f"{row['token']} {row['planner']} {row['cls']:.2f} {row['reason']}" for row in bad)
         say(f" worst: {' · '.join(words)}")
     lost = failures(finished)
-    for row in lost[:_MAX_NAMED_FAILURES]:
-        say(f" {row['status']}: {row['token']} {row['planner']} {row['noise']}: {row['error']}")
+    alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in lost:
+        alike.setdefault((row["status"], row["error"], row["hint"]), []).append(row)
+    for (status, error, hint), rows in list(alike.items())[:_MAX_NAMED_FAILURES]:
+        more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+        first = f"{rows[0]['token']} {rows[0]['planner']} {rows[0]['noise']}"
+        say(f" {status}: {first}{more}: {error}")
+        if hint:
+            say(f"   hint: {hint}")
     if lost:
         say(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
             f" of {counts['expected']} tasks — shiftsim explain {finished.path} TOKEN"
         )
     say(f" results: {finished.path}")
-    if finished.manifest["config"]["save_rollouts"] == "all":
+    if counts["ok"] and finished.manifest["config"]["save_rollouts"] == "all":
         say(f" replay:  shiftsim view {finished.path}")

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json
+from shiftsim.cli import (
+    Debug,
+    Json,
+    Quiet,
+    completion,
+    new_app,
+    plural,
+    progress_bar,
+    say,
+    say_json,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,11 +29,16 @@ _DATA, _PARTIAL = 2, 3
 _MAX_SHOWN = 20  # problems of one kind
 export = new_app("Write scenarios in the formats of others.", no_args_is_help=True)
 
-Store = Annotated[str, typer.Argument(metavar="STORE", help="Store, by name or folder.")]
+Store = Annotated[
+    str,
+    typer.Argument(
+        metavar="STORE", help="Store, by name or folder.", autocompletion=completion.stores
+    ),
+]
 
 
 def check(
-    store: Annotated[str, typer.Argument(help="Store, by name or folder.")],
+    store: Store,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Debug, Json, Quiet, new_app, say, show
+from shiftsim.cli import Debug, Json, Quiet, completion, new_app, say, show
 
 app = new_app("Train networks.")
 
@@ -15,9 +15,15 @@ app = new_app("Train networks.")
 @app.command()
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
-    store: Annotated[str, typer.Option(help="Store by name, path or URL.")] = "demo",
+    store: Annotated[
+        str, typer.Option(help="Store by name, path or URL.", autocompletion=completion.stores)
+    ] = "demo",
     split: Annotated[
-        str, typer.Option(help="Split of the store; all its scenarios if empty.")
+        str,
+        typer.Option(
+            help="Split of the store; all its scenarios if empty.",
+            autocompletion=completion.splits,
+        ),
     ] = "",
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or auto.")] = "cpu",
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Quiet, plural, progress_bar, say
+from shiftsim.cli import Debug, Quiet, plural, progress_bar, say, show_in_browser
 from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def view(
         page = folder / "index.html"
     say(f"written: {page}")
     if browser:
-        _show(page.resolve().as_uri())
+        show_in_browser(page.resolve().as_uri())
 
 
 def plot(
@@ -138,7 +138,7 @@ def inspect(
         say(f"kept in    {path / REVIEW}")
         say("stop with Ctrl-C; what was decided is on disk")
         if browser:
-            _show(server.address)
+            show_in_browser(server.address)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
@@ -169,14 +169,3 @@ def _holding(found: "list[Gallery]", token: str) -> "tuple[Gallery, str]":
         with suppress(ConfigError):
             return gallery, gallery.find(token)
     return last, last.find(token)
-
-
-def _show(address: str) -> None:
-    """Open an address in the browser, where there is a screen."""
-    import os
-    import sys
-    import webbrowser
-
-    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if screen or sys.platform != "linux":
-        webbrowser.open(address)

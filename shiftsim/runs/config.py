@@ -36,6 +36,10 @@ def parse_seeds(text: str) -> list[int]:
             span = range(int(first), int(last) + 1) if dash and first else [int(word)]
             if len(span) > MAX_SEEDS:
                 raise ConfigError(f"seeds {text!r} are more than {MAX_SEEDS}")
+            if not span:
+                raise ConfigError(
+                    f"seeds {text!r} begin behind their end", hint=f"--seeds {last}-{first}"
+                )
             seeds += span
     except ValueError as error:
         raise ConfigError(
@@ -100,7 +104,11 @@ class RunConfig:
         "nonreactive",
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
-    controller: str = _setting("lqr", "lqr, perfect or log-playback. [lqr]")
+    controller: str = _setting(
+        "lqr",
+        "lqr, perfect or log-playback. [lqr]",
+        choices=("lqr", "perfect", "log-playback"),
+    )
     thresholds: str = _setting("nuplan", "nuplan or deepplan. [nuplan]")
     planner_args: dict[str, dict[str, Value]] = field(
         default_factory=dict,
@@ -235,7 +243,10 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
             f"planner argument {text!r} is not key=value", hint="for example --planner-arg gap=1.0"
         )
     named = [name for name in planners if key.startswith(f"{name}.")]
+    owner, dot, _ = key.partition(".")
     if not named and len(planners) != 1:
+        if dot:
+            one_of(f"argument {text!r}: planner", owner, planners)
         raise ConfigError(
             f"planner argument {text!r} does not say which planner is meant",
             hint=f"write PLANNER.{text}; planners: {', '.join(planners)}",

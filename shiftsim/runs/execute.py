@@ -8,8 +8,9 @@ import logging
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from operator import attrgetter
 from threading import get_ident
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -43,6 +44,8 @@ class Progress:
     failed: int  # tasks that failed, in this attempt
     # time spent so far by purpose, over all workers [s]
     seconds: dict[str, float] = field(default_factory=dict)
+    # what has ended since the last call, those of an earlier attempt first; to be read once
+    news: Iterable[TaskResult] = ()
 
     def after(self, result: TaskResult) -> "Progress":
         """The progress after one more result."""
@@ -52,7 +55,11 @@ class Progress:
         names = {**self.seconds, **other.seconds}
         seconds = {n: self.seconds.get(n, 0.0) + other.seconds.get(n, 0.0) for n in names}
         return Progress(
-            self.done + other.done, self.total + other.total, self.failed + other.failed, seconds
+            self.done + other.done,
+            self.total + other.total,
+            self.failed + other.failed,
+            seconds,
+            other.news,
         )
 
 
@@ -132,9 +139,15 @@ def _do_batches(prepared: Prepared, writer: RunWriter, on_progress: Watch) -> bo
     todo = remaining(prepared.batches, statuses, retry=prepared.config.retry_failed)
     total = len(prepared.tasks)
     progress = Progress(total - sum(len(batch.tasks) for batch in todo), total, 0)
+    again = {task for batch in todo for task in batch.tasks}
+    earlier = (result for result in writer.results() if result.task not in again)
+
+    def tell(progress: Progress) -> None:
+        on_progress(replace(progress, news=chain(earlier, progress.news)))
+
     try:
         with closing(_results(prepared, todo)) as results:
-            record(results, writer.add, progress, on_progress)
+            record(results, writer.add, progress, tell)
     except KeyboardInterrupt:
         return True
     return False
@@ -155,7 +168,7 @@ def record(
             if result.is_short and result.task.planner not in short:
                 short.add(result.task.planner)
                 _LOG.warning("planner %s: %s", result.task.planner, SHORT)
-        on_progress(progress)
+        on_progress(replace(progress, news=results))
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:

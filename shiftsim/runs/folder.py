@@ -108,6 +108,13 @@ class RunWriter:
             )
             yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
 
+    def results(self) -> Iterator[TaskResult]:
+        """What has ended so far, without the rollouts."""
+        for task, ended in self.ended.items():
+            values = self._journal.values(ended.number)
+            known = {name: values[name] for name in (*TEXTS, "seconds", "scores", "metrics")}
+            yield TaskResult(task, **known)
+
     def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
         """Put one result on disk; its rollout may be `stored` by another run already.
 

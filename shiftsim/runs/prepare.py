@@ -201,10 +201,15 @@ def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
         name, equals, path = text.partition("=")
         if not equals or name not in config.planners:
             name, path = (takers[0], text) if len(takers) == 1 else ("", text)
+        if not name and not takers:
+            raise ConfigError(
+                f"checkpoint {text!r}: {', '.join(config.planners)} takes none",
+                hint="leave --checkpoint out",
+            )
         if not name:
             raise ConfigError(
                 f"checkpoint {text!r} does not say which planner is meant",
-                hint=f"write PLANNER={path}; planners with one: {', '.join(takers) or 'none'}",
+                hint=f"write PLANNER={path}; planners with one: {', '.join(takers)}",
             )
         one_of("planner with a checkpoint", name, takers)
         if name in out:
@@ -396,5 +401,6 @@ def run_name(config: RunConfig, split: str, determining: dict[str, Any]) -> str:
 
 
 def _joined(names: Sequence[str], what: str) -> str:
-    text = "+".join(re.sub(r"[^A-Za-z0-9.-]+", "-", name) for name in names)
+    # without a dot in front, which would hide the folder
+    text = "+".join(re.sub(r"[^A-Za-z0-9.-]+", "-", name).lstrip(".-") for name in names)
     return text if len(text) <= _MAX_NAME else f"{len(names)}-{what}"

@@ -323,5 +323,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _known_runs(parent: Path) -> str:
-    runs = sorted(str(path.parent) for path in parent.glob("*/manifest.json"))
+    below = (path for where in ("*", "runs/*") for path in parent.glob(f"{where}/manifest.json"))
+    runs = sorted(str(path.parent) for path in below)
     return f"there are: {', '.join(runs[:8])}" if runs else "make one with `shiftsim run`"

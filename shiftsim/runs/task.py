@@ -18,6 +18,7 @@ import pyarrow as pa
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
+from shiftsim.files import place_of
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
 from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
@@ -222,11 +223,13 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
         # the one place: a task that fails is a row, not the end of a run
         is_ours = isinstance(error, ShiftsimError)
         kind = "" if is_ours else f"{type(error).__name__}: "
+        where = "" if is_ours else place_of(error)
+        hint = f"repair {where}, which is no part of shiftsim" if where else ""
         return TaskResult(
             task,
             FAILED,
             error=kind + readable(getattr(error, "message", error) if is_ours else error),
-            hint=readable(getattr(error, "hint", "")) if is_ours else "",
+            hint=readable(getattr(error, "hint", "") if is_ours else hint),
             traceback=readable(traceback.format_exc()),
         )
 

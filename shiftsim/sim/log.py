@@ -29,8 +29,9 @@ class SimulationLog:
         commands: (K, 2) acceleration [m/s^2] and steering rate [rad/s] asked for at each sample,
             before noise; NaN where no motion model ran.
         noise: (K, 2) what was added to them.
-        plans: (K, P, 3) poses of the plan over its first second, from the moment of planning on
-            (P = 11 at 0.1 s); NaN where a command was returned.
+        plans: (K, P, 3) poses of the plan: every 0.1 s over its first second, from the moment of
+            planning on, then every second to 8 s (P = 18); NaN where it does not reach, and where a
+            command was returned. Rollouts of older versions end with the first second (P = 11).
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
 
@@ -78,7 +79,7 @@ def as_recorded(scenario: Scenario) -> SimulationLog:
         route=scenario.route,
         commands=np.full((count, 2), np.nan),
         noise=np.zeros((count, 2)),
-        plans=np.full((count, 11, 3), np.nan),
+        plans=np.full((count, 18, 3), np.nan),
         planning_seconds=np.zeros(count),
         degraded=np.zeros(count, np.bool_),
     )

@@ -16,7 +16,7 @@ import numpy as np
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
-from shiftsim.sim.dynamics.perfect import follow_perfectly, sample_poses
+from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
 from shiftsim.sim.plan_check import SHORT, find_fault, is_short, plain
@@ -33,7 +33,6 @@ from shiftsim.sim.traffic.scripted import Scripted
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
-PLAN_SAMPLES = 11  # first second of a plan, every 0.1 s
 MIN_ITERATIONS = 3
 CONTROLLERS = ("lqr", "perfect", "log-playback")
 
@@ -112,7 +111,7 @@ class Rollout:
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
         self._commands = np.full((self.num_samples, 2), np.nan)
-        self._plans = np.full((self.num_samples, PLAN_SAMPLES, 3), np.nan)
+        self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
@@ -180,7 +179,7 @@ class Rollout:
             raise_for_status(status, now_us, times)
 
     def _checked(self, plan: Any) -> Trajectory | Command:
-        """The plan in log time; its first second and whether it is a fallback are noted."""
+        """The plan in log time; its poses and whether it is a fallback are noted."""
         iteration, row = self.iteration, self._start + self.iteration
         now_us, next_us = self._clock[row], self._clock[row + 1]
         if reason := getattr(self.planner, "degraded", ""):
@@ -198,7 +197,7 @@ class Rollout:
                 self.is_short = is_short(plan)
             time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
             plan = Trajectory(time_us, plain(plan.states))
-            sample_poses(plan.time_us, plan.states, now_us, self._plans[iteration])
+            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, self._plans[iteration])
         return plan
 
     def log(self) -> SimulationLog:

@@ -69,13 +69,9 @@ class Training:
 
     def run(self) -> None:
         """Do all rounds that are not done yet, and PPO if it is asked for."""
-        try:
-            self._imitate()
-            if self._settings.ppo_samples:
-                self._reinforce()
-        except KeyboardInterrupt:
-            self._say(f"kept in {str(self._settings.out)!r}; go on with --resume")
-            raise
+        self._imitate()
+        if self._settings.ppo_samples:
+            self._reinforce()
 
     def _imitate(self) -> None:
         settings, course = self._settings, self.course

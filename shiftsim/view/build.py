@@ -28,6 +28,10 @@ class Choice:
     noises: tuple[str, ...] = ()  # only these; empty for all
     seeds: tuple[int, ...] = ()  # only these; empty for the first one of each planner and noise
 
+    def __str__(self) -> str:
+        parts = zip(("planner", "noise", "seed"), vars(self).values(), strict=True)
+        return ", ".join(f"{n} {' or '.join(map(str, v))}" for n, v in parts if v) or "any planner"
+
     def of(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks chosen among those of one scenario, by planner, noise and seed."""
         wanted = [
@@ -104,9 +108,12 @@ class Gallery:
         """
         found = self.choice.of(self._tokens.get(token, []))
         if not found:
+            there = zip(*self._tokens.get(token, []), strict=True)
+            names = zip(("planners", "noise", "seeds"), there, strict=False)
+            kept = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
             raise ConfigError(
-                f"no stored rollout of scenario {token!r} fits",
-                hint="check --planner, --noise and --seeds; --save-rollouts none keeps none",
+                f"scenario {token!r} has no stored rollout with {self.choice}",
+                hint="; ".join(kept) or "--save-rollouts all keeps them",
             )
         return found[:MAX_ROLLOUTS]
 

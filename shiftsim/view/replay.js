@@ -9,6 +9,7 @@ const NOISY = [7, 5];
 const EXPERT = "#1f1f1f";
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
 const TOLD = 2; // s that the words of a violation stay
+const FADE = 500; // ms in which whole plans appear once a moment is chosen
 
 const byId = (id) => document.getElementById(id);
 const meta = JSON.parse(byId("data-meta").textContent);
@@ -27,6 +28,7 @@ const state = {
   centre: null,
   told: [], // the words of violations on the canvas
 };
+let planned = 0; // how much of the plans beyond their first second is seen, 0 to 1
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
 let scene, map, times, strips, panels, highlighted = -1;
 
@@ -51,9 +53,23 @@ function sampleAt(t) {
 
 function seek(t) {
   state.t = Math.min(Math.max(t, 0), duration());
-  draw();
   byId("time").value = state.t;
-  if (!state.playing) saveState();
+  if (state.playing) return draw();
+  saveState();
+  fadePlans();
+}
+
+// while it plays the first second of a plan is shown; at a moment chosen the whole of it appears
+let fading = 0;
+function fadePlans() {
+  cancelAnimationFrame(fading);
+  const began = performance.now();
+  const go = (now) => {
+    planned = state.playing ? 0 : Math.min(Math.max((now - began) / FADE, 0), 1);
+    draw();
+    if (!state.playing && planned < 1) fading = requestAnimationFrame(go);
+  };
+  go(began);
 }
 
 function stepBy(samples) {
@@ -73,6 +89,7 @@ function frame(now) {
 }
 
 function play() {
+  planned = 0;
   if (state.t >= duration() - 1e-6) state.t = 0;
   state.playing = true;
   byId("play").textContent = "❚❚";
@@ -84,6 +101,7 @@ function pause() {
   state.playing = false;
   byId("play").textContent = "▶";
   saveState();
+  if (panels) fadePlans();
 }
 
 // ---- violations ----
@@ -230,7 +248,7 @@ function drawPanel(panel, members, leading, at) {
   }
   for (const index of order) {
     const rollout = meta.rollouts[index];
-    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour);
+    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
     const pose = egoPose(index, at);
     drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     const reach = meta.vehicle[2];
@@ -666,7 +684,7 @@ async function start() {
   byId("time").value = state.t;
   changed();
   highlightNow();
-  draw();
+  fadePlans();
   window.firstFrame = performance.now(); // ms since the page was opened
   document.documentElement.dataset.ready = "1";
 }

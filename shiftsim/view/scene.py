@@ -26,6 +26,8 @@ Fields: TypeAlias = dict[str, Quantised | np.ndarray]
 
 MARGIN = 100.0  # m of map around everything the ego does
 _METRES, _RADIANS, _SPEED, _SECONDS = 0.01, 0.001, 0.01, 0.001
+_COARSE = 0.05  # m, of plans beyond their first second
+_FIRST_SECOND = 11  # poses of a plan up to 1 s ahead
 _MAP_STEP = 0.05  # m
 _TOLERANCE = 0.05  # m, of simplified map lines
 
@@ -102,7 +104,9 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
     fields = _poses("ego", log.ego[:, None, :3], origin)
     fields["speed"] = Quantised(speeds(log.ego), _SPEED)
     fields["accel"] = Quantised(log.ego[:, AX].copy(), _SPEED)
-    fields["plan"] = Quantised(log.plans[:, :, :2] - log.ego[:, None, :2], _METRES)
+    plans = log.plans[:, :, :2] - log.ego[:, None, :2]
+    fields["plan"] = Quantised(plans[:, :_FIRST_SECOND], _METRES)
+    fields["rest"] = Quantised(plans[:, _FIRST_SECOND - 1 :], _COARSE)
     fields["noise"] = Quantised(log.noise, _RADIANS)
     fields["degraded"] = log.degraded
     if replay.own_tracks:

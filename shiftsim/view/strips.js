@@ -2,7 +2,7 @@
 // Curves over time below the scene: speed, acceleration, noise, and the first violations.
 // They are painted once; moving in time only moves the cursor.
 
-const STRIP_HEIGHT = window.innerHeight >= 800 ? 64 : 46;
+const STRIP_HEIGHT = 64;
 const STRIP_LEFT = 46;
 const STRIP_RIGHT = 10;
 const VIOLATION_ROW = 13;
@@ -70,7 +70,7 @@ class Strips {
     context.fillStyle = "#4c4c4c";
     context.textAlign = "right";
     context.fillText(high.toFixed(high < 10 ? 1 : 0), STRIP_LEFT - 5, top + 12);
-    if (low < 0) context.fillText(low.toFixed(1), STRIP_LEFT - 5, top + STRIP_HEIGHT - 4);
+    context.fillText(low < 0 ? low.toFixed(1) : "0", STRIP_LEFT - 5, top + STRIP_HEIGHT - 3);
     context.textAlign = "left";
     for (const line of curve.lines) {
       context.beginPath();
@@ -94,21 +94,19 @@ class Strips {
   paintMarks(context, top) {
     context.textAlign = "left";
     if (!this.marks.length) context.fillText("no violations", STRIP_LEFT + 4, top + 11);
-    const ends = []; // of the texts so far, by row: none is written over another
+    const ends = []; // of what is written so far, by row: nothing is written over another
     for (const mark of this.marks) {
-      const y = top + mark.row * VIOLATION_ROW + 8;
-      drawMarker(context, mark.marker, this.x(mark.t), y, 4.5, mark.colour, mark.hollow);
+      const [x, y] = [this.x(mark.t), top + mark.row * VIOLATION_ROW + 8];
+      const others = this.marks.filter((other) => other.row === mark.row && other.t > mark.t);
+      const stop = Math.min(this.width, ...others.map((other) => this.x(other.t) - 6));
+      const width = context.measureText(mark.text).width;
+      const left = x + 8 + width <= stop ? x + 8 : x - 8 - width;
+      const free = left >= (ends[mark.row] || 0);
+      ends[mark.row] = Math.max(x + 6, free ? left + width + 4 : 0);
+      drawMarker(context, mark.marker, x, y, 4.5, mark.colour, mark.hollow);
       context.fillStyle = "#3a3a3a";
-      const text = ` ${mark.text}`;
-      const width = context.measureText(text).width;
-      const fits = this.x(mark.t) + 8 + width < this.width;
-      const left = fits ? this.x(mark.t) + 4 : this.x(mark.t) - 8 - width;
-      if (left < (ends[mark.row] || 0)) continue;
-      ends[mark.row] = left + width + 8;
-      context.textAlign = "left";
-      context.fillText(text, left, y + 4);
+      if (free) context.fillText(mark.text, left, y + 4);
     }
-    context.textAlign = "left";
   }
 
   paintAxis(context, height) {

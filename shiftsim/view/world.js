@@ -232,27 +232,43 @@ function drawPath(context, xy, at, panel, colour, dash, width) {
   context.setLineDash([]);
 }
 
-// the first second of the plan, from the rear axle on
-function drawPlan(context, fields, panel, at, colour) {
-  const { shape, data } = fields.get("plan");
-  const base = at.row * shape[1];
-  if (Number.isNaN(data[2 * base])) return;
-  const xy = fields.get("ego.xy").data;
-  context.beginPath();
-  for (let i = 0; i < shape[1]; i++) {
-    const x = xy[2 * at.row] + data[2 * (base + i)];
-    const y = xy[2 * at.row + 1] + data[2 * (base + i) + 1];
-    const [px, py] = panel.toScreen(x, y);
-    if (i === 0) context.moveTo(px, py);
-    else context.lineTo(px, py);
-  }
-  context.lineWidth = 5;
+// the plan from the rear axle on: its first second, and as far as `shown` (0 to 1) the rest of it,
+// with a dot at every second
+function drawPlan(context, fields, panel, at, colour, shown) {
+  const first = planPoints(fields, "plan", panel, at);
+  const rest = planPoints(fields, "rest", panel, at);
+  context.strokeStyle = context.fillStyle = colour;
   context.lineCap = "round";
   context.globalAlpha = 0.45;
-  context.strokeStyle = colour;
-  context.stroke();
+  strokePoints(context, first, 5);
+  context.globalAlpha = 0.75 * shown;
+  strokePoints(context, rest, 2.5);
+  for (const [px, py] of rest) {
+    context.beginPath();
+    context.arc(px, py, 3, 0, 2 * Math.PI);
+    context.fill();
+  }
   context.globalAlpha = 1;
   context.lineCap = "butt";
+}
+
+// poses of a plan on the screen, as far as it reaches
+function planPoints(fields, name, panel, at) {
+  const { shape, data } = fields.get(name);
+  const xy = fields.get("ego.xy").data;
+  const points = [];
+  const base = at.row * shape[1];
+  for (let i = base; i < base + shape[1] && !Number.isNaN(data[2 * i]); i++) {
+    points.push(panel.toScreen(xy[2 * at.row] + data[2 * i], xy[2 * at.row + 1] + data[2 * i + 1]));
+  }
+  return points;
+}
+
+function strokePoints(context, points, width) {
+  context.beginPath();
+  points.forEach(([px, py], i) => (i ? context.lineTo(px, py) : context.moveTo(px, py)));
+  context.lineWidth = width;
+  context.stroke();
 }
 
 // the box of an ego: filled when it leads, with a dashed edge where its rollout is disturbed

@@ -198,6 +198,8 @@ def test_words_of_marks_never_lie_on_each_other(page, folder):
     spans = sorted(page.run(MARKS))
     assert len(spans) >= 2
     assert all(a[1] <= b[0] for a, b in pairwise(spans))
+    marks = page.run("strips.marks.map((mark) => strips.x(mark.t))")
+    assert all(x + 4 <= left or x - 4 >= right for x in marks for left, right in spans)
 
 
 def test_a_violation_button_jumps_to_its_rollout(replay):
@@ -253,6 +255,28 @@ def test_zoom_and_drag_change_the_view(replay):
     assert before != zoomed
     assert replay.pixels() != zoomed
     assert not replay.run("replay.state.follow")
+
+
+def test_whole_plans_appear_at_the_moment_chosen(replay):
+    replay.run("replay.seek(1.0)")
+    assert replay.run("planned") < 0.5
+    replay.wait("planned === 1")
+    whole = replay.pixels()
+
+    replay.press("p")
+    without = replay.pixels()
+    replay.browser.execute_script("replay.state.plans = true; planned = 0; replay.draw()")
+
+    assert len({whole, without, replay.pixels()}) == 3
+
+
+def test_while_it_plays_plans_end_with_their_first_second(replay):
+    replay.wait("planned === 1")
+
+    replay.press(" ")
+    replay.wait("replay.state.t > 0.3")
+
+    assert replay.run("replay.state.playing && planned") == 0
 
 
 def test_hostile_texts_stay_texts(page, tmp_path):

@@ -30,7 +30,7 @@ def test_the_options_are_those_of_before():
         --thresholds --planner-arg --metric --checkpoint --device --batch-size --isolate
         --planner-python --strict --out --workers --timeout --resume --retry-failed --shard
         --executor --scheduler --save-rollouts
-        --bundle --allow-partial --config --dry-run --quiet --json --debug"""
+        --bundle --allow-partial --config --dry-run --live --quiet --json --debug"""
     assert flags == words.split()
 
 

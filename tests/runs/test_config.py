@@ -96,6 +96,6 @@ def test_seeds_are_numbers_or_ranges():
     assert parse_seeds("0,1,2") == [0, 1, 2]
     assert parse_seeds("0-2,7") == [0, 1, 2, 7]
     assert parse_seeds("-1") == [-1]  # which a configuration refuses
-    for text in ("a", "1-", "1-b", "", "1,,2", "0-99999999"):
+    for text in ("a", "1-", "1-b", "", "1,,2", "0-99999999", "3-1"):
         with pytest.raises(ConfigError, match="seeds"):
             parse_seeds(text)

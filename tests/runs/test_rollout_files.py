@@ -43,7 +43,7 @@ def made_up(length, *, value=0.0, tracks=None):
     columns = []
     for field in STATES if tracks is None else [*STATES, *TRACKS]:
         if pa.types.is_list(field.type):
-            width = {"plan_poses": 33, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
+            width = {"plan_poses": 54, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
             size = width if field.name == "plan_poses" else width * tracks
             item = bool if pa.types.is_boolean(field.type.value_type) else float
             columns.append(pa.array([[item(value)] * size] * length, field.type))

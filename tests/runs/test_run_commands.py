@@ -77,13 +77,17 @@ def test_checkpoint_device_and_batch_size_are_printed(call, tmp_path):
 @pytest.mark.parametrize(
     ("words", "fact"),
     [
-        (("--checkpoint", "x.ckpt"), "does not say which planner is meant"),
+        (("--checkpoint", "x.ckpt"), "constant-velocity takes none"),
         (("--checkpoint", "constant-velocity=x.ckpt"), "planner with a checkpoint"),
         (("--device", "gpu"), "device 'gpu' unknown"),
         (("--batch-size", "0"), "batch_size is 0"),
         (("--timeout", "-1"), "timeout is -1.0"),
         (("--executor", "ray"), "executor 'ray' unknown"),
         (("--executor", "dask"), "needs a scheduler"),
+        (("--controller", "pid"), "controller 'pid' unknown"),
+        (("--planner-arg", "idn.x=1", "-p", "idm"), "planner 'idn' unknown"),
+        (("-p", "my_file.py"), "is a file: which of its classes is meant?"),
+        (("--seeds", "3-1"), "begin behind their end"),
         (("--shard", "3/2"), "is not i/n"),
         (("--save-rollouts", "some"), "save_rollouts 'some' unknown"),
     ],

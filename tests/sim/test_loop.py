@@ -186,10 +186,11 @@ def test_each_channel_of_the_noise_of_a_step_acts_on_its_own_command(planner):
         np.testing.assert_array_equal(log.ego[step + 1], after)
 
 
-def test_the_first_second_of_every_plan_is_kept_in_the_map_frame():
+def test_every_plan_is_kept_in_the_map_frame():
     log = simulate(cruise_scenario(iterations=8), Recorder())
-    assert log.plans.shape == (7, 11, 3)
-    ahead = log.ego[:, None, X] + 0.8 * np.arange(11)
+    assert log.plans.shape == (7, 18, 3)
+    seconds = [*np.arange(0, 11) / 10, *range(2, 9)]
+    ahead = log.ego[:, None, X] + 8.0 * np.array(seconds)
     np.testing.assert_allclose(log.plans[..., 0], ahead, rtol=0.0, atol=1e-9)
     np.testing.assert_array_equal(log.plans[..., 1:], 0.0)
 

@@ -7,7 +7,8 @@ from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.view.review.server import HOST, MAX_BODY, TOKEN_HEADER
+from shiftsim.view.local import HOST, TOKEN_HEADER
+from shiftsim.view.review.server import MAX_BODY
 from shiftsim.view.review.service import ReviewService
 
 FIRST = "0000cafe"

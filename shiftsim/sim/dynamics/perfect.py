@@ -24,7 +24,9 @@ from shiftsim.world.state import (
 )
 
 MAX_SPEED = 50.0  # m/s, nuPlan perfect tracking controller
-SAMPLE_US = 100_000  # us, spacing of the poses of a plan that a rollout keeps
+# us from the moment of planning on, of the poses of a plan that a rollout keeps: every 0.1 s over
+# the first second, which the tracker looks ahead, then every second to 8 s
+KEPT_US = np.concatenate([np.arange(0, 1_000_001, 100_000), np.arange(2, 9) * 1_000_000])
 
 
 @lean_kernel
@@ -87,12 +89,16 @@ def interpolate(
 
 @kernel
 def sample_poses(
-    traj_time_us: IntArray, traj_states: FloatArray, now_us: int, out: FloatArray
+    traj_time_us: IntArray,
+    traj_states: FloatArray,
+    now_us: int,
+    ahead_us: IntArray,
+    out: FloatArray,
 ) -> None:
-    """Poses of a trajectory every 0.1 s from now on, into `out` (P, 3); NaN where it has none."""
+    """Poses of a trajectory at times (P,) from now on, into `out` (P, 3); NaN where it has none."""
     state = np.empty(NUM_STATE)
     for row in range(len(out)):
-        covered = interpolate(traj_time_us, traj_states, now_us + row * SAMPLE_US, state)
+        covered = interpolate(traj_time_us, traj_states, now_us + ahead_us[row], state)
         for column in range(3):
             out[row, column] = state[column] if covered else np.nan
 

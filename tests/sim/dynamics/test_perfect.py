@@ -119,9 +119,9 @@ def test_nothing_is_extrapolated(query):
 def test_poses_behind_the_end_of_a_plan_are_absent():
     time_us, states = two_states()
     states[1, 0] = 10.0
-    poses = np.zeros((4, 3))
+    poses, ahead_us = np.zeros((4, 3)), np.array([0, 100_000, 200_000, 1_000_000])
 
-    sample_poses(time_us, states, 800_000, poses)
+    sample_poses(time_us, states, 800_000, ahead_us, poses)
 
     np.testing.assert_allclose(poses[:3, 0], [8.0, 9.0, 10.0], atol=1e-12)
     assert np.isnan(poses[3]).all()

@@ -1,0 +1,132 @@
+"use strict";
+// A run under way: asks for its state twice a second, and keeps the last one when it has ended.
+
+const byId = (id) => document.getElementById(id);
+const key = new URLSearchParams(location.search).get("token") || "";
+const EVERY = 500; // ms between two questions
+const SILENT = 6; // questions without an answer after which nothing more is asked
+const WORDS = {
+  running: "running",
+  finished: "finished",
+  interrupted: "interrupted; the same command with --resume goes on",
+  stopped: "stopped by an error; the terminal says why",
+};
+
+function minutes(seconds) {
+  const whole = Math.round(seconds);
+  const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  return parts.slice(parts[0] ? 0 : 1).map((part, i) => (i ? `${part}`.padStart(2, "0") : part)).join(":");
+}
+
+function cell(content, kind) {
+  const td = document.createElement("td");
+  if (kind) td.className = kind;
+  td.append(content === null || content === undefined ? "–" : content);
+  return td;
+}
+
+function fillRows(id, rows, empty) {
+  const body = byId(id).tBodies[0];
+  const lines = rows.map((cells) => {
+    const tr = document.createElement("tr");
+    tr.append(...cells);
+    return tr;
+  });
+  if (!lines.length) {
+    const tr = document.createElement("tr");
+    const td = cell(empty, "none");
+    td.colSpan = byId(id).tHead.rows[0].cells.length;
+    tr.append(td);
+    lines.push(tr);
+  }
+  body.replaceChildren(...lines);
+}
+
+// mean and interval on a scale from 0 to 100
+function range({ mean, half, colour }) {
+  const box = document.createElement("div");
+  box.className = "range";
+  const [line, dot] = [document.createElement("i"), document.createElement("b")];
+  const [low, high] = [Math.max(mean - (half || 0), 0), Math.min(mean + (half || 0), 100)];
+  line.style.left = `${low}%`;
+  line.style.width = `${high - low}%`;
+  dot.style.left = `${mean}%`;
+  line.style.background = dot.style.background = colour;
+  box.append(line, dot);
+  return box;
+}
+
+function scenario(row, ended) {
+  if (row.replay === null || ended) return row.token;
+  const link = document.createElement("a");
+  link.href = `/replay/${row.replay}?token=${encodeURIComponent(key)}`;
+  link.target = "_blank";
+  link.textContent = row.token;
+  return link;
+}
+
+function seedOf(row) {
+  return row.noise === "none" ? "" : `${row.seed}`;
+}
+
+function show(state) {
+  const ended = state.state !== "running";
+  document.title = `${Math.floor((100 * state.done) / Math.max(state.total, 1))} % · ${state.title}`;
+  byId("title").textContent = state.title;
+  byId("bar").firstChild.style.width = `${(100 * state.done) / Math.max(state.total, 1)}%`;
+  byId("state").textContent = `${WORDS[state.state]}:`;
+  byId("count").textContent = `${state.done} of ${state.total} rollouts`;
+  const left = state.left === null ? "" : `, about ${minutes(state.left)} left`;
+  const so = ended ? `in ${minutes(state.elapsed)}` : `after ${minutes(state.elapsed)}${left}`;
+  const next = ended ? `; replays of all: shiftsim view ${state.title}` : "";
+  byId("time").textContent = so + next;
+  document.body.className = state.state === "finished" ? "ended" : ended ? "stopped" : "";
+  const half = (row) => (row.half === null ? "–" : `± ${row.half.toFixed(2)}`);
+  fillRows(
+    "scores",
+    state.groups.map((row) => [
+      cell(row.planner), cell(row.noise), cell(row.traffic),
+      cell(`${row.done}${row.failed ? `, ${row.failed} failed` : ""}`, "n"),
+      cell(row.mean.toFixed(2), "n"), cell(half(row), "n"), cell(range(row), "scale"),
+    ]),
+    "nothing has finished yet",
+  );
+  fillRows(
+    "worst",
+    state.worst.map((row) => [
+      cell(row.score.toFixed(2), "n"), cell(scenario(row, ended)), cell(row.planner),
+      cell(row.noise), cell(seedOf(row), "n"), cell(row.why, "why"),
+    ]),
+    "no rollout below 100 yet",
+  );
+  byId("failed").textContent = state.num_failures ? `(${state.num_failures})` : "";
+  fillRows(
+    "failures",
+    state.failures.map((row) => [
+      cell(row.token), cell(row.planner), cell(row.noise), cell(seedOf(row), "n"),
+      cell(`${row.status}: ${[row.error, row.hint].filter(Boolean).join(" – ")}`, "why"),
+    ]),
+    "nothing",
+  );
+}
+
+let silent = 0;
+async function ask() {
+  try {
+    const answer = await fetch("/state", { headers: { "X-Shiftsim-Token": key } });
+    const state = await answer.json();
+    if (!answer.ok) throw new Error(state.error);
+    silent = 0;
+    show(state);
+    document.documentElement.dataset.ready = "1";
+    if (state.state !== "running") return;
+  } catch {
+    if (++silent >= SILENT) {
+      byId("state").textContent = "no answer any more: the run has ended, this was its last state";
+      document.body.className = "stopped";
+      return;
+    }
+  }
+  setTimeout(ask, EVERY);
+}
+ask();

@@ -1,0 +1,272 @@
+"""A run that is watched: a page on the loopback interface that shows how far it is.
+
+What the main process hears from its workers is summed up here in a few numbers, result by result;
+a thread answers the page, which asks twice a second. Nothing is read from disk until a replay is
+opened, and nothing is added to what the workers do.
+"""
+
+import heapq
+import json
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from threading import Event, Lock, Thread
+from time import monotonic
+from types import TracebackType
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from shiftsim.errors import ShiftsimError
+from shiftsim.metrics import MULTIPLIERS
+from shiftsim.report.palette import planner_styles
+from shiftsim.report.words import REASONS
+from shiftsim.runs.execute import Progress
+from shiftsim.runs.results import OK, TaskResult
+from shiftsim.runs.rollouts import complete_rollout, decode_rows
+from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
+from shiftsim.view.page import framed, replay_page
+from shiftsim.view.scene import Shown
+from shiftsim.world.scenario import Scenario
+
+_WORST, _FAILURES = 20, 50  # that the page lists
+_Z95 = 1.96  # of the normal distribution
+_PATIENCE = 2.0  # s that the end of a run waits for the page to see it
+
+Read = Callable[[str], Scenario]
+
+
+class _Group(NamedTuple):
+    """What has one score of its own."""
+
+    planner: str
+    noise: str
+    traffic: str
+
+
+@dataclass(slots=True)
+class _Sums:
+    """Scores so far, by recording: scenarios of one recording are not independent."""
+
+    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    totals: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def add(self, recording: str, score: float) -> None:
+        self.counts[recording] += 1
+        self.totals[recording] += score
+
+    def values(self) -> dict[str, Any]:
+        """Mean and 95 % interval x 100; no interval of fewer than two recordings."""
+        count, clusters = sum(self.counts.values()), len(self.counts)
+        mean = sum(self.totals.values()) / count
+        half = None
+        if clusters > 1:
+            squares = sum((self.totals[r] - n * mean) ** 2 for r, n in self.counts.items())
+            half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / count
+        return {"done": count, "mean": 100.0 * mean, "half": half}
+
+
+class LiveRun:
+    """What is known of a run under way.
+
+    Attributes:
+        title: Folder of the run.
+    """
+
+    def __init__(self, title: str, total: int, planners: Sequence[str], read: Read) -> None:
+        """A run of so many tasks that has just begun; `read` gives a scenario by its token."""
+        self.title = title
+        self._read = read
+        self._styles = planner_styles(planners)
+        self._lock = Lock()
+        self._began = monotonic()
+        self._ended: float | None = None
+        self._state = "running"
+        self._progress = Progress(0, total, 0)
+        self._first: int | None = None  # tasks that were done before
+        self._sums: dict[_Group, _Sums] = defaultdict(_Sums)
+        # the lowest scores: a heap of (-score, -number of the result, the result)
+        self._worst: list[tuple[float, int, TaskResult]] = []
+        self._number = 0
+        self._failures: list[TaskResult] = []
+        self._num_failures: Counter[tuple[str, str]] = Counter()  # by planner and noise
+
+    def add(self, progress: Progress) -> None:
+        """Take in what has ended since the last call."""
+        with self._lock:
+            for result in progress.news:
+                self._add(result)
+            if self._first is None:
+                self._first = progress.done - self._number
+            self._progress = progress
+
+    def _add(self, result: TaskResult) -> None:
+        self._number += 1
+        if result.status != OK:
+            self._num_failures[result.task.planner, result.task.noise] += 1
+            if len(self._failures) < _FAILURES:
+                self._failures.append(result)
+            return
+        score = float(result.scores["cls"])
+        group = _Group(result.task.planner, result.task.noise, result.scores["traffic"])
+        self._sums[group].add(result.scores["log_name"], score)
+        if score < 1.0:
+            heapq.heappush(self._worst, (-score, -self._number, result))
+            if len(self._worst) > _WORST:
+                heapq.heappop(self._worst)
+
+    def end(self, state: str) -> None:
+        """Say how the run ended: `finished`, `interrupted` or `stopped`."""
+        with self._lock:
+            self._state, self._ended = state, monotonic()
+
+    def values(self) -> dict[str, Any]:
+        """Everything that the page shows, as JSON values."""
+        with self._lock:
+            progress, done = self._progress, self._progress.done - (self._first or 0)
+            elapsed = (self._ended or monotonic()) - self._began
+            left = elapsed / done * (progress.total - progress.done) if done > 0 else None
+            return {
+                "title": self.title,
+                "state": self._state,
+                "done": progress.done,
+                "total": progress.total,
+                "elapsed": elapsed,
+                "left": left,
+                "groups": [
+                    {
+                        **group._asdict(),
+                        **sums.values(),
+                        "failed": self._num_failures[group.planner, group.noise],
+                        "colour": self._styles[group.planner].colour,
+                    }
+                    for group, sums in sorted(self._sums.items())
+                ],
+                "worst": [
+                    {
+                        **result.task._asdict(),
+                        "score": 100.0 * float(result.scores["cls"]),
+                        "why": _reason(result),
+                        "replay": -number if result.rollout else None,
+                    }
+                    for _, number, result in sorted(self._worst, reverse=True)
+                ],
+                "failures": [
+                    {**r.task._asdict(), "status": r.status, "error": r.error, "hint": r.hint}
+                    for r in self._failures
+                ],
+                "num_failures": self._num_failures.total(),
+            }
+
+    def replay(self, number: int) -> str | None:
+        """The replay of one of the worst rollouts; None where it is none of them any more.
+
+        Raises:
+            ShiftsimError: Its scenario cannot be read.
+        """
+        with self._lock:
+            found = [result for _, n, result in self._worst if -n == number and result.rollout]
+        if not found:
+            return None
+        (result,) = found
+        scenario = self._read(result.task.token)
+        log = complete_rollout(decode_rows(result.rollout), scenario)
+        planner, noise, seed, _ = result.task
+        shown = Shown(planner, noise, seed, log, result.scores["cls"], result.metrics)
+        return replay_page(scenario, [shown])
+
+
+def _reason(result: TaskResult) -> str:
+    """What was violated first of the metrics that cost most."""
+    rows = {row["metric"]: row for row in result.metrics if row["metric"] in REASONS}
+    below = {name: row for name, row in rows.items() if row["score"] is None or row["score"] < 1.0}
+    costly = {name: row for name, row in below.items() if name in MULTIPLIERS} or below
+    times: Mapping[str, float | None] = {n: row["first_violation_s"] for n, row in costly.items()}
+    parts = sorted(times, key=lambda name: (times[name] is None, times[name] or 0.0))
+    return ", ".join(
+        REASONS[name] if times[name] is None else f"{REASONS[name]} {times[name]:.1f} s"
+        for name in parts
+    )
+
+
+class LiveServer(LocalServer):
+    """Shows a run while it lasts: `with LiveServer(run) as live: execute(…, on_progress=live.add)`.
+
+    Attributes:
+        run: What is shown.
+    """
+
+    def __init__(self, run: LiveRun) -> None:
+        """Bind to a free port of the loopback interface."""
+        self.run = run
+        self.asked = 0.0  # when the page asked last
+        self.told = Event()  # that the run has ended
+        super().__init__(_Handler)
+
+    def __enter__(self) -> "LiveServer":
+        """Begin to answer."""
+        Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Let an open page see the end, and stop answering; the page keeps what it shows."""
+        interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
+        self.run.end("interrupted" if interrupted else "stopped" if kind else "finished")
+        if monotonic() - self.asked < _PATIENCE:
+            self.told.wait(_PATIENCE)
+        self.shutdown()
+        self.server_close()
+
+
+class _Handler(LocalHandler):
+    server: LiveServer
+
+    def do_GET(self) -> None:
+        """The page, what it shows, or one of the replays that it names."""
+        url = urlsplit(self.path)
+        given = self.headers.get(TOKEN_HEADER) or parse_qs(url.query).get("token", [""])[0]
+        if not self.may(given):
+            return
+        run = self.server.run
+        if url.path == "/":
+            self.answer(live_page(run.title), "text/html")
+        elif url.path == "/state":
+            values = run.values()
+            self.server.asked = monotonic()
+            self.answer(json.dumps(values), "application/json")
+            if values["state"] != "running":
+                self.server.told.set()
+        elif url.path.startswith("/replay/"):
+            self._replay(url.path.removeprefix("/replay/"))
+        else:
+            self.refuse(HTTPStatus.NOT_FOUND, "no such page")
+
+    def _replay(self, number: str) -> None:
+        page = None
+        with suppress(ValueError):
+            try:
+                page = self.server.run.replay(int(number))
+            except (ShiftsimError, OSError) as error:
+                self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+                return
+        if page is None:
+            self.refuse(HTTPStatus.NOT_FOUND, "no longer one of the worst")
+        else:
+            self.answer(page, "text/html")
+
+
+def live_page(title: str) -> str:
+    """The page; it fetches everything else."""
+    return framed(
+        "live.html",
+        title=f"{title} · live",
+        meta='<meta name="referrer" content="no-referrer">',
+        styles=["list.css", "live.css"],
+        scripts=["live.js"],
+    )

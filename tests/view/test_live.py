@@ -1,0 +1,182 @@
+"""The page of a run under way: what it counts, and whom it answers."""
+
+import http.client
+import json
+
+import numpy as np
+import pytest
+from stores import write_toy_store
+
+import shiftsim
+from shiftsim.data.store.reading import open_store
+from shiftsim.runs.config import make_config
+from shiftsim.runs.execute import Progress, execute
+from shiftsim.runs.prepare import prepare
+from shiftsim.runs.results import FAILED, OK, TaskResult
+from shiftsim.runs.rollouts import Task
+from shiftsim.view.live import LiveRun, LiveServer
+
+
+def ended(number, score, recording="r0", **more):
+    """One finished rollout."""
+    scores = {"cls": score, "traffic": "nonreactive", "log_name": recording}
+    return TaskResult(Task("idm", "none", 0, f"t{number}"), OK, scores=scores, **more)
+
+
+def run_of(*results, total=10):
+    run = LiveRun("runs/x", total, ["idm"], read=None)
+    run.add(Progress(len(results), total, 0, news=results))
+    return run
+
+
+@pytest.fixture
+def server():
+    with LiveServer(run_of(ended(0, 0.5))) as running:
+        yield running
+
+
+def ask(server, path, method="GET", **headers):
+    """Status and body of a request with the token, unless the headers say otherwise."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    connection.request(method, path, headers={"X-Shiftsim-Token": server.token, **headers})
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode()
+
+
+def test_the_interval_is_that_of_a_mean_of_recordings():
+    scores = [("a", 1.0), ("a", 0.8), ("b", 0.0), ("c", 0.5), ("c", 0.5), ("c", 0.9)]
+    run = run_of(*[ended(i, score, name) for i, (name, score) in enumerate(scores)])
+
+    (group,) = run.values()["groups"]
+
+    mean = np.mean([score for _, score in scores])
+    by_recording = [sum(s - mean for n, s in scores if n == name) for name in "abc"]
+    error = np.sqrt(3 * np.var(by_recording, ddof=1)) / 6
+    assert group["done"] == 6
+    assert group["mean"] == pytest.approx(100 * mean)
+    assert group["half"] == pytest.approx(100 * 1.96 * error)
+
+
+def test_one_recording_says_nothing_of_the_spread():
+    (group,) = run_of(ended(0, 0.5), ended(1, 0.7)).values()["groups"]
+    assert group["half"] is None
+
+
+def test_the_worst_are_kept_in_order_with_the_reason():
+    violated = {"metric": "drivable_area_compliance", "score": 0.0, "first_violation_s": 4.25}
+    late = {"metric": "no_ego_at_fault_collisions", "score": 0.0, "first_violation_s": 9.0}
+    comfort = {"metric": "ego_is_comfortable", "score": 0.0, "first_violation_s": 1.0}
+    bad = ended(99, 0.0, metrics=[late, comfort, violated])
+    run = run_of(*[ended(i, i / 40) for i in range(1, 41)], bad)
+
+    worst = run.values()["worst"]
+
+    assert [row["token"] for row in worst] == ["t99", *[f"t{i}" for i in range(1, 20)]]
+    assert worst[0]["why"] == "drivable area 4.2 s, at-fault collision 9.0 s"
+    assert worst[0]["replay"] is None  # no rollout is stored
+
+
+def test_failures_are_counted_and_named():
+    lost = TaskResult(Task("idm", "none", 0, "t1"), FAILED, error="no plan", hint="return one")
+    values = run_of(ended(0, 0.5), lost).values()
+    assert values["num_failures"] == values["groups"][0]["failed"] == 1
+    assert values["failures"][0]["error"] == "no plan"
+
+
+def test_nothing_is_shown_without_the_token(server):
+    for path in ("/", "/state", "/replay/1"):
+        status, body = ask(server, path, **{"X-Shiftsim-Token": "guess"})
+        assert (status, "token" in body) == (403, True)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", ""])
+def test_other_host_names_are_refused(server, host):
+    assert ask(server, "/state", Host=host)[0] == 403
+    assert ask(server, "/state", Origin="http://evil.example")[0] == 403
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
+def test_only_get_is_answered(server, method):
+    assert ask(server, "/state", method)[0] == 501
+
+
+@pytest.mark.parametrize("path", ["/x", "/replay/", "/replay/7", "/replay/-1", "/../manifest.json"])
+def test_other_pages_are_not_there(server, path):
+    assert ask(server, path)[0] == 404
+
+
+def test_only_this_machine_is_answered(server):
+    assert server.server_address[0] == "127.0.0.1"
+
+
+def test_the_page_hears_of_the_end_and_then_nothing_is_answered(server):
+    with LiveServer(run_of(ended(0, 0.5))) as other:
+        assert json.loads(ask(other, "/state")[1])["state"] == "running"
+        other.told.wait = lambda seconds: None  # nobody asks again here
+    assert other.run.values()["state"] == "finished"
+    with pytest.raises(OSError, match=r"refused|reset"):
+        ask(other, "/state")
+
+
+def test_an_interrupt_is_told():
+    server = LiveServer(run_of())
+    with pytest.raises(KeyboardInterrupt), server:
+        raise KeyboardInterrupt
+    assert server.run.values()["state"] == "interrupted"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return write_toy_store(tmp_path_factory.mktemp("live") / "toy", count=4)
+
+
+def config(store, out, **more):
+    values = {"planners": ["constant-velocity"], "store": str(store), "workers": 1, "out": str(out)}
+    return prepare(make_config(values | more))
+
+
+def test_a_run_agrees_with_its_table_and_its_replays_open(store, tmp_path):
+    live = LiveRun("x", 4, ["constant-velocity"], open_store(store).read)
+
+    finished = execute(config(store, tmp_path / "run"), on_progress=live.add)
+
+    values = live.values()
+    assert values["done"] == values["total"] == 4
+    scores = np.array(finished.scores["cls"].to_pylist())
+    assert values["groups"][0]["mean"] == pytest.approx(100 * scores.mean(), abs=1e-9)
+    assert [row["score"] for row in values["worst"]] == sorted(100 * scores[scores < 1.0])
+    page = live.replay(values["worst"][0]["replay"])
+    assert values["worst"][0]["token"] in page
+
+
+def test_a_resumed_run_counts_what_had_finished_before(store, tmp_path):
+    def stop(progress):
+        if progress.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        execute(config(store, tmp_path / "run"), on_progress=stop)
+    live = LiveRun("x", 4, ["constant-velocity"], open_store(store).read)
+
+    finished = execute(config(store, tmp_path / "run", resume=True), on_progress=live.add)
+
+    values = live.values()
+    assert values["groups"][0]["done"] == 4
+    mean = np.mean(finished.scores["cls"].to_pylist())
+    assert values["groups"][0]["mean"] == pytest.approx(100 * mean)
+
+
+def test_the_command_says_where_the_page_is(store, tmp_path, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setenv("DISPLAY", ":0")
+    words = ["run", "-p", "constant-velocity", "--store", str(store), "--workers", "1"]
+
+    with pytest.raises(SystemExit) as left:
+        shiftsim.cli.main([*words, "--out", str(tmp_path / "run"), "--live", "--json"])
+
+    printed = capsys.readouterr()
+    assert left.value.code in (0, None)
+    json.loads(printed.out)
+    assert opened == [line.split()[1] for line in printed.err.splitlines() if "live" in line]
+    assert opened[0].startswith("http://127.0.0.1:")
