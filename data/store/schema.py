@@ -15,6 +15,10 @@ the connectors) are JSON in its footer.
 
 import pyarrow as pa
 
+from shiftsim.data.arrow import defer_pandas
+
+defer_pandas()  # before the first array
+
 FORMAT = "shiftsim-store"
 VERSION = 1
 BLOCK_ROWS = 128  # rows of a recording per row group of tracks; a window reads few it does not need

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from shiftsim.data.store.check import Problem, RecordingRow
     from shiftsim.data.store.reading import ScenarioStore
-    from shiftsim.runs.filter import Verdicts
+    from shiftsim.runs.verdicts import Verdicts
 
 _DATA, _PARTIAL = 2, 3
 _MAX_SHOWN = 20  # problems of one kind
@@ -157,8 +157,8 @@ _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": 
 def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
-    from shiftsim.runs.filter import read_verdicts
     from shiftsim.runs.scenarios import find_split
+    from shiftsim.runs.verdicts import read_verdicts
 
     if split := settings.get("split"):
         tokens = find_split(split, store.path, store.tokens).tokens

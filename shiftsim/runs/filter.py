@@ -21,43 +21,36 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.tables import Table, digest, write_blocks
+from shiftsim.data.store.tables import Table, write_blocks
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import below
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
+from shiftsim.runs import verdicts
 from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Split
 from shiftsim.runs.task import Scenarios, attempt
+from shiftsim.runs.verdicts import (
+    ACCEPTED,
+    AREA,
+    COLLISION,
+    DROPPED,
+    FAILED,
+    OFF_ROUTE,
+    STANDING,
+    VERDICTS,
+    Verdicts,
+)
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
-VERDICTS = "filter/verdicts.parquet"
 _UNFINISHED = "filter/unfinished.sqlite"
-ACCEPTED, DROPPED, FAILED = "accepted", "dropped", "failed"
-COLLISION, AREA = "at-fault collision", "drivable area"
-STANDING, OFF_ROUTE = "path too short", "progress along the route"
 _COLLISIONS, _DRIVABLE = "no_ego_at_fault_collisions", "drivable_area_compliance"
 _PROGRESS = "expert_total_progress_along_route"
-
-_SCHEMA = pa.schema(
-    [
-        pa.field("token", pa.string(), nullable=False),
-        pa.field("verdict", pa.string(), nullable=False),  # accepted, dropped or failed
-        pa.field("reason", pa.string(), nullable=False),  # rules broken, or the error
-        pa.field("no_at_fault_collisions", pa.float64()),  # score
-        pa.field("drivable_area_compliance", pa.float64()),  # score
-        pa.field("max_outside_m", pa.float64()),  # furthest corner outside the drivable area
-        pa.field("path_m", pa.float64()),  # travelled from iteration 0 to the last one
-        pa.field("progress_m", pa.float64()),  # of it along the route driven
-        pa.field("partner_token", pa.string()),  # of the first at-fault collision
-        pa.field("first_violation_s", pa.float64()),  # since iteration 0, of the first rule broken
-    ]
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,37 +69,6 @@ class FilterConfig:
                 f"{self.min_progress_share!r} is out of range",
                 hint="min_path_m from 0 on, min_progress_share within 0 and 1",
             )
-
-
-@dataclass(frozen=True)
-class Verdicts:
-    """The verdicts of a store."""
-
-    path: Path  # the file
-    # one row per scenario, sorted by token; the columns of the file
-    rows: tuple[Mapping[str, Any], ...]
-    hash: str  # digest of the file
-    config: Mapping[str, Any]  # what the scenarios had to satisfy
-
-    @property
-    def accepted(self) -> tuple[str, ...]:
-        """Tokens of the accepted scenarios, sorted."""
-        return tuple(row["token"] for row in self.rows if row["verdict"] == ACCEPTED)
-
-    @property
-    def rejected(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of the scenarios that were dropped or could not be driven."""
-        return tuple(row for row in self.rows if row["verdict"] != ACCEPTED)
-
-    def counts(self) -> dict[str, int]:
-        """How many scenarios there are by verdict, and how many break each rule."""
-        names = (ACCEPTED, DROPPED, FAILED, COLLISION, AREA, STANDING, OFF_ROUTE)
-        out = dict.fromkeys(names, 0)
-        for row in self.rows:
-            out[row["verdict"]] += 1
-            for reason in row["reason"].split(", ") if row["verdict"] == DROPPED else ():
-                out[reason] += 1
-        return out
 
 
 class Playback:
@@ -200,12 +162,12 @@ def filter_store(
                 done[outcome.task] = row
                 on_progress(len(done), len(opened))
         found = [dict(done[token]) for token in opened.tokens]
-        table = pa.Table.from_pylist(found, schema=_SCHEMA)
+        table = pa.Table.from_pylist(found, schema=verdicts.SCHEMA)
         write_blocks(path / VERDICTS, [table], conditions)
         journal.remove()
     finally:
         journal.close()
-    return _read(path)
+    return verdicts.read(path)
 
 
 def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[str, Any]:
@@ -223,45 +185,19 @@ def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[
 
 
 def _failed(token: str, reason: str) -> dict[str, Any]:
-    return dict.fromkeys(_SCHEMA.names) | {"token": token, "verdict": FAILED, "reason": reason}
+    row = {"token": token, "verdict": FAILED, "reason": reason}
+    return dict.fromkeys(verdicts.SCHEMA.names) | row
 
 
 def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     if not (store / VERDICTS).is_file():
         return ()
     try:
-        found = _read(store)
+        found = verdicts.read(store)
     except DataError:
         return ()  # it is written anew
-    same = Table(found.path, _SCHEMA).footer.get("hash") == conditions["hash"]
+    same = Table(found.path, verdicts.SCHEMA).footer.get("hash") == conditions["hash"]
     return found.rows if same else ()
-
-
-def _read(store: Path) -> Verdicts:
-    path = store / VERDICTS
-    table = Table(path, _SCHEMA)
-    config = table.footer.get("config")
-    if not isinstance(config, dict):
-        raise DataError(f"{path}: the footer has no 'config'", hint=f"shiftsim filter {store}")
-    return Verdicts(path, tuple(table.read().to_pylist()), digest(path), config)
-
-
-def read_verdicts(store: str | Path, store_hash: str) -> Verdicts | None:
-    """The verdicts of a store, whose content has a hash; None where it was not filtered.
-
-    Raises:
-        DataError: The file is damaged, or of another content of the store.
-    """
-    path = Path(store)
-    if not (path / VERDICTS).is_file():
-        return None
-    found = _read(path)
-    if Table(found.path, _SCHEMA).footer.get("store") != store_hash:
-        raise DataError(
-            f"{found.path}: the verdicts are of another content of the store",
-            hint=f"shiftsim filter {path}, or --all to use every scenario",
-        )
-    return found
 
 
 def choose_scenarios(

@@ -17,7 +17,6 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import require_no_import
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.planners.isolated import Isolated
 from shiftsim.planners.registry import (
     PLANNERS,
     RunPlanner,
@@ -31,11 +30,12 @@ from shiftsim.runs.manifest import State, check_resumable, check_space, check_ta
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, token_hash
 from shiftsim.runs.task import Batch
+from shiftsim.runs.verdicts import Verdicts, read_verdicts
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import PLANNER, make_traffic, traffic_name
 
 if TYPE_CHECKING:
-    from shiftsim.runs.filter import Verdicts
+    from shiftsim.planners.isolated import Isolated
 
 RUNS = Path("runs")
 _NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
@@ -179,12 +179,14 @@ def _is_known(config: RunConfig, source: Any) -> bool:
     return source in PLANNERS if config.isolate or config.planner_python else True
 
 
-def _isolated(config: RunConfig, source: Any, arguments: dict[str, Value]) -> Isolated:
+def _isolated(config: RunConfig, source: Any, arguments: dict[str, Value]) -> "Isolated":
     if not isinstance(source, str):
         raise ConfigError(
             f"planner {planner_name(source)!r} cannot be isolated: it is an object of this process",
             hint="put its class into a module, and give its name as package.module:Class",
         )
+    from shiftsim.planners.isolated import Isolated  # few runs need it
+
     return Isolated(source, arguments, "" if source in PLANNERS else config.planner_python)
 
 
@@ -267,10 +269,8 @@ def _edits(config: RunConfig, store: ScenarioStore) -> EditSet | None:
     return edits
 
 
-def _verdicts(config: RunConfig, store: ScenarioStore) -> "Verdicts | None":
+def _verdicts(config: RunConfig, store: ScenarioStore) -> Verdicts | None:
     """The verdicts that decide which scenarios of a whole store are run."""
-    from shiftsim.runs.filter import read_verdicts
-
     found = read_verdicts(store.path, store.hash)
     if found is not None and not found.accepted:
         raise DataError(
@@ -302,7 +302,10 @@ def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int)
             "needs it",
             hint="put its class into a module of its own, beside the main script",
         )
-    large = (entry.in_batches or isinstance(entry.source, Isolated) for entry in entries)
+    large = (
+        entry.in_batches or getattr(type(entry.source), "shares_nothing", False)
+        for entry in entries
+    )
     memory = _MEMORY_OF_NETWORK if any(large) else 0.0
     workers = config.workers or (default_workers(memory) if memory else default_workers())
     return 1 if stuck else max(1, min(workers, num_batches))

@@ -11,8 +11,8 @@ from time import monotonic
 from typing import Any
 
 from shiftsim.planners.learned.device import resolve_device
-from shiftsim.runs.filter import read_verdicts
 from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.runs.verdicts import read_verdicts
 from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
 from shiftsim.train.keeping import read_state, write_network, write_state

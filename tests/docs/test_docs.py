@@ -312,10 +312,10 @@ def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: p
 
 
 def test_verdicts_of_the_filter_are_described() -> None:
-    from shiftsim.runs.filter import _SCHEMA
+    from shiftsim.runs.verdicts import SCHEMA
 
     rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
-    assert [row[:3] for row in rows] == _described(_SCHEMA)
+    assert [row[:3] for row in rows] == _described(SCHEMA)
 
 
 def test_columns_of_a_map_are_those_of_the_file() -> None:

@@ -17,17 +17,8 @@ import shiftsim
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.runs.filter import (
-    AREA,
-    COLLISION,
-    OFF_ROUTE,
-    STANDING,
-    VERDICTS,
-    FilterConfig,
-    filter_store,
-    judge_scenario,
-    read_verdicts,
-)
+from shiftsim.runs.filter import FilterConfig, filter_store, judge_scenario
+from shiftsim.runs.verdicts import AREA, COLLISION, OFF_ROUTE, STANDING, VERDICTS, read_verdicts
 from shiftsim.world.state import AgentKind, Y
 
 

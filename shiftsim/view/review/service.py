@@ -22,7 +22,7 @@ from shiftsim.data.store.review import (
     write_reviews,
 )
 from shiftsim.errors import ConfigError
-from shiftsim.runs.filter import read_verdicts
+from shiftsim.runs.verdicts import read_verdicts
 from shiftsim.sim.log import as_recorded
 from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.scene import (
