@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.report.palette import new_figure
 from shiftsim.view import still
 from shiftsim.world.scenario import Scenario
 
 _EDITED = "#7b2fbf"  # as in replays
-_SIDE = 5.0  # inches, width of each of the two
 _WIDTH = 110  # characters of the words below the picture
 
 
@@ -25,12 +23,9 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     if len(made):
         points.append(edited.tracks.poses[edited.iteration_rows[0], made, :2])
     extent = still.extent_of_points(np.concatenate(points))
-    side = extent[2:] - extent[:2]
-    width, height = 2.0 * _SIDE, _SIDE * min(side[1] / side[0], 2.0)
     words = edited.script.words if edited.script else ()
     lines = [part for line in words for part in textwrap.wrap(line, _WIDTH)]
-    figure = new_figure(layout="compressed", figsize=(width, height + 0.5))
-    panels = figure.subplots(1, 2)
+    figure, (panels,) = still.panels(1, 2, extent)
     for scenario, axes in zip((recorded, edited), panels, strict=True):
         still.draw_start(axes, scenario, extent)
         axes.set_title(

@@ -85,7 +85,7 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
 def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, Any, list[Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
     extent = _extent_of(scenario, shown)
-    figure, axes = _single(extent)
+    figure, ((axes,),) = panels(1, 1, extent)
     draw_map(axes, scenario.map, scenario.route, extent)
     styles = planner_styles(item.planner for item in shown)
     draw_paths(axes, shown, styles)
@@ -107,26 +107,20 @@ def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> 
     """
     rows = [_sample_at(shown[0].log.time_us, time) for time in at]
     extent = _extent_of(scenario, shown)
-    width, height = extent[2:] - extent[:2]
-    size = min(_WIDTH / len(at), _LARGEST * width / max(width, height))
-    figure = new_figure(
-        layout="compressed",
-        figsize=(size * len(at) + 0.4, (size * height / width + 0.1) * len(shown) + 0.5),
-    )
-    panels = figure.subplots(len(shown), len(at), squeeze=False)
+    figure, panels_of = panels(len(shown), len(at), extent)
+    sides = extent[2:] - extent[:2]
+    per_line = max(20, int(15 * sides[1] / sides[0] * _width(len(at), extent)))  # characters
     styles = planner_styles(item.planner for item in shown)
-    for item, line in zip(shown, panels, strict=True):
+    for item, line in zip(shown, panels_of, strict=True):
         for time, row, axes in zip(at, rows, line, strict=True):
-            _frame(axes, extent)
             draw_map(axes, scenario.map, scenario.route, extent)
             draw_paths(axes, [item], styles)
             draw_boxes(axes, [item], row, styles)
             draw_violation(axes, item, styles[item.planner], "short")
             if item is shown[0]:
                 axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
-        words = "\n".join(wrap(caption(item), max(20, int(size * height / width * 15))))
-        line[0].set_ylabel(words, fontsize=SMALL - 1)
-    draw_scale(panels[-1][0], extent)
+        line[0].set_ylabel("\n".join(wrap(caption(item), per_line)), fontsize=SMALL - 1)
+    draw_scale(panels_of[-1][0], extent)
     figure.suptitle(_words(scenario), fontsize=SMALL + 1)
     return figure
 
@@ -140,12 +134,12 @@ def overview(thing: Scenario | VectorMap) -> Any:
     if isinstance(thing, VectorMap):
         bounds = thing.edges.polygons.bounds
         extent = extent_of_points(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
-        figure, axes = _single(extent)
+        figure, ((axes,),) = panels(1, 1, extent)
         draw_map(axes, thing, (), extent)
         draw_scale(axes, extent)
         return figure
     extent = extent_of_points(thing.expert[:, :2])
-    figure, axes = _single(extent)
+    figure, ((axes,),) = panels(1, 1, extent)
     draw_start(axes, thing, extent)
     _heading(axes, thing, 0.0)
     add_legend(figure, axes)
@@ -155,7 +149,6 @@ def overview(thing: Scenario | VectorMap) -> Any:
 def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
     """A scenario at its first iteration, within an extent (4,) [m]."""
     log = as_recorded(scenario)
-    _frame(axes, extent)
     draw_map(axes, scenario.map, scenario.route, extent)
     draw_recorded(axes, log)
     draw_others(axes, log, 0)
@@ -190,22 +183,26 @@ def extent_of_points(points: FloatArray) -> FloatArray:
     return np.array([*(middle - half), *(middle + half)])
 
 
-def _single(extent: FloatArray) -> tuple[Any, Any]:
-    """A figure with one scene, as wide and high as the extent needs."""
+def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
+    """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
+    sides, width = extent[2:] - extent[:2], _width(columns, extent)
+    height = width * sides[1] / sides[0]
+    size = (width * columns + 0.4, (height + 0.1) * rows + 0.5)
+    figure = new_figure(layout="compressed", figsize=size)
+    made = figure.subplots(rows, columns, squeeze=False)
+    for axes in made.flat:
+        axes.set_xlim(extent[0], extent[2])
+        axes.set_ylim(extent[1], extent[3])
+        axes.set_aspect("equal")
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return figure, made
+
+
+def _width(columns: int, extent: FloatArray) -> float:
+    """Width of one scene of a row [inch]."""
     sides = extent[2:] - extent[:2]
-    width, height = sides * _LARGEST / sides.max()
-    figure = new_figure(layout="compressed", figsize=(width + 0.2, height + 0.4))
-    axes = figure.subplots()
-    _frame(axes, extent)
-    return figure, axes
-
-
-def _frame(axes: Any, extent: FloatArray) -> None:
-    axes.set_xlim(extent[0], extent[2])
-    axes.set_ylim(extent[1], extent[3])
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    return float(min(_WIDTH / columns, _LARGEST * sides[0] / sides.max()))
 
 
 def add_legend(figure: Any, axes: Any) -> None:
