@@ -89,7 +89,8 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
         number += count - 1
         arms = _arms(
             rng, numbers, angles,
-            lit=lit, lanes=lanes, crossings=float(rng.uniform(0.3, 1.0)), like=mid, alike=(0, onward),
+            lit=lit, lanes=lanes, crossings=float(rng.uniform(0.3, 1.0)),
+            like=mid, alike=(0, onward),
         )  # fmt: skip
         rounding = _rounding(rng)
         if junction == 101:

@@ -17,6 +17,9 @@ def carl(
     split: Annotated[
         str, typer.Option(help="Split of the store; all its scenarios if empty.")
     ] = "",
+    checkpoint: Annotated[
+        str, typer.Option(help="Weights to begin with: a file, or shiftsim. Else from nothing.")
+    ] = "",
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or auto.")] = "cpu",
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that drive, threads that train.")] = 2,
@@ -43,6 +46,7 @@ def carl(
         store=store,
         out=out,
         split=split,
+        checkpoint=checkpoint,
         seed=seed,
         rounds=rounds,
         states=states,
