@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from shiftsim.world.state import LightStatus
 
-_YELLOW, _CLEARING = 3.0, 2.0  # s
+_CLEARING = 2.0  # s
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,7 @@ class Lights:
     green: tuple[float, ...]  # how long each phase is green [s]
     begun: float  # how long the cycle has been going on at time 0 [s]
     crossings: dict[str, int]  # phase of the vehicles that a crosswalk stops, by its name
+    yellow: float = 3.0  # how long a phase is yellow [s]
 
     def status(self, phase: int, time: float) -> LightStatus:
         """What a phase shows at a time [s]."""
@@ -26,9 +27,9 @@ class Lights:
 
     def wait(self, phase: int, time: float) -> float:
         """Time until a phase becomes green; 0 and less, how long it has been, or yellow [s]."""
-        spans = [green + _YELLOW + _CLEARING for green in self.green]
+        spans = [green + self.yellow + _CLEARING for green in self.green]
         since = (self.begun + time - sum(spans[:phase])) % sum(spans)
-        return -since if since < self.green[phase] + _YELLOW else sum(spans) - since
+        return -since if since < self.green[phase] + self.yellow else sum(spans) - since
 
     def closed(self, time: float) -> set[int]:
         """Connecting roads that nobody may enter at a time [s]."""

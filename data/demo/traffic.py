@@ -26,6 +26,7 @@ _LOOK_AHEAD = 60.0  # m
 _REQUEST = 1.0  # s before braking would begin, a driver asks to enter a zone
 _EVEN = 1.15  # m/s^2, even braking towards a place to wait begins here
 _YIELDING = 1.8  # m/s^2, a driver stops for waiting pedestrians when this is enough
+_AT_YELLOW, _REACTION = 2.6, 0.5  # m/s^2, s, likewise for a light that turns
 _SIDE_MARGIN = 0.4  # m
 _PASSED = 2.8  # m between a pedestrian who has crossed and the middle of a driver's way
 
@@ -103,7 +104,7 @@ class Traffic:
         for driver in drivers:
             for held in driver.path.zones if driver.held else ():
                 waits = driver.is_yielding(held) or driver.is_held_up(held)
-                if driver.rear > held.exit or waits:
+                if driver.rear > held.exit or waits or self._must_stop(driver, held):
                     driver.held.discard(held.id)
         asking = [(d, zone) for d in drivers if (zone := d.next_zone())]
         asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].token))
@@ -123,6 +124,12 @@ class Traffic:
                 driver.patience = 6.0
             elif driver.patience <= 0.0:
                 refused.append(zone)
+
+    def _must_stop(self, driver: Driver, zone: Zone) -> bool:
+        """Whether a light has turned, and who was let in before can still stop."""
+        place = zone.stop - _REACTION * driver.v
+        is_shut = zone.id in self._closed and driver.is_before(zone)
+        return is_shut and driver.needed(place) < _AT_YELLOW
 
     def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
         return any(

@@ -7,6 +7,7 @@ from shiftsim.data.demo.network import BAY_ANGLE, Street, Town
 from shiftsim.data.demo.paths import STEP, Walk, arc_at, resample
 
 _PARKING_STEP, _BAY_STEP = 6.6, 3.1  # m along the street between parked cars, diagonal ones
+_UNMARKED = 4.0  # m from a place to cross without a crosswalk to the middle of a parked car
 _DIAGONAL = 3.0  # m, wider strips are for diagonal parking
 _ROUNDING = 0.6  # m
 
@@ -61,6 +62,7 @@ def _bays(town: Town, street: Street) -> FloatArray:
     step, clear = (_BAY_STEP, 4.0) if street.parking > _DIAGONAL else (_PARKING_STEP, 9.0)
     stalls = street.stalls or ((14.0, road.length - 8.0),)
     places = np.concatenate([np.arange(*ends, step) for ends in stalls])
+    clear = clear if street.is_marked else min(clear, _UNMARKED)
     for first, last in street.crossings:
         places = places[(places < first - clear) | (places > last + clear)]
     aside = np.full(len(places), street.half - 0.5 * street.parking)

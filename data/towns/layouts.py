@@ -65,7 +65,7 @@ def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
     angles = random_angles(rng, count)
     lanes = int(rng.choice((1, 2, 3), p=(0.25, 0.5, 0.25) if lit else (0.6, 0.4, 0.0)))
     lanes = min(lanes, 2) if count == 5 else lanes
-    share = float(rng.random())
+    share = float(rng.uniform(0.3, 1.0))
     arms = _arms(rng, range(1, count + 1), angles, lit=lit, lanes=lanes, crossings=share)
     return _anywhere(rng, fan(arms, angles, _rounding(rng)))
 
@@ -76,7 +76,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
     limits = ((30.0, 50.0), *_LIMITS[1:])[lanes - 1]
     limit, length = float(rng.choice(limits)), float(rng.uniform(60.0, 120.0))
     mid = random_street(rng, 1, lanes=lanes, limit=limit, length=length, parking=0.0)
-    if rng.random() < 0.4 and not lit:
+    if rng.random() < 0.6 and not lit:
         at = 0.5 * length_of(mid)
         mid = replace(mid, crossings=((at - 2.0, at + 2.0),))
     mid = replace(mid, has_lights=lit, stop=2.0)
@@ -89,7 +89,8 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
         number += count - 1
         arms = _arms(
             rng, numbers, angles,
-            lit=lit, lanes=lanes, crossings=float(rng.random()), like=mid, alike=(0, onward),
+            lit=lit, lanes=lanes, crossings=float(rng.uniform(0.3, 1.0)),
+            like=mid, alike=(0, onward),
         )  # fmt: skip
         rounding = _rounding(rng)
         if junction == 101:
@@ -138,10 +139,12 @@ def _arms(
         else:
             street = random_street(rng, number, lanes=own, limit=limit if is_main else None)
             street = with_crossings(rng, street, crossings)
-            if street.lanes == 1 and rng.random() < 0.3:
+            if street.lanes == 1 and rng.random() < 0.4:
                 street = with_obstacles(rng, street)
             is_main = lit or (all_main or is_main if like is None else False)
-        out.append(replace(street, is_main=is_main, has_lights=lit, has_stop_sign=has_sign))
+        is_marked = lit or street.is_marked
+        street = replace(street, is_main=is_main, has_lights=lit, is_marked=is_marked)
+        out.append(replace(street, has_stop_sign=has_sign))
     return out
 
 
@@ -160,7 +163,7 @@ def _roundabout(rng: np.random.Generator) -> list[Street]:
     if gaps.min() < 2.0 * half + 0.15:
         return []
     start = float(radius / np.cos(half) + radius * np.tan(half))
-    limit, share = float(rng.choice((30.0, 40.0, 50.0))), rng.random()
+    limit, share = float(rng.choice((30.0, 40.0, 50.0))), rng.uniform(0.3, 1.0)
     arms, rings = [], []
     for place, angle in enumerate(directions(gaps)):
         arm = random_street(rng, place + 1, limit=limit, parking=0.0)
@@ -198,7 +201,7 @@ def _street(rng: np.random.Generator) -> list[Street]:
         own = 20.0 if is_side else limit
         arm = random_street(rng, place + 1, limit=own, length=length, parking=parking)
         arm = replace(arm, width=width, is_main=not is_side, has_stop_sign=is_side)
-        arm = with_crossings(rng, arm, 0.4)
+        arm = with_crossings(rng, arm, 0.6)
         if not is_side and rng.random() < 0.5:
             arm = with_obstacles(rng, arm)
         elif not is_side and rng.random() < 0.7:

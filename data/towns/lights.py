@@ -24,7 +24,9 @@ def random_lights(town: Town, junction: int, rng: np.random.Generator) -> Lights
     green = tuple(round(float(rng.uniform(7.0, 13.0)), 1) for _ in phases)
     begun = round(float(rng.uniform(0.0, 30.0)), 1)
     numbers = tuple(frozenset(x for name in phase for x in roads[name]) for phase in phases)
-    return Lights(numbers, green, begun, crossings)
+    fastest = max(town.streets[name].limit for name in roads)
+    yellow = float(np.clip(0.1 * fastest - 2.0, 3.0, 5.0))  # as in German towns
+    return Lights(numbers, green, begun, crossings, yellow)
 
 
 def _phases(headings: dict[str, float]) -> list[list[str]]:

@@ -17,15 +17,18 @@ from shiftsim.data.towns.ways import Ways
 from shiftsim.world.state import LightStatus
 
 _SHARES = {
-    "car": 0.71,
-    "van": 0.09,
-    "pickup": 0.06,
+    "car": 0.50,
+    "van": 0.06,
+    "pickup": 0.05,
     "truck": 0.04,
     "bus": 0.03,
-    "motorcycle": 0.03,
-    "bicycle": 0.04,
+    "motorcycle": 0.07,
+    "bicycle": 0.25,
 }
+_HALTS = {"bus": 0.4, "bicycle": 0.2}  # chance to stop for a while
+_HALTS_ELSE, _SLOW = 0.08, 0.07  # chance of all others, and of those who dawdle
 _NEVER = (0.0, 0.0)  # a halt that is none
+_WALK_UP = 14.0  # m, of pedestrians to the place where they cross
 _MERGING = 14.0  # m, on which who was parked joins the lane
 _ROUNDS = 12  # how often somebody is left out
 
@@ -59,10 +62,12 @@ def _driver(
     eager = float(np.clip(rng.normal(0.95, 0.1), 0.65, 1.06))
     if category in ("truck", "bus"):
         eager = float(rng.uniform(0.7, 0.92))
+    elif rng.random() < _SLOW:
+        eager = float(rng.uniform(0.35, 0.65))
     made = Driver(category, path, s, 0.0, round(eager, 3), start)
     if rng.random() < 0.16:
         made.wave = (round(float(rng.uniform(0.15, 0.65)), 2), round(float(rng.uniform(6, 15)), 1))
-    if rng.random() < (0.4 if category == "bus" else 0.05) and not path.is_parking:
+    if rng.random() < _HALTS.get(category, _HALTS_ELSE) and not path.is_parking:
         made.halt = _halt(path, made, rng)
     return made
 
@@ -218,15 +223,13 @@ def _arriving(ways: Ways, rng: np.random.Generator, duration: float) -> list[Dri
 def _walkers(town: Town, rng: np.random.Generator, duration: float) -> list[Walker]:
     """Pedestrians over crossings and along the streets."""
     out = []
-    level = float(rng.choice((0.15, 0.5, 1.0)))
+    level = float(rng.choice((0.5, 1.0, 1.5)))
     for walk in town.walks.values():
-        crosses = bool(walk.crossing)
-        if rng.random() >= level * (0.55 if crosses else 0.8):
-            continue
-        last = walk.kerb - 4.0 if crosses else 0.7 * walk.length
+        last = walk.kerb - 4.0 if walk.crossing else 0.7 * walk.length
         if last < 3.0:
             continue
-        start = float(rng.uniform(0.0, duration - 8.0)) if rng.random() < 0.7 else 0.0
-        s = float(rng.uniform(2.0, last))
-        out.append(Walker(walk, start=round(start, 2), s=round(s, 2)))
+        for _ in range(int(rng.poisson(level if walk.crossing else 0.5 * level))):
+            start = float(rng.uniform(0.0, duration - 8.0)) if rng.random() < 0.7 else 0.0
+            s = float(rng.uniform(max(2.0, last - _WALK_UP), last))
+            out.append(Walker(walk, start=round(start, 2), s=round(s, 2)))
     return sorted(out, key=lambda walker: walker.start)

@@ -19,6 +19,7 @@ from shiftsim.data.deepplan.windows import ROW_S, ConversionConfig
 from shiftsim.data.demo.files import write_site
 from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.scenes import DemoSite, Scene
+from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import recording_folder
 from shiftsim.data.store.tracks import open_recording
@@ -36,6 +37,7 @@ _SPACING = 2000.0  # m between the origins of towns
 _ENOUGH = 6  # scenarios that a town must have
 _TRIES = 8
 _SAME_PLACE = 0.5  # m, both ends together
+_MIN_BLOCKS = 2  # of a route; who drives out of town from the first moment on has one
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,13 @@ def _make(name: str, rng: np.random.Generator, source: Path, store: Path) -> int
     report = convert_dsc3d(source, store, site=name, options=config)
     if place.lights:
         _add_lights(store, f"{name}_{scene.name}", place, np.array(offset[:2]))
-    return report.accepted
+    return len(usable(ScenarioStore(store))) if report.accepted else 0
+
+
+def usable(store: ScenarioStore) -> list[Window]:
+    """Scenarios of a town whose route all planners can follow."""
+    windows = map(store.window, store.tokens)
+    return [window for window in windows if len(window.route) >= _MIN_BLOCKS]
 
 
 def _add_lights(store: Path, recording: str, place: Place, offset: FloatArray) -> None:

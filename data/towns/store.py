@@ -11,7 +11,7 @@ from shiftsim.data.deepplan.convert import Spread
 from shiftsim.data.store.reading import ScenarioStore, read_report
 from shiftsim.data.store.tables import MANIFEST
 from shiftsim.data.store.writing import StoreWriter, window_row
-from shiftsim.data.towns.recordings import MakeTown, town_names
+from shiftsim.data.towns.recordings import MakeTown, town_names, usable
 from shiftsim.errors import ConfigError, DataError
 
 GENERATOR = "towns"  # as `store.json` names it
@@ -68,8 +68,7 @@ def _add(part: Path, city: str, writer: StoreWriter) -> None:
     store = ScenarioStore(part)
     writer.add_map(store.map(city))
     rows: dict[str, list[dict[str, Any]]] = {}
-    for token in store.tokens:
-        window = store.window(token)
+    for window in usable(store):
         rows.setdefault(window.log_name, []).append(window_row(window, city))
     for recording, windows in sorted(rows.items()):
         writer.take_recording(store.recording_folder(recording), recording, windows)

@@ -88,13 +88,17 @@ def length_of(street: Street) -> float:
 
 
 def with_crossings(rng: np.random.Generator, street: Street, share: float) -> Street:
-    """The same street with crosswalks: at its begin with a chance of `share`, and further on."""
+    """The same street with crossings: at its begin with a chance of `share`, and further on.
+
+    Some are not marked: there people step out between parked cars.
+    """
     length = length_of(street)
     places = AT_JUNCTION if rng.random() < share else ()
-    if rng.random() < 0.3 and length > 75.0:
+    if rng.random() < 0.6 and length > 75.0:
         at = round(float(rng.uniform(32.0, length - 38.0)), 1)
         places = (*places, (at, at + 4.0))
-    return replace(street, crossings=places, stop=9.0 if AT_JUNCTION[0] in places else 2.0)
+    stop = 9.0 if AT_JUNCTION[0] in places else 2.0
+    return replace(street, crossings=places, stop=stop, is_marked=bool(rng.random() < 0.7))
 
 
 def with_obstacles(rng: np.random.Generator, street: Street) -> Street:

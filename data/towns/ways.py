@@ -6,7 +6,7 @@ from shiftsim.data.demo.network import Street, Town
 from shiftsim.data.demo.paths import Path
 
 _CHANGING = 70.0  # m, shortest street to change lanes on
-_CHANGES = 0.15  # chance of a lane change that no turn asks for
+_CHANGES = 0.3  # chance of a lane change that no turn asks for
 _PARKS = 0.35  # chance that who drives through a car park stays there
 _TRIES = 6
 

@@ -25,6 +25,9 @@ def carl(
             autocompletion=completion.splits,
         ),
     ] = "",
+    checkpoint: Annotated[
+        str, typer.Option(help="Weights to begin with: a file, or shiftsim. Else from nothing.")
+    ] = "",
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or auto.")] = "cpu",
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that drive, threads that train.")] = 2,
@@ -51,6 +54,7 @@ def carl(
         store=store,
         out=out,
         split=split,
+        checkpoint=checkpoint,
         seed=seed,
         rounds=rounds,
         states=states,

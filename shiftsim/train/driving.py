@@ -21,6 +21,7 @@ from shiftsim.train.network import forward, from_official, lay_out, tensor_of
 from shiftsim.train.pictures import blocks_of, packed
 
 EVERY = 2  # steps of which one is kept: neighbours are nearly the same
+_SOON = 30  # steps before an infraction
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,7 @@ class State(NamedTuple):
     picture: bytes  # `pictures.packed`
     measurements: Action  # (10,) of `CarlFeatures`
     action: Action  # (2,) what the expert would do
+    is_urgent: bool = False  # whether the network ended with an infraction soon after
 
 
 class Driven(NamedTuple):
@@ -99,6 +101,15 @@ class Lane:
         """Whether nothing is to be learnt from going on."""
         return self.episode.is_over or (not self.job.is_test and self.episode.infraction != "")
 
+    @property
+    def learnt(self) -> list[State]:
+        """What was noted; the last of it is urgent where the network drove into an infraction."""
+        by_network = 0 <= self.start.expert_steps < self.episode.iteration
+        if not (self.episode.infraction and by_network):
+            return self.states
+        calm = max(0, len(self.states) - _SOON // EVERY)
+        return self.states[:calm] + [state._replace(is_urgent=True) for state in self.states[calm:]]
+
     def look(self) -> None:
         """Note the state and its label, where it is kept, and who drives."""
         step, observation = self.episode.iteration, self.episode.observe()
@@ -137,7 +148,7 @@ class Driver:
         active = list(lanes)
         while active := [lane for lane in active if not lane.is_over]:
             active = _step(active, self._student, failed)
-        states = [state for lane in lanes for state in lane.states]
+        states = [state for lane in lanes for state in lane.learnt]
         ended = [lane.episode for lane in lanes if job.is_test and lane.episode.is_over]
         return Driven(states, [episode.scores.get("cls", 0.0) for episode in ended], failed)
 

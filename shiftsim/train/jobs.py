@@ -14,11 +14,11 @@ from shiftsim.train.driving import Driven, Driver, Job, Start, State
 from shiftsim.train.settings import Settings
 
 NOISES = {  # how often states are collected under each
-    "none": 0.3,
+    "none": 0.4,
     "ou-high": 0.3,
-    "ou-mid": 0.15,
+    "ou-mid": 0.1,
     "ou-low": 0.05,
-    "awgn-high": 0.1,
+    "awgn-high": 0.05,
     "awgn-mid": 0.1,
 }
 TESTED = ("none", "ou-high")
@@ -113,14 +113,15 @@ def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list
 def collect(
     settings: Settings, towns: Towns, checkpoint: str, number: int, tau: float, show: Show, say: Say
 ) -> Iterator[State]:
-    """The labelled states of a round; PDM-Closed drives in the first one."""
+    """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
     random = np.random.default_rng([settings.seed, 2, number])
     wanted, count, jobs_done = settings.states // settings.rounds, 0, 0
     while count < wanted:
         sizes = [min(len(tokens), TOGETHER) for tokens in towns.trained.values()]
         expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
         needed = int(np.ceil((wanted - count) / max(expected, 1.0)))
-        jobs = collecting_jobs(towns, needed, tau, random, by_expert=number == 0)
+        by_expert = number == 0 and not settings.checkpoint
+        jobs = collecting_jobs(towns, needed, tau, random, by_expert=by_expert)
         before, failed = count, list[str]()
         for driven in do(settings, checkpoint, jobs, show):
             jobs_done += 1

@@ -29,6 +29,8 @@ RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, sh
 DECAY, CLIP = 0.01, 5.0  # of the weights; of the norm of the gradient
 AVERAGED = 0.999  # of the running mean of the weights, per step
 SCALES = (0.3, 0.06)  # of errors of acceleration and steering
+LATE = 3.0  # weight of braking less than the label, where it brakes
+BEGUN = 0.5  # share of the learning rate, where weights are given to begin with
 CERTAINTY = 0.01  # weight of the likelihood, by which the distribution gets its width
 EDGE = 0.01  # labels are kept so far from the ends of [0, 1], where the density may be 0 or inf
 HIDDEN, MIRRORED = 0.5, 0.25  # shares: of last actions not shown, of states in the mirror
@@ -58,17 +60,20 @@ def draw_batch(states: States, key: Iterable[int], size: int = BATCH) -> Batch:
 def loss_of(policy: Policy, actions: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of losses over (B, 2) labels, and (2,) the sums of absolute errors.
 
-    The mean of the distribution, which is what the policy does, is fitted to the label; its
-    width by likelihood, with the mean as given.
+    The mean of the distribution, which is what the policy does, is fitted to the label, and to
+    brake too little is worse than too much: a pedestrian may be one pixel. The width is fitted by
+    likelihood, with the mean as given.
     """
     error = policy.action - actions
     scales = torch.tensor(SCALES, device=error.device)
-    fit = functional.smooth_l1_loss(error / scales, torch.zeros_like(error), reduction="sum")
+    fit = functional.smooth_l1_loss(error / scales, torch.zeros_like(error), reduction="none")
+    is_late = (actions[:, 0] < 0.0) & (error[:, 0] > 0.0)
+    each = torch.stack([torch.where(is_late, LATE * fit[:, 0], fit[:, 0]), fit[:, 1]])
     total = policy.alpha + policy.beta
     mean = (policy.alpha / total).detach()
     label = ((actions + 1.0) / 2.0).clamp(EDGE, 1.0 - EDGE)
     likely = log_density(mean * total, (1.0 - mean) * total, label)
-    return fit - CERTAINTY * likely.sum(), error.detach().abs().sum(0)
+    return each.sum() - CERTAINTY * likely.sum(), error.detach().abs().sum(0)
 
 
 def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
@@ -88,10 +93,18 @@ class Learned:
 class Learner:
     """A network, its optimiser, and the running mean of its weights, which is what drives."""
 
-    def __init__(self, device: str, threads: int, total: int, seed: int) -> None:
-        """`total` steps are to be done; the learning rate falls towards their end."""
+    def __init__(
+        self, device: str, threads: int, total: int, seed: int, begin: State | None = None
+    ) -> None:
+        """`total` steps are to be done; the learning rate falls towards their end.
+
+        `begin` are weights to begin with.
+        """
         torch.manual_seed(seed)
         self.network, self.total, self.step = CarlNetwork(), total, 0
+        self._rate = RATE * BEGUN if begin else RATE
+        if begin:
+            self.network.load_state_dict(begin)
         self.network.to(device)
         self.mean = {name: value.detach().clone() for name, value in self._parameters.items()}
         plain = [value for value in self._trained if value.dim() != 2 and value.dim() != 4]
@@ -125,7 +138,7 @@ class Learner:
         gradients, loss, errors = self._gradients.of(leaves(laid), count, see, judge)
         torch._foreach_div_(gradients, float(count))
         for group in self.optimiser.param_groups:
-            group["lr"] = RATE * schedule(self.step / self.total)
+            group["lr"] = self._rate * schedule(self.step / self.total)
         self.optimiser.zero_grad()
         torch.autograd.backward(list(laid.values()), gradients)
         torch.nn.utils.clip_grad_norm_(self._trained, CLIP)

@@ -1,7 +1,8 @@
 """CaRL's network as it is trained: the same function as `CarlNetwork`, computed fast.
 
-The convolutions compute in bfloat16 with channels last, the rest in single precision. Weights are
-laid out once per step (`lay_out`), and the parts of a batch are computed with that.
+The convolutions compute with channels last, and in bfloat16 where the processor can, which not all
+do; the rest in single precision. Weights are laid out once per step (`lay_out`), and the parts of a
+batch are computed with that.
 """
 
 from typing import Any
@@ -58,6 +59,12 @@ def mirrored_measurements(measurements: NDArray[np.float32]) -> NDArray[np.float
     return out
 
 
+def kind_on(device: str) -> torch.dtype:
+    """What convolutions compute in: bfloat16 takes longer than floats where it is only imitated."""
+    has_it = torch.cpu.get_capabilities().get("avx512_bf16", False)
+    return torch.bfloat16 if has_it or device != "cpu" else torch.float32
+
+
 def lay_out(network: CarlNetwork, *, critic: bool = False) -> Laid:
     """The weights of a network as `forward` wants them; gradients lead back to the network.
 
@@ -65,16 +72,17 @@ def lay_out(network: CarlNetwork, *, critic: bool = False) -> Laid:
     """
     weights: Laid = dict(network.named_parameters())
     laid: Laid = {}
+    kind = kind_on(next(network.parameters()).device.type)
     for layer in range(len(CONVOLUTIONS)):
         conv, norm = f"{_CNN}.{3 * layer}", f"{_CNN}.{3 * layer + 1}"
         weight = weights[f"{conv}.weight"]
         if layer == 0:
             weight = _by_blocks(weight)
-        laid[f"{conv}.weight"] = weight.bfloat16().contiguous(memory_format=torch.channels_last)
-        laid[f"{conv}.bias"] = weights[f"{conv}.bias"].bfloat16()
-        for kind in ("weight", "bias"):
-            turned = weights[f"{norm}.{kind}"].permute(1, 2, 0)
-            laid[f"{norm}.{kind}"] = turned.bfloat16().contiguous()
+        laid[f"{conv}.weight"] = weight.to(kind).contiguous(memory_format=torch.channels_last)
+        laid[f"{conv}.bias"] = weights[f"{conv}.bias"].to(kind)
+        for part in ("weight", "bias"):
+            turned = weights[f"{norm}.{part}"].permute(1, 2, 0)
+            laid[f"{norm}.{part}"] = turned.to(kind).contiguous()
     for name, value in weights.items():
         if name not in laid and (critic or not name.startswith("value_head")):
             laid[name] = value
@@ -94,9 +102,9 @@ def _by_blocks(weight: Tensor) -> Tensor:
 
 
 def tensor_of(blocks: Blocks, device: str = "cpu") -> Tensor:
-    """(B, 32, 128, 128) bfloat16 of `pictures.blocks_of`, channels last."""
-    turned: Tensor = torch.from_numpy(blocks).to(device).view(torch.bfloat16).permute(0, 3, 1, 2)
-    return turned
+    """(B, 32, 128, 128) of `pictures.blocks_of`, channels last."""
+    bits = torch.from_numpy(blocks).to(device).view(torch.bfloat16)
+    return bits.to(kind_on(bits.device.type)).permute(0, 3, 1, 2)
 
 
 def see(laid: Laid, pictures: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
 """Training CaRL's network by imitation of PDM-Closed, in rounds (DAgger).
 
 A round collects states, first those that PDM-Closed meets under noise, then those that the network
-meets; PDM-Closed labels all of them. It trains on the states of all rounds so far, and drives in
-towns that are left out. What was done is kept at least every two minutes.
+meets, at once where it has weights to begin with; PDM-Closed labels all of them. It trains on the
+states of all rounds so far, and drives in towns that are left out. What was done is kept at least
+every two minutes.
 """
 
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
 from shiftsim.train.keeping import read_state, write_network, write_state
 from shiftsim.train.learning import BATCH, Learner, draw_batch
-from shiftsim.train.network import to_official
+from shiftsim.train.network import State, from_official, to_official
 from shiftsim.train.settings import TAUS, Settings, prepare_folder
 from shiftsim.train.states import States, read_part, write_part
 
@@ -59,13 +60,24 @@ class Training:
         prepare_folder(settings, store.hash, resume=resume)
         self.steps = max(1, settings.samples // settings.rounds // BATCH)
         total = self.steps * settings.rounds
-        self.learner = Learner(self.device, settings.workers, total, settings.seed)
+        begin = from_official(self._begin()) if settings.checkpoint else None
+        self.learner = Learner(self.device, settings.workers, total, settings.seed, begin)
         self.course = Course()
         if settings.state.exists():
             kept = read_state(settings.state)
             self.course = Course(**kept["course"])
             self.learner.restore(kept["learner"])
         self._began = monotonic() - self.course.seconds
+
+    def _begin(self) -> State:
+        """The weights to begin with, which are the network that drives first."""
+        from shiftsim.planners.learned.checkpoint import load_weights
+
+        settings = self._settings
+        state = load_weights(settings.checkpoint, "carl").state
+        if not settings.network.exists():
+            write_network(settings.network, state)
+        return state
 
     def run(self) -> None:
         """Do all rounds that are not done yet, and PPO if it is asked for."""
@@ -114,7 +126,8 @@ class Training:
         folder = settings.part(course.round)
         if folder.exists():
             return
-        checkpoint = str(settings.network) if course.round else _NOBODY
+        drives = course.round or settings.checkpoint
+        checkpoint = str(settings.network) if drives else _NOBODY
         show = self._shower(f"{self._where} collecting")
         number, tau, towns = course.round, course.tau, self.towns
         states = collect(settings, towns, checkpoint, number, tau, show, self._say)

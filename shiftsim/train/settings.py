@@ -18,6 +18,7 @@ class Settings:
     store: str  # name, path or URL of the store
     out: Path  # folder that is written
     split: str = ""  # of the store; all scenarios if empty
+    checkpoint: str = ""  # weights to begin with, as planners take them; from nothing if empty
     seed: int = 0
     rounds: int = 8  # of collecting, training and testing
     states: int = 360_000  # labelled states in all

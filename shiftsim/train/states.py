@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.carl.planner import MAX_STEERING
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.train.driving import State
@@ -16,7 +16,8 @@ from shiftsim.train.pictures import unpacked
 
 _PICTURES, _NUMBERS = "pictures.bin", "states.npz"
 _STEERING = 6  # of the measurements
-BRAKING, TURNING, DISTURBED = -0.25, 0.1, 0.03  # actions that count as such
+BRAKING, HARD, TURNING, DISTURBED = -0.25, -0.6, 0.1, 0.03  # actions that count as such
+URGENT = 3.0  # how much more often a state before an infraction is drawn
 
 Values = NDArray[np.float32]
 
@@ -28,6 +29,7 @@ class Part(NamedTuple):
     ends: IntArray  # (N + 1,) where each begins and the last one ends
     measurements: Values  # (N, 10)
     actions: Values  # (N, 2) labels
+    urgent: BoolArray  # (N,) whether the network ended with an infraction soon after
 
 
 def write_part(folder: Path, states: Iterable[State]) -> None:
@@ -35,17 +37,19 @@ def write_part(folder: Path, states: Iterable[State]) -> None:
     partial = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    ends, measurements, actions = [0], [], []
+    ends, measurements, actions, urgent = [0], [], [], []
     with (partial / _PICTURES).open("wb") as file:
         for state in states:
             ends.append(ends[-1] + file.write(state.picture))
             measurements.append(state.measurements)
             actions.append(state.action)
+            urgent.append(state.is_urgent)
     np.savez(
         partial / _NUMBERS,
         ends=np.array(ends),
         measurements=np.stack(measurements),
         actions=np.stack(actions),
+        urgent=np.array(urgent),
     )
     partial.rename(folder)
 
@@ -54,7 +58,8 @@ def read_part(folder: Path) -> Part:
     """The states of one round."""
     pictures = np.memmap(folder / _PICTURES, np.uint8, "r")
     with np.load(folder / _NUMBERS) as numbers:
-        return Part(pictures, numbers["ends"], numbers["measurements"], numbers["actions"])
+        names = ("ends", "measurements", "actions", "urgent")
+        return Part(pictures, *(numbers[name] for name in names))
 
 
 class States:
@@ -66,7 +71,8 @@ class States:
         self._first = np.concatenate([[0], np.cumsum(sizes)])
         self.measurements = np.concatenate([part.measurements for part in self._parts])
         self.actions = np.concatenate([part.actions for part in self._parts])
-        weights = importance(self.measurements, self.actions)
+        urgent = np.concatenate([part.urgent for part in self._parts])
+        weights = importance(self.measurements, self.actions, urgent)
         self._total = np.cumsum(weights / weights.sum())
 
     def __len__(self) -> int:
@@ -84,11 +90,16 @@ class States:
         return unpacked(part.pictures[part.ends[row] : part.ends[row + 1]])
 
 
-def importance(measurements: Values, actions: Values) -> FloatArray:
-    """(N,) how often a state is drawn, in relation: braking, turning and correcting more."""
+def importance(measurements: Values, actions: Values, urgent: BoolArray) -> FloatArray:
+    """(N,) how often a state is drawn, in relation: braking, turning and correcting more.
+
+    Most of all where the network did not brake in time.
+    """
     steering = measurements[:, _STEERING] / MAX_STEERING
     weights = np.ones(len(actions))
     weights += actions[:, 0] < BRAKING
+    weights += actions[:, 0] < HARD
+    weights += URGENT * urgent
     weights += np.abs(actions[:, 1]) > TURNING
     weights += np.abs(actions[:, 1] - steering) > DISTURBED
     return weights

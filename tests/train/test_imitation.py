@@ -14,6 +14,7 @@ from shiftsim.train import network as fast
 from shiftsim.train.expert import Expert, encode
 from shiftsim.train.learning import (
     BATCH,
+    LATE,
     MIRRORED,
     Learner,
     draw_batch,
@@ -146,6 +147,23 @@ def test_the_mean_is_fitted_by_the_error_and_the_width_by_likelihood():
     assert up[0, 1] < 0
 
 
+def test_to_brake_less_than_the_label_is_worse_than_more():
+    def slope(label):
+        alpha = torch.full((1, 2), 3.0, requires_grad=True)
+        loss, _ = loss_of(Policy(alpha, torch.full((1, 2), 3.0)), torch.tensor([[label, 0.0]]))
+        return abs(float(torch.autograd.grad(loss, alpha)[0][0, 0]))
+
+    certain = slope(0.0)  # what the likelihood adds is small
+    assert slope(-0.2) - certain == pytest.approx(LATE * (slope(0.2) - certain), rel=0.05)
+
+
+def test_learning_begins_with_given_weights():
+    torch.manual_seed(3)
+    begin = CarlNetwork().state_dict()
+    learner = Learner("cpu", 1, total=4, seed=0, begin=begin)
+    assert all(torch.equal(value, begin[name]) for name, value in learner.driving().items())
+
+
 def test_the_learning_rate_rises_and_falls():
     values = [schedule(done) for done in np.linspace(0.0, 1.0, 101)]
     assert max(values) == pytest.approx(1.0, abs=1e-3)
@@ -157,8 +175,10 @@ def test_the_learning_rate_rises_and_falls():
 @pytest.fixture
 def states(tmp_path, rng):
     found = [
-        State(packed(raster), measured, rng.uniform(-1, 1, 2).astype(np.float32))
-        for raster, measured in zip(rasters(rng, 24), measurements(rng, 24), strict=True)
+        State(packed(raster), measured, rng.uniform(-1, 1, 2).astype(np.float32), number % 5 == 0)
+        for number, (raster, measured) in enumerate(
+            zip(rasters(rng, 24), measurements(rng, 24), strict=True)
+        )
     ]
     write_part(tmp_path / "round-00", found[:10])
     write_part(tmp_path / "round-01", found[10:])
@@ -170,11 +190,12 @@ def states(tmp_path, rng):
 
 
 def test_rare_states_are_drawn_more_often(states):
-    measured, actions = np.zeros((3, 10), np.float32), np.zeros((3, 2), np.float32)
-    actions[1, 0], actions[2, 1] = -0.5, 0.5
-    assert importance(measured, actions).tolist() == [1.0, 2.0, 3.0]
+    measured, actions = np.zeros((5, 10), np.float32), np.zeros((5, 2), np.float32)
+    actions[1, 0], actions[2, 1], actions[3, 0] = -0.5, 0.5, -0.7
+    urgent = np.arange(5) == 4
+    assert importance(measured, actions, urgent).tolist() == [1.0, 2.0, 3.0, 3.0, 4.0]
     drawn = states.draw(20_000, np.random.default_rng(0))
-    weights = importance(states.measurements, states.actions)
+    weights = importance(states.measurements, states.actions, np.arange(24) % 5 == 0)
     shares = np.bincount(drawn, minlength=len(states)) / len(drawn)
     assert shares == pytest.approx(weights / weights.sum(), abs=0.01)
 

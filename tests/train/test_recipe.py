@@ -13,6 +13,7 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
+from shiftsim.train.driving import Driver, Job, Start
 from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
 from shiftsim.train.settings import Settings
@@ -70,6 +71,28 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
         out=str(tmp_path / "run"),
     )
     assert done.is_complete
+
+
+def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, monkeypatch):
+    asked = []
+    monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[2]) or [])
+    monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
+    settings = small("more", checkpoint=str(trained[0].best))
+    training = Training(settings, print)
+    training._collect()
+    assert asked == [str(settings.network)]
+    assert settings.network.read_bytes() == trained[0].best.read_bytes()
+
+
+def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy):
+    def urgent(expert_steps):
+        starts = tuple(Start(token, "none", 0, expert_steps) for token in sorted(tokens)[:2])
+        return [x.is_urgent for x in driver(Job(starts, False, 0.3)).states]
+
+    tokens = open_store(toy).tokens
+    driver = Driver(str(toy), "deterministic:base")
+    assert 0 < sum(urgent(0)) <= 2 * 15
+    assert not any(urgent(-1))
 
 
 def test_tau_is_chosen_by_driving_the_expert_through_its_labels(small):

@@ -29,7 +29,6 @@ from tests.commands import call
 
 ONE_PROCESS = partial(map_unordered, workers=1)
 DURATION = 42.08  # s
-_LATEST = 9.0  # s after the end of green: who was let in before may still be on the way
 
 
 def _place(kind, number=0):
@@ -63,8 +62,15 @@ def test_two_towns_give_many_scenarios_that_pass_the_filter(store):
     accepted = [row["token"] for row in verdicts if row["verdict"] == "accepted"]
     assert len(accepted) >= 10 * 2
     assert {row["reason"] for row in verdicts} <= {"", "path too short"}
-    # those who drive out of town have one block; real recordings have such scenarios as well
-    assert np.mean([len(store.window(token).route) >= 2 for token in accepted]) > 0.7
+
+
+def test_every_route_has_the_two_blocks_that_planners_need(store, tmp_path, monkeypatch):
+    assert min(len(store.window(token).route) for token in store.tokens) >= 2
+    monkeypatch.setattr(towns_recordings, "_MIN_BLOCKS", 3)
+    few = write_towns(tmp_path / "few", towns=1, seed=5, spread=ONE_PROCESS)
+    here = [x for x in map(store.window, store.tokens) if x.log_name.startswith("town-5-001")]
+    assert set(few.tokens) == {window.token for window in here if len(window.route) >= 3}
+    assert 0 < len(few.tokens) < len(here)
 
 
 def test_a_town_is_the_same_bytes_in_a_store_of_one(store, tmp_path):
@@ -202,6 +208,17 @@ def test_nobody_touches_anybody_and_traffic_drives_smoothly(kind):
     assert rows[:, 5].max() > 5.0
 
 
+def test_some_people_step_out_between_parked_cars():
+    found = {True: [], False: []}
+    for number in range(6):
+        town = _place("street", number)[0].town
+        for street in town.streets.values():
+            for ends in street.crossings if street.parking else ():
+                middle = town.network.roads[street.id].at(np.array([sum(ends) / 2]))[0, :2]
+                found[street.is_marked].append(np.hypot(*(town.parked()[:, :2] - middle).T).min())
+    assert min(found[True]) > 11.0 > min(found[False])
+
+
 def test_traffic_lights_are_in_the_store_for_the_connectors_that_have_one(store):
     scene = next(s for s in map(store.read, store.tokens) if s.city == "town-5-002")
     edges = scene.map.edges.ids
@@ -225,7 +242,7 @@ def test_streets_take_turns_and_yellow_lies_between_green_and_red():
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.thorough)])
-def test_nobody_enters_a_junction_long_after_green(number):
+def test_nobody_enters_a_junction_at_red(number):
     place, rng = _place("lights", number)
     traffic = random_traffic(place, rng, DURATION)
     (lights,) = place.lights
@@ -238,9 +255,8 @@ def test_nobody_enters_a_junction_long_after_green(number):
         late = [x[0] * DT for x, s in zip(rows, front, strict=True) if s > zone.stop + 2.5]
         if rows and front[0] < zone.stop and late:
             entered += 1
-            ago = [late[0] - back for back in np.arange(0.0, _LATEST, 0.5).tolist()]
-            shown = {lights.status(phases[zone.id], time) for time in ago}
-            assert LightStatus.GREEN in shown, driver.token
+            shown = lights.status(phases[zone.id], late[0])
+            assert shown in (LightStatus.GREEN, LightStatus.YELLOW), driver.token
     assert entered >= 5
 
 
