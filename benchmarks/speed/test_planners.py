@@ -10,8 +10,11 @@ import pytest
 from plans import recorded_inputs
 
 from shiftsim.planners.registry import load_planner
+from shiftsim.sim.loop import Rollout, simulate
 from shiftsim.sim.plan_check import validate_plan
-from shiftsim.world.state import TrafficLights
+from shiftsim.world.state import LightStatus, TrafficLights
+
+LIGHTS_TARGET = 0.3e-3  # s
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +23,14 @@ def scenario():
     from shiftsim.data.demo.store import bench_scene
 
     return bench_scene(100, 0)
+
+
+@pytest.fixture(scope="module")
+def lit_scenario():
+    """The same city with lights, and connectors of 150 vertices."""
+    from shiftsim.data.demo.store import bench_scene
+
+    return bench_scene(100, 0, lights=True)
 
 
 @pytest.mark.parametrize("name", ["constant-velocity", "simple", "log-future", "idm"])
@@ -32,12 +43,27 @@ def test_plan(measure, scenario, name):
 
 
 def test_idm_at_red_lights(measure, scenario):
+    """All lanes and connectors of the city are red."""
     scene, observations = recorded_inputs(scenario)
     ids = scene.map.edges.ids
-    lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8))
+    lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8)).sealed()
     planner = load_planner("idm")
     planner.reset(scene)
-    measure(planner.plan, replace(observations[0], lights=lights), calls=2)
+    measure(planner.plan, replace(observations[0], lights=lights), calls=2, target=LIGHTS_TARGET)
+
+
+def test_idm_at_a_red_light_with_large_connectors(measure, lit_scenario):
+    """What a rollout asks for at a junction whose connectors have 150 vertices."""
+    planner = load_planner("idm")
+    observation = Rollout(lit_scenario, planner).observe()
+    assert (observation.lights.status == LightStatus.RED).sum() > 100
+    measure(planner.plan, observation, calls=2, target=LIGHTS_TARGET)
+
+
+@pytest.mark.parametrize("traffic", ["nonreactive", "reactive"])
+def test_idm_scenario_with_large_connectors(measure, lit_scenario, traffic):
+    planner = load_planner("idm")
+    measure(lambda: simulate(lit_scenario, planner, traffic=traffic), calls=1)
 
 
 def test_validate_plan(measure, scenario):

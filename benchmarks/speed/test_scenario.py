@@ -12,6 +12,7 @@ import pytest
 
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import run_planner
@@ -25,7 +26,8 @@ from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
 from shiftsim.verify.scenes import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
-WHOLE_TARGET, METRICS_TARGET, SEALING_TARGET = 25e-3, 5e-3, 1e-6  # s
+WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s
+READ_TARGET, LOOP_TARGET, METRICS_TARGET = 1.5e-3, 2.5e-3, 1.2e-3  # s, with 100 agents
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,8 @@ def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN) as archive:
         archive.extractall(folder, filter="data")
-    return {**Scenes(folder / "nuplan"), "bench_scene_100": bench_scene(100, 0)}
+    cities = {f"bench_scene_{count}": bench_scene(count, 0) for count in (100, 300)}
+    return {**Scenes(folder / "nuplan"), **cities}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +65,14 @@ NAMES = (
     "s07_parked_in_lane",
     "s13_empty_road",
     "bench_scene_100",
+    "bench_scene_300",
 )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_read(measure, runner, name):
+    store = open_store(runner.store)
+    measure(lambda: store.read(name), calls=1, target=READ_TARGET)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -80,7 +90,7 @@ def test_whole_scenario(measure, runner, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_step_loop(measure, scenes, runner, name):
     planner = runner.planners["constant-velocity"].make()
-    measure(lambda: simulate(scenes[name], planner), calls=1)
+    measure(lambda: simulate(scenes[name], planner), calls=1, target=LOOP_TARGET)
 
 
 class PlainSight(Sight):

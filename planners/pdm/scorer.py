@@ -151,8 +151,11 @@ def _travel(places: Places, centerline: Path) -> tuple[FloatArray, FloatArray]:
     """Progress along the centerline and longest way off the route, both (P,) [m]."""
     centers, last = places.centers, places.centers.shape[1] - 1
     progress, off_route = np.empty(len(centers)), np.empty(len(centers))
+    start = (0.0, 0.0, 0)
     for row in range(len(centers)):
-        start = project(centerline, centers[row, 0, 0], centers[row, 0, 1], 0)
+        x, y = centers[row, 0, 0], centers[row, 0, 1]
+        if row == 0 or x != centers[row - 1, 0, 0] or y != centers[row - 1, 0, 1]:  # rarely
+            start = project(centerline, x, y, start[2])
         end = project(centerline, centers[row, last, 0], centers[row, last, 1], start[2])
         progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
