@@ -54,17 +54,18 @@ class Draft:
         if not self.waiting:
             return
         parts = [self.joined, *(tracks for tracks, _ in self.waiting)]
-        arrays = [
+        valid, poses, velocities, sizes = (
             np.concatenate([getattr(part, name) for part in parts], axis=1)
             for name in ("valid", "poses", "velocities", "sizes")
-        ]
+        )
         kinds = np.concatenate([part.kinds for part in parts])
         # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
         order = np.argsort(kinds, kind="stable")
         tokens = tuple(token for part in parts for token in part.tokens)
-        self.joined = Tracks(*arrays, kinds, tokens).select(order)
-        new = np.array([behavior for _, behavior in self.waiting], np.int64)
-        self.known = np.concatenate([self.known, new])[order]
+        new = Tracks(valid, poses, velocities, sizes, kinds, tokens)
+        self.joined = new.select(order)
+        behaviors = np.array([behavior for _, behavior in self.waiting], np.int64)
+        self.known = np.concatenate([self.known, behaviors])[order]
         self.waiting = []
 
     @property
