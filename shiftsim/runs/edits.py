@@ -151,10 +151,16 @@ class EditedStore(ScenarioStore):
             self.edited = edits.expand(store, store.tokens)
         else:  # a bundle need not hold what other scenarios of the run are made of
             by_digest = {edit.digest: edit for edit in edits.edits}
-            self.edited = {
-                token: Edited(found["base"], by_digest[found["digest"]])
-                for token, found in made.items()
-            }
+            try:
+                self.edited = {
+                    token: Edited(str(found["base"]), by_digest[found["digest"]])
+                    for token, found in made.items()
+                }
+            except (KeyError, TypeError) as error:
+                raise DataError(
+                    f"edits {edits.name!r} of the manifest do not make its scenarios",
+                    hint="make the run again",
+                ) from error
         self.tokens = tuple(self.edited)
 
     def __contains__(self, token: object) -> bool:

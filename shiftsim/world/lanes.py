@@ -65,6 +65,17 @@ def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, F
     return progress, np.array([*here, np.arctan2(by - ay, bx - ax)])
 
 
+def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
+    """As `pose_on_line`, the poses (N, 3) of N shapely points."""
+    progress = shapely.line_locate_point(line, points)
+    here, ahead, behind = (
+        shapely.get_coordinates(shapely.line_interpolate_point(line, progress + offset))
+        for offset in (0.0, _HEADING_SPACING, -_HEADING_SPACING)
+    )
+    step = np.where((here == ahead).all(axis=1)[:, None], here - behind, ahead - here)
+    return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
+
+
 def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
     point = shapely.line_interpolate_point(line, progress)
     return float(point.x), float(point.y)

@@ -23,7 +23,7 @@ from shiftsim.world.edits.apply import edited_id
 from shiftsim.world.edits.density import blocks_at, draw_slots
 from shiftsim.world.edits.draft import EGO_SIZE, Draft, begin
 from shiftsim.world.edits.spec import LEVELS, MANNERS, Edit
-from shiftsim.world.lanes import find_start, nearest_heading, pose_on_line, start_on
+from shiftsim.world.lanes import find_start, nearest_heading, poses_on_line, start_on
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.script import CAUTIOUS, FOLLOW, LOGGED, STOPPED, Crossing, Finish, Script
@@ -162,6 +162,8 @@ class _Cast:
         self.ego_speed = float(np.hypot(self.ego[VX], self.ego[VY]))
         self.vehicles: list[Vehicle] = []
         self.bodies: list[Vehicle] = []
+        self.areas: dict[int, shapely.Geometry] = {}
+        self.held: list[Vehicle] = []
         self.cones: list[tuple[str, FloatArray]] = []
         self.pedestrians: list[Crossing] = []
 
@@ -245,8 +247,9 @@ class _Cast:
         # nuPlan rule 700: not the speed that was computed, but the ego's velocity, or none
         velocity = self.ego[VX : VY + 1].copy() if speed else np.zeros(2)
         new = Vehicle(token, pose, own_size if size is None else size, velocity, behavior)
-        area = corridor(new)
-        met = [other for other in self.vehicles if area.intersects(corridor(other))]
+        area = self.areas[id(new)] = corridor(new)
+        self.held.append(new)  # ids are of objects that live
+        met = [other for other in self.vehicles if area.intersects(self.areas[id(other)])]
         if met:
             if behavior == STOPPED:
                 self.vehicles = [
@@ -286,11 +289,11 @@ def straight_path(
 def _past(road: VectorMap, vehicles: tuple[Vehicle, ...], draws: random.Random) -> FloatArray:
     """(23, V, 3) where the vehicles were, oldest first, with noise."""
     starts = [_segment(road, vehicle) for vehicle in vehicles]
-    out = np.empty((HISTORY, len(vehicles), 3))
+    out = np.array([[vehicle.pose for vehicle in vehicles]] * HISTORY).reshape(HISTORY, -1, 3)
+    places: dict[int, list[tuple[int, int, float]]] = {}
     for sample in range(HISTORY):
         for number, (vehicle, start) in enumerate(zip(vehicles, starts, strict=True)):
             if start is None:
-                out[sample, number] = vehicle.pose
                 continue
             edge, along = start
             # nuPlan rule 709: with noise, standing ones as well
@@ -299,9 +302,11 @@ def _past(road: VectorMap, vehicles: tuple[Vehicle, ...], draws: random.Random) 
                 before = road.incoming.at(edge).tolist()
                 edge, along = (before[0], along) if before else (edge, 0.0)
                 along += road.baselines.length(edge) if before else 0.0
-            line = shapely.LineString(road.baselines.at(edge))
-            point = shapely.line_interpolate_point(line, along)
-            out[sample, number] = pose_on_line(line, point.x, point.y)[1]
+            places.setdefault(edge, []).append((sample, number, along))
+    for edge, found in places.items():
+        samples, numbers, distances = map(np.array, zip(*found, strict=True))
+        line = shapely.LineString(road.baselines.at(edge))
+        out[samples, numbers] = poses_on_line(line, shapely.line_interpolate_point(line, distances))
     return out
 
 

@@ -171,6 +171,8 @@ class _Editor:
 
     def _change_motion(self) -> None:
         draft, edit = self.draft, self.edit
+        if edit.move or edit.slow or edit.stop or edit.speed:
+            draft.own()
         for move in edit.move:
             for track in draft.which((), move.tokens).tolist():
                 _shift(draft, track, move.ahead_m, move.left_m)
@@ -218,6 +220,7 @@ class _Editor:
                 share = np.arange(slanted) / slanted
                 left.insert(0, -block.width_m * 0.5 * (1.0 - share))
                 ahead.insert(0, -block.taper_m * (1.0 - share))
+            places: list[FloatArray] = []
             offsets = zip(
                 np.concatenate(ahead).tolist(), np.concatenate(left).tolist(), strict=True
             )
@@ -233,13 +236,10 @@ class _Editor:
                     place = _ahead_of(pose, distance, aside)
                 what = block.kind.replace("_", " ")
                 self.draft.require_free(place, size, f"{what} of a closed lane")
-                self.draft.add(
-                    self.name(block.kind),
-                    KIND_CODES[block.kind],
-                    size,
-                    self.draft.still(place),
-                    behavior=STOPPED,
-                )
+                places.append(place)
+            for place in places:
+                name, kind = self.name(block.kind), KIND_CODES[block.kind]
+                self.draft.add(name, kind, size, self.draft.still(place), behavior=STOPPED)
 
     def _walk(self) -> None:
         draft, size = self.draft, np.array(SIZES["pedestrian"])

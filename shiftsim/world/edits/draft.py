@@ -30,11 +30,43 @@ class Draft:
     """A scenario while it is edited."""
 
     scenario: "Scenario"  # as recorded, but for what does not move
-    tracks: Tracks  # arrays that may be written
-    behaviors: IntArray  # (N,) as in `Script`
+    joined: Tracks
+    known: IntArray  # (N,) behaviours of these tracks, as in `Script`
     touched: list[str] = field(default_factory=list)  # tokens of tracks made or changed
     walkers: list[tuple[str, Walker]] = field(default_factory=list)  # with the token of their track
     finish: Finish | None = None
+    waiting: list[tuple[Tracks, int]] = field(default_factory=list)  # new tracks, one each
+
+    @property
+    def tracks(self) -> Tracks:
+        """All tracks; in arrays that may be written after `own`."""
+        self._join()
+        return self.joined
+
+    @property
+    def behaviors(self) -> IntArray:
+        """(N,) behaviours of the tracks, as in `Script`."""
+        self._join()
+        return self.known
+
+    def _join(self) -> None:
+        """Put new tracks where they belong."""
+        if not self.waiting:
+            return
+        parts = [self.joined, *(tracks for tracks, _ in self.waiting)]
+        valid, poses, velocities, sizes = (
+            np.concatenate([getattr(part, name) for part in parts], axis=1)
+            for name in ("valid", "poses", "velocities", "sizes")
+        )
+        kinds = np.concatenate([part.kinds for part in parts])
+        # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
+        order = np.argsort(kinds, kind="stable")
+        tokens = tuple(token for part in parts for token in part.tokens)
+        new = Tracks(valid, poses, velocities, sizes, kinds, tokens)
+        self.joined = new.select(order)
+        behaviors = np.array([behavior for _, behavior in self.waiting], np.int64)
+        self.known = np.concatenate([self.known, behaviors])[order]
+        self.waiting = []
 
     @property
     def now(self) -> int:
@@ -46,6 +78,10 @@ class Draft:
         """(R,) times of the rows, from the first iteration on [s]."""
         times = self.scenario.time_us
         return (times - times[self.now]) * 1e-6
+
+    def own(self) -> None:
+        """Copy the arrays of the tracks, so that they may be written."""
+        self.joined = self.tracks.rows(np.arange(len(self.scenario.time_us)))
 
     def change(self, **values: object) -> None:
         """Replace fields of the scenario."""
@@ -73,7 +109,7 @@ class Draft:
 
     def keep(self, which: BoolArray) -> None:
         """Keep some of the tracks (a mask) only."""
-        self.tracks, self.behaviors = self.tracks.select(which), self.behaviors[which]
+        self.joined, self.known = self.tracks.select(which), self.behaviors[which]
 
     def add(
         self,
@@ -94,19 +130,15 @@ class Draft:
         if kind > velocity_of:
             moves = np.full((rows, 2), np.nan)
         blank = np.where(there, 0.0, np.nan)[:, None]
-        before = self.tracks
-        joined = Tracks(
-            np.concatenate([before.valid, there[:, None]], axis=1),
-            np.concatenate([before.poses, (poses + blank)[:, None]], axis=1),
-            np.concatenate([before.velocities, (moves + blank)[:, None]], axis=1),
-            np.concatenate([before.sizes, (np.broadcast_to(size, (rows, 2)) + blank)[:, None]], 1),
-            np.append(before.kinds, np.int64(kind)),
-            (*before.tokens, token),
+        new = Tracks(
+            there[:, None],
+            (poses + blank)[:, None],
+            (moves + blank)[:, None],
+            (size + blank)[:, None],
+            np.array([kind], np.int64),
+            (token,),
         )
-        # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
-        order = np.argsort(joined.kinds, kind="stable")
-        self.tracks = joined.select(order)
-        self.behaviors = np.append(self.behaviors, np.int64(behavior))[order]
+        self.waiting.append((new, behavior))
         self.touched.append(token)
 
     def still(self, pose: FloatArray) -> FloatArray:
@@ -138,7 +170,6 @@ class Draft:
 
 
 def begin(scenario: "Scenario") -> Draft:
-    """A draft with copies of the arrays that edits write."""
+    """A draft of a scenario in which nothing is changed yet."""
     tracks = scenario.tracks
-    writable = tracks.rows(np.arange(len(tracks)))
-    return Draft(scenario, writable, np.full(tracks.num_tracks, FOLLOW, np.int64))
+    return Draft(scenario, tracks, np.full(tracks.num_tracks, FOLLOW, np.int64))

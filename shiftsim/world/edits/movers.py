@@ -35,34 +35,27 @@ def add_mover(
         if not before or before[0] in lanes:
             break
         lanes.append(before[0])
-    poses = np.full((len(seconds), 3), np.nan)
-    for row in np.flatnonzero(past).tolist():
-        poses[row] = pose_on_edges(road, lanes, along + seconds[row] * speed)
+    poses = poses_on_edges(road, lanes, along + np.minimum(seconds, 0.0) * speed)
     headings = poses[:, 2]
     velocities = speed * np.stack([np.cos(headings), np.sin(headings)], -1)
     draft.add(
         name,
         AgentKind.VEHICLE,
         size,
-        np.nan_to_num(poses),
+        poses,
         valid=past,
-        velocities=np.nan_to_num(velocities),
+        velocities=velocities,
         behavior=behavior,
     )
 
 
-def pose_on_edges(road: VectorMap, lanes: list[int], along: float) -> FloatArray:
-    """(3,) pose on an edge, or, where `along` is negative, on those that lead to it [m]."""
-    baselines = road.baselines
-    edge, *before = lanes
-    while along < 0.0 and before:
-        edge, *before = before
-        along += baselines.length(edge)
-    line = baselines.at(edge)
-    arc = baselines.arc[baselines.ptr[edge] : baselines.ptr[edge + 1]]
-    index = min(max(int(np.searchsorted(arc, along, side="right")), 1), len(line) - 1)
-    step = line[index] - line[index - 1]
-    heading = float(np.arctan2(step[1], step[0]))
-    ahead = along - arc[index - 1]
-    x, y = line[index - 1] + ahead * np.array([np.cos(heading), np.sin(heading)])
-    return np.array([x, y, heading])
+def poses_on_edges(road: VectorMap, lanes: list[int], along: FloatArray) -> FloatArray:
+    """(N, 3) poses on an edge, or, where `along` (N,) is negative, on those that lead to it [m]."""
+    lines = [road.baselines.at(edge) for edge in reversed(lanes)]
+    xy = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
+    steps = np.diff(xy, axis=0)
+    progress = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+    at = along + progress[-1] - road.baselines.length(lanes[0])
+    segment = np.clip(np.searchsorted(progress, at, side="right") - 1, 0, len(steps) - 1)
+    x, y = (np.interp(at, progress, xy[:, column]) for column in (0, 1))
+    return np.column_stack([x, y, np.arctan2(steps[segment, 1], steps[segment, 0])])

@@ -1,5 +1,6 @@
 """Places beside the recorded path of the ego, so that one edit fits many scenarios."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -65,10 +66,12 @@ def ego_path(scenario: "Scenario") -> EgoPath:
 
 def _spaced(xy: FloatArray) -> FloatArray:
     """The first of the points (N, 2), and those that are far enough from the one before."""
-    kept = [0]
-    for index in range(1, len(xy)):
-        if np.hypot(*(xy[index] - xy[kept[-1]])) >= _SPACING:
+    kept, points = [0], xy.tolist()
+    x, y = points[0]
+    for index, (ahead_x, ahead_y) in enumerate(points):
+        if math.hypot(ahead_x - x, ahead_y - y) >= _SPACING:
             kept.append(index)
+            x, y = ahead_x, ahead_y
     return xy[kept]
 
 

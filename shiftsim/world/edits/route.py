@@ -60,7 +60,7 @@ def reroute(draft: Draft, wanted: Reroute, *, ends: bool) -> None:
     if total < _MIN_LENGTH:
         raise ConfigError(f"reroute: the goal is {total:.1f} m ahead, at least 5 m are needed")
     ids = [road.blocks.ids[block] for block in dict.fromkeys(road.block_of[lanes].tolist())]
-    draft.change(ego=_drive(draft, path, total), route=tuple(ids), mission_goal=goal)
+    draft.change(ego=_drive(draft, line, total), route=tuple(ids), mission_goal=goal)
     if ends:
         draft.finish = Finish(line, total - TOLERANCE, int(road.block_of[lanes[-1]]))
 
@@ -79,23 +79,22 @@ def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[in
     return blocks[blocks.index(first) :]
 
 
-def _drive(draft: Draft, path: shapely.LineString, total: float) -> FloatArray:
-    """(R, 11) ego states that go evenly along a path within the window, and stand at its end."""
+def _drive(draft: Draft, line: FloatArray, total: float) -> FloatArray:
+    """(R, 11) ego states that go evenly along a path (K, 2) in the window, and stand at its end."""
     scenario, now = draft.scenario, draft.now
     ego, seconds = np.array(scenario.ego), draft.seconds
     duration = seconds[scenario.iteration_rows[-1]]
     after = np.arange(now + 1, len(ego))
     along = np.minimum(seconds[after] / duration, 1.0) * total
-    centers = np.array([_pose_at(path, value) for value in along.tolist()]).reshape(-1, 3)
+    steps = np.diff(line, axis=0)
+    progress = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+    segment = np.clip(np.searchsorted(progress, along, side="right") - 1, 0, len(steps) - 1)
+    x, y = (np.interp(along, progress, line[:, column]) for column in (0, 1))
+    headings = np.arctan2(steps[segment, 1], steps[segment, 0])
     ego[after] = np.zeros((len(after), NUM_STATE))
-    ego[after, :3] = rear_poses(centers)
+    ego[after, :3] = rear_poses(np.column_stack([x, y, headings]))
     ego[after, VX] = np.where(along < total, total / duration, 0.0)
     return ego
-
-
-def _pose_at(path: shapely.LineString, along: float) -> FloatArray:
-    point = shapely.line_interpolate_point(path, along)
-    return pose_on_line(path, point.x, point.y)[1]
 
 
 def edge_at(road: VectorMap, x: float, y: float) -> int:
