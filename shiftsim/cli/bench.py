@@ -50,6 +50,12 @@ def bench(
     published: Annotated[
         bool, typer.Option("--published", help="The paper's figures beside the own ones.")
     ] = False,
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Only say what it will cost, after a few tasks.")
+    ] = False,
+    shards: Annotated[
+        int, typer.Option(min=1, help="Machines that share the tasks, for --estimate.")
+    ] = 1,
     dry_run: DryRun = False,
     live: Live = False,
     quiet: Quiet = False,
@@ -72,6 +78,9 @@ def bench(
         settings["checkpoints"] = (*settings.get("checkpoints", ()), *_official(settings))
     with output_kept():
         plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
+    if estimate:
+        _estimate(plan, shards, as_json=as_json)
+        return
     announce_data(list(plan.runs.values()), as_json=as_json)
     if not as_json:
         _announce(plan)
@@ -86,6 +95,16 @@ def bench(
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
         raise typer.Exit(_UNFINISHED)
+
+
+def _estimate(plan: "Plan", shards: int, *, as_json: bool) -> None:
+    """Do a few tasks, and say what all of them cost."""
+    from shiftsim.benchmarks import estimate
+
+    with cli.output_kept():
+        costs = estimate.estimate(plan, shards=shards)
+    shown = estimate.lines(plan, costs, shards=shards)
+    cli.show(estimate.as_json(plan, costs, shards=shards), shown, as_json=as_json)
 
 
 def _official(settings: cli.Settings) -> list[str]:

@@ -1,0 +1,120 @@
+"""What a benchmark will cost on this machine: tasks, time, memory and disk, before it is run.
+
+A few tasks of every planner and run are done and timed, after one of each noise that loads and
+compiles; nothing is written.
+"""
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from time import perf_counter
+
+import pyarrow as pa
+
+from shiftsim.benchmarks.bench import Plan
+from shiftsim.runs.prepare import Prepared
+from shiftsim.runs.task import Batch, TaskRunner
+
+_SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time
+_FEWEST, _MOST = 3, 24  # tasks that are timed
+_ROW_BYTES = 400.0  # of the tables, per task
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What one planner costs in one run."""
+
+    run: str  # name of the run
+    planner: str  # name of the planner
+    tasks: int  # rollouts
+    seconds_per_task: float  # of one core [s]
+    hours: float  # with all workers of all shards [h]
+    memory: int  # all workers of one machine at their peak [bytes], 0 where unknown
+    disk: int  # [bytes]
+
+
+def estimate(plan: Plan, *, shards: int = 1) -> list[Cost]:
+    """The cost of every planner in every run of a benchmark that has been checked.
+
+    `shards` machines like this one share the tasks, each with the workers of the plan.
+    """
+    return [cost for name, prepared in plan.runs.items() for cost in _costs(name, prepared, shards)]
+
+
+def total(costs: list[Cost]) -> Cost:
+    """All of it: runs follow one another."""
+    tasks, hours = sum(cost.tasks for cost in costs), sum(cost.hours for cost in costs)
+    work = sum(cost.tasks * cost.seconds_per_task for cost in costs)
+    memory, disk = max(cost.memory for cost in costs), sum(cost.disk for cost in costs)
+    return Cost("all", "all", tasks, work / max(1, tasks), hours, memory, disk)
+
+
+def _costs(name: str, prepared: Prepared, shards: int) -> Iterator[Cost]:
+    config = prepared.config
+    make = TaskRunner(config, prepared.store, prepared.planners, prepared.noises)
+    with closing(make) as do:
+        for planner in prepared.planners:
+            own = [batch for batch in prepared.batches if batch.planner == planner]
+            tasks = sum(len(batch.tasks) for batch in own)
+            each, stored = _measure(do, own)
+            workers = max(1, min(prepared.workers * shards, len(own)))
+            memory = _peak() * min(prepared.workers, workers)
+            hours = tasks * each / workers / 3600.0
+            yield Cost(name, planner, tasks, each, hours, memory, round(tasks * stored))
+
+
+def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
+    """Seconds and bytes of one task: the mean of some from all over the run."""
+    if not batches:
+        return 0.0, 0.0
+    for batch in {batch.tasks[0].noise: batch for batch in batches}.values():
+        do(batch)  # loads, and compiles
+    step = max(1, len(batches) // _MOST)
+    spent, done, stored = 0.0, 0, 0.0
+    for number, batch in enumerate(batches[::step][:_MOST]):
+        if number >= _FEWEST and spent > _SECONDS:
+            break
+        began = perf_counter()
+        results = do(batch)
+        spent += perf_counter() - began
+        done += len(results)
+        for result in results:
+            stored += _ROW_BYTES + len(pa.compress(result.rollout, codec="zstd", asbytes=True))
+    return spent / done, stored / done
+
+
+def _peak() -> int:
+    """Most memory that this process has had [bytes], 0 where unknown."""
+    if sys.platform == "win32":
+        return 0
+    import resource
+
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size if sys.platform == "darwin" else size * 1024
+
+
+def lines(plan: Plan, costs: list[Cost], *, shards: int) -> list[str]:
+    """As a table in text."""
+    workers = next(iter(plan.runs.values())).workers
+    head = f"{'run':24} {'planner':20} {'tasks':>8} {'s per task':>11} {'time':>9} {'memory':>9} "
+    out = [f"{plan.track.name}: {shards} x {workers} workers", f"{head}{'disk':>9}"]
+    for cost in (*costs, total(costs)):
+        out.append(
+            f"{cost.run:24} {cost.planner:20} {cost.tasks:8d} {cost.seconds_per_task:11.4f}"
+            f" {_time(cost.hours):>9} {cost.memory / 1e9:6.1f} GB {cost.disk / 1e9:6.2f} GB"
+        )
+    return out
+
+
+def _time(hours: float) -> str:
+    return f"{hours:.1f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
+
+
+def as_json(plan: Plan, costs: list[Cost], *, shards: int) -> Mapping[str, object]:
+    """As plain values."""
+    rows = [
+        {name: getattr(cost, name) for name in Cost.__slots__} for cost in (*costs, total(costs))
+    ]
+    workers = next(iter(plan.runs.values())).workers
+    return {"track": plan.track.name, "workers": workers, "shards": shards, "costs": rows}
