@@ -79,3 +79,5 @@ def test_a_replay_of_the_worst_opens_while_the_run_goes_on(page, watched):
     page.open(link)
 
     assert page.text("token") == token
+    assert page.run("replay.state.t") > 0  # at the violation
+    assert page.run("replay.state.told.length") > 0

@@ -73,6 +73,7 @@ def test_the_worst_are_kept_in_order_with_the_reason():
 
     assert [row["token"] for row in worst] == ["t99", *[f"t{i}" for i in range(1, 20)]]
     assert worst[0]["why"] == "drivable area 4.2 s, at-fault collision 9.0 s"
+    assert worst[0]["at"] == 4.25
     assert worst[0]["replay"] is None  # no rollout is stored
 
 
