@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stores import write_toy_store
 
-import shiftsim
+from shiftsim.cli import main
 from shiftsim.data.store.reading import open_store
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import Progress, execute
@@ -174,7 +174,7 @@ def test_the_command_says_where_the_page_is(store, tmp_path, capsys, monkeypatch
     words = ["run", "-p", "constant-velocity", "--store", str(store), "--workers", "1"]
 
     with pytest.raises(SystemExit) as left:
-        shiftsim.cli.main([*words, "--out", str(tmp_path / "run"), "--live", "--json"])
+        main([*words, "--out", str(tmp_path / "run"), "--live", "--json"])
 
     printed = capsys.readouterr()
     assert left.value.code in (0, None)
