@@ -61,5 +61,5 @@ def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
         if row["metric"] == COLLISIONS:  # the speed by which it changes is kept here
             words.append(f"Δv {value:.1f} m/s")
         elif unit:
-            words.append(f"{value:.3g} {unit}")
+            words.append(f"{value:.3g} {unit}" if abs(value) >= 0.01 else f"under 0.01 {unit}")
     return ", ".join(words)

@@ -59,7 +59,8 @@ function range({ mean, half, colour }) {
 function scenario(row, ended) {
   if (row.replay === null || ended) return row.token;
   const link = document.createElement("a");
-  link.href = `/replay/${row.replay}?token=${encodeURIComponent(key)}`;
+  const at = row.at === null ? "" : `#t=${row.at.toFixed(2)}`;
+  link.href = `/replay/${row.replay}?token=${encodeURIComponent(key)}${at}`;
   link.target = "_blank";
   link.textContent = row.token;
   return link;

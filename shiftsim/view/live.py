@@ -147,7 +147,8 @@ class LiveRun:
                     {
                         **result.task._asdict(),
                         "score": 100.0 * float(result.scores["cls"]),
-                        "why": _reason(result),
+                        "why": _words(violated := _violated(result)),
+                        "at": next(iter(violated.values()), None),
                         "replay": -number if result.rollout else None,
                     }
                     for _, number, result in sorted(self._worst, reverse=True)
@@ -177,17 +178,21 @@ class LiveRun:
         return replay_page(scenario, [shown])
 
 
-def _reason(result: TaskResult) -> str:
-    """What was violated first of the metrics that cost most."""
+def _violated(result: TaskResult) -> dict[str, float | None]:
+    """First times [s] of the violations that cost most, the earliest first; None where it has none.
+
+    That is what made the score 0, else all that lowered it.
+    """
     rows = {row["metric"]: row for row in result.metrics if row["metric"] in REASONS}
     below = {name: row for name, row in rows.items() if row["score"] is None or row["score"] < 1.0}
     costly = {name: row for name, row in below.items() if name in MULTIPLIERS} or below
-    times: Mapping[str, float | None] = {n: row["first_violation_s"] for n, row in costly.items()}
-    parts = sorted(times, key=lambda name: (times[name] is None, times[name] or 0.0))
-    return ", ".join(
-        REASONS[name] if times[name] is None else f"{REASONS[name]} {times[name]:.1f} s"
-        for name in parts
-    )
+    times = {name: row["first_violation_s"] for name, row in costly.items()}
+    return dict(sorted(times.items(), key=lambda item: (item[1] is None, item[1] or 0.0)))
+
+
+def _words(violated: Mapping[str, float | None]) -> str:
+    parts = ((REASONS[name], seconds) for name, seconds in violated.items())
+    return ", ".join(words if at is None else f"{words} {at:.1f} s" for words, at in parts)
 
 
 class LiveServer(LocalServer):

@@ -27,7 +27,7 @@ class Watched:
         )
         self.may, self.server = Event(), LiveServer(self.live)
         self.thread = Thread(target=self._work)
-        self.stop_after = 3
+        self.stop_after = 6
 
     def _work(self):
         with self.server:
@@ -55,7 +55,7 @@ def count(page):
 @pytest.mark.parametrize("size", SIZES)
 def test_progress_grows_and_the_last_state_stays(page, watched, size, tmp_path):
     page.open(watched.server.address, size)
-    page.wait("document.getElementById('count').textContent.startsWith('3 of 8')")
+    page.wait("document.getElementById('count').textContent.startsWith('6 of 8')")
     page.shoot(tmp_path / "running.png")
     assert page.text("title") == "runs/<i>x</i>"
     assert "running" in page.text("state")
@@ -72,10 +72,10 @@ def test_progress_grows_and_the_last_state_stays(page, watched, size, tmp_path):
 
 def test_a_replay_of_the_worst_opens_while_the_run_goes_on(page, watched):
     page.open(watched.server.address)
-    page.wait("document.querySelector('#worst a')")
-    link = page.run("document.querySelector('#worst a').href")
-    token = page.run("document.querySelector('#worst a').textContent")
+    link = """document.querySelector("#worst a")"""
+    page.wait(link)
+    token = page.run(f"{link}.textContent")
 
-    page.open(link)
+    page.open(page.run(f"{link}.href"))
 
     assert page.text("token") == token

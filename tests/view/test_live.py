@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stores import write_toy_store
 
-import shiftsim
+from shiftsim.cli import main
 from shiftsim.data.store.reading import open_store
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import Progress, execute
@@ -73,6 +73,7 @@ def test_the_worst_are_kept_in_order_with_the_reason():
 
     assert [row["token"] for row in worst] == ["t99", *[f"t{i}" for i in range(1, 20)]]
     assert worst[0]["why"] == "drivable area 4.2 s, at-fault collision 9.0 s"
+    assert worst[0]["at"] == 4.25
     assert worst[0]["replay"] is None  # no rollout is stored
 
 
@@ -173,7 +174,7 @@ def test_the_command_says_where_the_page_is(store, tmp_path, capsys, monkeypatch
     words = ["run", "-p", "constant-velocity", "--store", str(store), "--workers", "1"]
 
     with pytest.raises(SystemExit) as left:
-        shiftsim.cli.main([*words, "--out", str(tmp_path / "run"), "--live", "--json"])
+        main([*words, "--out", str(tmp_path / "run"), "--live", "--json"])
 
     printed = capsys.readouterr()
     assert left.value.code in (0, None)
