@@ -141,6 +141,9 @@ def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Colu
     shift = said.get("shift_m", (0.0, 0.0))
     if len(shift) != 2 or not all(isinstance(v, int | float) for v in shift):
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")
+    hz = said.get("hz", 1.0)
+    if not isinstance(hz, int | float) or not 0.0 < hz < np.inf:
+        raise ConfigError(f"hz is {hz!r}", "hz = 25, or --hz 25")
     reference = said.get("reference", "")
     if reference:
         one_of("reference", reference, ("center", "front", "rear"))

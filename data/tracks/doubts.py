@@ -23,6 +23,7 @@ _LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
 _MOVING = 1.0  # m/s
 _MAX_GAP = 1.0  # s without a row of any object
 _LEAST_OBJECTS = 5  # that begin at once
+_MAX_SPAN = 1e5  # s from the first row to the last one
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
@@ -105,8 +106,14 @@ def _check_times(table: TrackTable, step: FloatArray, out: Doubts) -> bool:
         return False
     period = float(np.median(step))
     slow, fast = _RATES
+    span = float(np.ptp(table.time_us)) / 1e6
     if 0.99 / fast <= period <= 1.01 / slow:
-        return True
+        if span > _MAX_SPAN:
+            out.say(
+                f"the rows span {span:g} s, more than {_MAX_SPAN:g} s",
+                "leave out rows with a wrong time, check its unit, or convert parts by themselves",
+            )
+        return span <= _MAX_SPAN
     column = table.columns.found.get("time")
     remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
     if column is not None and table.hz is None:

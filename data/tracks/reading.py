@@ -224,7 +224,7 @@ def _times(
             "say how many there are per second: --hz 25",
         )
     if role == "frame" and not 0.0 < float(rate or 0.0) < np.inf:
-        raise ConfigError(f"{path}: hz is {rate!r}", "--hz 25")
+        raise ConfigError(f"hz is {rate!r}", "--hz 25")
     values = table[column.name] if column.name else None
     if values is None:
         raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
