@@ -1,0 +1,66 @@
+"""What compiling costs, by kernel: the first run after an install.
+
+Run with `pytest benchmarks/speed/test_compile.py -s`. A kernel's own time is that without the
+kernels it calls; they are compiled as parts of it.
+"""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from shiftsim.data.demo.store import demo_store
+
+SHOWN = 20  # the dearest kernels
+CHILD = """
+import json, sys
+from contextlib import redirect_stdout, suppress
+from time import process_time
+from numba.core import event
+from shiftsim.cli import main
+
+own, calls = {}, []
+
+class Watch(event.Listener):
+    def on_start(self, event):
+        calls.append([process_time(), 0.0])
+
+    def on_end(self, event):
+        began, inner = calls.pop()
+        seconds = process_time() - began
+        if calls:
+            calls[-1][1] += seconds
+        function = event.data["dispatcher"].py_func
+        name = f"{function.__module__.removeprefix('shiftsim.')}.{function.__name__}"
+        own[name] = own.get(name, 0.0) + seconds - inner
+
+event.register("numba:compile", Watch())
+with redirect_stdout(sys.stderr), suppress(SystemExit):
+    main(sys.argv[1:])
+print(json.dumps([process_time(), own]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("planner", "traffic"), [("constant-velocity", "nonreactive"), ("pdm-closed", "reactive")]
+)
+def test_first_run_after_an_install(planner, traffic, note, size, tmp_path):
+    if planner == "pdm-closed" and size(1, 0) == 0:
+        pytest.skip("half a minute more, and shows nothing new")
+    store = demo_store(tmp_path / "demo")
+    words = ["run", "-p", planner, "--traffic", traffic, "--store", str(store), "--quiet"]
+    words += ["--limit", "16", "--workers", "1", "--out", str(tmp_path / "run")]
+    empty = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, *words], env=empty, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    total, own = json.loads(done.stdout)
+    compiled = sum(own.values())
+    print(f"\n{planner}, {traffic}: {total:.1f} CPU-s, {compiled:.1f} for {len(own)} kernels")
+    for name, seconds in sorted(own.items(), key=lambda item: -item[1])[:SHOWN]:
+        print(f"  {seconds:6.3f} s  {name}")
+    note(total=total, compiling=compiled)
+    assert len(own) > 50
