@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shiftsim.data.nuplan.scenarios import read_scenario
-from shiftsim.runs.interplan.build import apply_code
+from shiftsim.runs.edits.interplan.build import apply_code
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.verify.scenario_edits import WINDOW
 from shiftsim.verify.scenes import Scenes

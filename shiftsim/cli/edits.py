@@ -25,7 +25,7 @@ def check(
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
     from shiftsim.errors import ConfigError, ShiftsimError
-    from shiftsim.runs.edits import EditedStore
+    from shiftsim.runs.edits.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.sim.traffic import traffic_name
 
@@ -68,7 +68,7 @@ def show(
     """What an edit makes of a scenario: words, and a picture of before and after."""
     from shiftsim.errors import beginning
     from shiftsim.report.palette import save_picture
-    from shiftsim.runs.edits import EditedStore
+    from shiftsim.runs.edits.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.view.edited import before_and_after
 
@@ -103,8 +103,8 @@ def import_edits(
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
     from shiftsim.files import write_text
-    from shiftsim.runs.edits import edits_text, make_edits
-    from shiftsim.runs.interplan.codes import import_names
+    from shiftsim.runs.edits.edited import edits_text, make_edits
+    from shiftsim.runs.edits.interplan.codes import import_names
 
     table = import_names(names, modifications, window)
     made = make_edits(table, out.stem)
@@ -130,7 +130,7 @@ def sample(
 
     from shiftsim.errors import one_of
     from shiftsim.files import write_text
-    from shiftsim.runs.edits import edits_text
+    from shiftsim.runs.edits.edited import edits_text
     from shiftsim.runs.scenarios import find_split, open_named_store
     from shiftsim.world.edits.sampling import KINDS, sample_edits
 

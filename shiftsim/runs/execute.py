@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 from shiftsim.errors import DataError
 from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
-from shiftsim.runs.edits import EditedStore
+from shiftsim.runs.edits.edited import EditedStore
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
 from shiftsim.runs.prepare import Prepared, prepare

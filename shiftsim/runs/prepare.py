@@ -25,7 +25,7 @@ from shiftsim.planners.registry import (
     takes_argument,
 )
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
-from shiftsim.runs.edits import EditSet, describe
+from shiftsim.runs.edits.edited import EditSet, describe
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, token_hash

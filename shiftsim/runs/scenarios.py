@@ -16,7 +16,7 @@ from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.files import below, read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
-from shiftsim.runs.edits import EditedStore, EditSet, make_edits, read_edits
+from shiftsim.runs.edits.edited import EditedStore, EditSet, make_edits, read_edits
 from shiftsim.runs.results import Run
 
 BUNDLE = "store"  # folder below that of the run

@@ -24,7 +24,7 @@ from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.edits import EditedStore, EditSet
+from shiftsim.runs.edits.edited import EditedStore, EditSet
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog

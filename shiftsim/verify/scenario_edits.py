@@ -23,8 +23,8 @@ from shiftsim.metrics.interplan import (
     role_of,
 )
 from shiftsim.planners.idm import Idm
-from shiftsim.runs.interplan import codes
-from shiftsim.runs.interplan.build import SORTS, Built, assemble, build
+from shiftsim.runs.edits.interplan import codes
+from shiftsim.runs.edits.interplan.build import SORTS, Built, assemble, build
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.scripted import Scripted, share_walked

@@ -7,8 +7,8 @@ from commands import call
 
 import shiftsim
 from shiftsim.errors import ConfigError
-from shiftsim.runs.edits import EditedStore, edits_text, make_edits
-from shiftsim.runs.interplan.codes import import_names
+from shiftsim.runs.edits.edited import EditedStore, edits_text, make_edits
+from shiftsim.runs.edits.interplan.codes import import_names
 from shiftsim.runs.scenarios import open_run_store
 
 EDITS = """

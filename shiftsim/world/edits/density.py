@@ -1,7 +1,7 @@
 """Vehicles in the lanes around the ego at random distances, with speeds that let them stop.
 
 The draws are those of interPlan (`random.Random`, in its order), so that its density codes give the
-same vehicles; what it does with them is in `shiftsim.runs.interplan`.
+same vehicles; what it does with them is in `shiftsim.runs.edits.interplan`.
 """
 
 import math

@@ -16,8 +16,8 @@ import shapely
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angle
-from shiftsim.runs.interplan import codes
-from shiftsim.runs.interplan.path import Plan, make_plan
+from shiftsim.runs.edits.interplan import codes
+from shiftsim.runs.edits.interplan.path import Plan, make_plan
 from shiftsim.sim.traffic.scripted import PEDESTRIAN_SIZE
 from shiftsim.world.edits.apply import edited_id
 from shiftsim.world.edits.density import blocks_at, draw_slots

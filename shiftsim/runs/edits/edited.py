@@ -13,7 +13,7 @@ from typing import Any
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, beginning, nearest
 from shiftsim.files import read_toml
-from shiftsim.runs.interplan.build import apply_code
+from shiftsim.runs.edits.interplan.build import apply_code
 from shiftsim.world.edits.apply import apply_edit, edited_id
 from shiftsim.world.edits.spec import PROFILES, Edit, digest_of, make_edit
 from shiftsim.world.scenario import Scenario

@@ -14,7 +14,7 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.metrics.interplan import simplified
 from shiftsim.metrics.route import driven_route
-from shiftsim.runs.interplan.codes import COMMANDS
+from shiftsim.runs.edits.interplan.codes import COMMANDS
 from shiftsim.world.edits.draft import EGO_SIZE
 from shiftsim.world.edits.route import TOLERANCE, by_command, cut_by_time, edge_at, plan_line
 from shiftsim.world.lanes import nearest_heading, start_on
