@@ -1,14 +1,30 @@
 """Array type aliases, and the decorators that compile kernels.
 
 Shapes and units are in the docstrings; the aliases say the kind of number only.
+
+Compiled kernels are kept on disk: in a checkout in `CACHE`, for an installed package where numba
+would keep them, and in `NUMBA_CACHE_DIR` where that is set. What is kept counts only as long as the
+file of the kernel and all that it imports are the same. Trouble with it costs time, nothing else.
 """
 
+import gc
+import hashlib
+import logging
+import os
+import pickle
+import re
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeAlias
 
+import numba
 import numpy as np
+from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
-from shiftsim.compiling import compiled
+from shiftsim.files import PACKAGE, sources
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -49,6 +65,121 @@ def sealed(array: Any) -> Any:
     return opaque(read_only(array))
 
 
+CACHE = PACKAGE.parent / ".numba-cache"  # in a checkout
+_USES_CACHE = "NUMBA_CACHE_DIR" not in os.environ and (CACHE.parent / "pyproject.toml").is_file()
+_COMPILED = re.compile(rb"kernel|^[A-Z][A-Z0-9_, ]* = ", re.MULTILINE)  # constants are, too
+
+
+_LOG = logging.getLogger(__name__)
+
+
+def cache_folder(file: str = "") -> str:
+    """Where the compiled kernels of a source file are; without one, where all of them are."""
+    if not _USES_CACHE:
+        return str(vars(numba.config)["CACHE_DIR"])
+    return str(CACHE / _fingerprint(Path(file))) if file else str(CACHE)
+
+
+@cache
+def _fingerprint(path: Path) -> str:
+    """Hash of all that the kernels of a source file are made of."""
+    digest = hashlib.sha256()
+    is_ours = path.is_relative_to(PACKAGE)
+    for name, source in sorted(sources([path] if is_ours else PACKAGE.rglob("*.py")).items()):
+        if _COMPILED.search(source):
+            digest.update(name.encode() + b"\n" + source)
+    return digest.hexdigest()[:16]
+
+
+class _Kept(FunctionCache):
+    """What is kept of one kernel: a file for each signature, whole and with its hash, or ignored.
+
+    numba's own files have no hash. They have an index, which a kill or a second process can make
+    point to the code of another signature; and numba looks only at the file of the outermost
+    kernel, while a kernel or constant of another file may have changed.
+    """
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        source = Path(function.__code__.co_filename)
+        stamp = self._impl.locator.get_source_stamp()
+        self._made_of = (numba.__version__, stamp, _fingerprint(source))
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel, None where it is to be compiled."""
+        target_context.refresh()
+        path, key = self._file(sig, target_context.codegen())
+        try:
+            content = path.read_bytes()
+            digest, content = content[:_DIGEST], content[_DIGEST:]
+            if hashlib.sha256(content).digest() != digest:
+                raise ValueError(f"{path} is damaged")
+            found, compiled = pickle.loads(content)
+            return self._impl.rebuild(target_context, compiled) if found == key else None
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # unpickling may run into anything
+            _say_once("kernels that were kept cannot be used and are compiled again", error)
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled kernel, if possible."""
+        if not self._impl.check_cachable(data):
+            return
+        path, key = self._file(sig, data.codegen)
+        partial = path.with_name(f".{path.name}.{os.getpid()}")  # others may write the same file
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                content = dumps((key, self._impl.reduce(data)))  # type: ignore[no-untyped-call]
+                partial.write_bytes(hashlib.sha256(content).digest() + content)
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+        except OSError as error:
+            _say_once(_UNKEPT, error)
+
+    def _file(self, sig: Any, codegen: Any) -> tuple[Path, Any]:
+        """Where the code for a signature and processor is, and what it must be made of."""
+        key = self._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        name = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:16]
+        path = Path(self.cache_path) / f"{self._impl.filename_base}.{name}.nbc"
+        return path, (self._made_of, key)
+
+
+_DIGEST = hashlib.sha256().digest_size
+_UNKEPT = "compiled kernels cannot be kept and are compiled anew by every process"
+_SAID = set[str]()
+
+
+def _say_once(what: str, error: Exception) -> None:
+    if what not in _SAID:
+        _SAID.add(what)
+        _LOG.warning("%s: %s", what, error)
+
+
+class _NoCollection(event.Listener):
+    """Compiling makes millions of objects that stay: looking for garbage takes a sixth of it."""
+
+    def __init__(self) -> None:
+        self._depth, self._was_on = 0, False
+
+    def on_start(self, event: Any) -> None:
+        """A kernel begins to be compiled, maybe within another one."""
+        if self._depth == 0:
+            self._was_on = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """It is done."""
+        self._depth -= 1
+        if self._depth == 0 and self._was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _NoCollection())
+
 # The entry point for C, which nobody calls, would take a tenth of the time to compile.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
@@ -60,7 +191,7 @@ def kernel(function: Any) -> Any:
     of threads. Division by zero gives inf or NaN, as in NumPy.
     """
     # said although it is the default: a kernel called by a lean one would inherit the opposite
-    return compiled(function, _OPTIONS | {"_nrt": True})
+    return _compiled(function, counts_references=True)
 
 
 def lean_kernel(function: Any) -> Any:
@@ -71,4 +202,15 @@ def lean_kernel(function: Any) -> Any:
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """
-    return compiled(function, _OPTIONS | {"_nrt": False})
+    return _compiled(function, counts_references=False)
+
+
+def _compiled(function: Any, *, counts_references: bool) -> Any:
+    compiled = numba.njit(**(_OPTIONS | {"_nrt": counts_references}))(function)
+    # a setting that numba makes at run time, and reads when it looks for a folder
+    vars(numba.config)["CACHE_DIR"] = cache_folder(function.__code__.co_filename)
+    try:
+        compiled._cache = _Kept(function)
+    except (OSError, RuntimeError) as error:  # no folder can be written to
+        _say_once(_UNKEPT, error)
+    return compiled

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.compiling import cache_folder
+from shiftsim.arrays import cache_folder
 from shiftsim.files import PACKAGE, sources
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate

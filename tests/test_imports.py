@@ -12,7 +12,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 # Who may import whom: a package may use those of lower layers, and itself.
 LAYERS = (
-    {"_moved", "arrays", "compiling", "errors", "files", "geometry"},
+    {"_moved", "arrays", "errors", "files", "geometry"},
     {"world"},
     {"sim", "metrics", "data", "planners"},
     {"runs"},

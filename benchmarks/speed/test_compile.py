@@ -1,7 +1,7 @@
 """What compiling costs, by kernel: the first run after an install.
 
 Run with `pytest benchmarks/speed/test_compile.py -s`. A kernel's own time is that without the
-kernels it calls; they are compiled as parts of it.
+kernels it calls.
 """
 
 import json

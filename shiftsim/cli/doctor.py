@@ -97,7 +97,7 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
-    from shiftsim.compiling import cache_folder
+    from shiftsim.arrays import cache_folder
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
     from shiftsim.verify import verify

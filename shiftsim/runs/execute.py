@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 from shiftsim.errors import DataError
 from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
-from shiftsim.runs.edits.edited import EditedStore
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
 from shiftsim.runs.prepare import Prepared, prepare
@@ -113,7 +112,7 @@ def _execute(prepared: Prepared, manifest: dict[str, Any], on_progress: Watch) -
             store = open_named_store(prepared.store)
             tokens = {task.token for task in prepared.tasks}
             if prepared.edits is not None:
-                edited = EditedStore(store, prepared.edits)
+                edited = prepared.edits.over(store)
                 tokens = {edited.base(token) for token in tokens}
             manifest["bundle"] = write_bundle(store, prepared.folder, tokens)
         missing = set(prepared.missing)

@@ -25,7 +25,6 @@ from shiftsim.planners.registry import (
     takes_argument,
 )
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
-from shiftsim.runs.edits.edited import EditSet, describe
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, token_hash
@@ -36,6 +35,7 @@ from shiftsim.sim.traffic import PLANNER, make_traffic, traffic_name
 
 if TYPE_CHECKING:
     from shiftsim.planners.isolated import Isolated
+    from shiftsim.runs.edits.edited import EditSet
 
 RUNS = Path("runs")
 _NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
@@ -62,7 +62,7 @@ class Prepared:
     workers: int  # number of worker processes
     generator: Mapping[str, Any]  # what made the scenarios up; empty where they were recorded
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
-    edits: EditSet | None = None  # what makes the scenarios of recorded ones
+    edits: "EditSet | None" = None  # what makes the scenarios of recorded ones
     made: Mapping[str, Any] = field(default_factory=dict)  # which are made of which
 
     @property
@@ -79,7 +79,7 @@ class Chosen(NamedTuple):
     missing: list[str]  # tokens that it does not hold
     num_dropped: int  # scenarios left out because the filter dropped them
     determining: dict[str, Any]  # what identifies them
-    edits: EditSet | None  # what makes them of recorded ones
+    edits: "EditSet | None"  # what makes them of recorded ones
     made: dict[str, Any]  # which are made of which, for the manifest
 
 
@@ -234,7 +234,7 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     name, tokens, store_tokens = split.name, split.tokens, set(known)
     edits, made = _edits(config, store), {}
     if edits is not None:
-        made = describe(edits.expand(store, tokens))
+        made = edits.describe(store, tokens)
         name, tokens, store_tokens = f"{name}+{edits.name}", tuple(made), set(made)
     tokens = tokens[: config.limit] if config.limit else tokens
     missing = sorted(set(tokens) - store_tokens)
@@ -260,7 +260,7 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
     return Chosen(name, present, missing, len(known) - len(usable), determining, edits, made)
 
 
-def _edits(config: RunConfig, store: ScenarioStore) -> EditSet | None:
+def _edits(config: RunConfig, store: ScenarioStore) -> "EditSet | None":
     """The edits of a run, which its traffic can drive."""
     if not config.edits:
         return None

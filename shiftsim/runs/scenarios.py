@@ -9,15 +9,17 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
 from shiftsim.files import below, read_toml, store_path
 from shiftsim.runs.config import DEFAULT_STORE
-from shiftsim.runs.edits.edited import EditedStore, EditSet, make_edits, read_edits
 from shiftsim.runs.results import Run
+
+if TYPE_CHECKING:
+    from shiftsim.runs.edits.edited import EditSet
 
 BUNDLE = "store"  # folder below that of the run
 
@@ -78,16 +80,20 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         )
     found.hash = run.manifest["determining"]["store"]
     if edits := run.manifest.get("edits"):
+        from shiftsim.runs.edits.edited import EditedStore, make_edits
+
         return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
 
 
-def open_edits(name: str, store: ScenarioStore) -> EditSet:
+def open_edits(name: str, store: ScenarioStore) -> "EditSet":
     """Edits by the path of a file, or by the name of one in `edits/` of a store; splits resolved.
 
     Raises:
         ConfigError: There is no such file, or it is wrong.
     """
+    from shiftsim.runs.edits.edited import read_edits
+
     path, known = Path(store.path), store.tokens
     edits = read_edits(name, path)
     return edits.with_splits(lambda split: find_split(split, path, known).tokens)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +24,6 @@ from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.edits.edited import EditedStore, EditSet
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
@@ -33,6 +32,9 @@ from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import Traffic
 from shiftsim.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from shiftsim.runs.edits.edited import EditSet
 
 T = TypeVar("T")
 
@@ -77,7 +79,7 @@ class Stopwatch:
 class Scenarios:
     """A store that is opened when it is needed, and the scenario that was read last."""
 
-    def __init__(self, store: str, edits: EditSet | None = None) -> None:
+    def __init__(self, store: str, edits: "EditSet | None" = None) -> None:
         self.store, self.edits = store, edits
         self._open: Any = None
         self._last: Scenario | None = None
@@ -86,7 +88,7 @@ class Scenarios:
         """A scenario; several tasks on one follow each other."""
         if self._open is None:
             found = open_store(self.store)
-            self._open = EditedStore(found, self.edits) if self.edits else found
+            self._open = self.edits.over(found) if self.edits else found
         if self._last is None or self._last.token != token:
             self._last = self._open.read(token)
         return self._last
@@ -101,7 +103,7 @@ class TaskRunner:
     planners: Mapping[str, RunPlanner]  # the planners, by name
     noises: Mapping[str, NoiseModel]  # the noise models, by name
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
-    edits: EditSet | None = None  # what makes the scenarios of recorded ones
+    edits: "EditSet | None" = None  # what makes the scenarios of recorded ones
     _originals: dict[str, Original] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:

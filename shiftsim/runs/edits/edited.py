@@ -55,6 +55,14 @@ class EditSet:
         )
         return replace(self, edits=tuple(edits))
 
+    def over(self, store: ScenarioStore) -> "EditedStore":
+        """The store that the edits make of a store."""
+        return EditedStore(store, self)
+
+    def describe(self, store: ScenarioStore, tokens: Iterable[str]) -> dict[str, Any]:
+        """For a manifest: base token and digest of the edited scenarios, by id."""
+        return describe(self.expand(store, tokens))
+
     @property
     def digest(self) -> str:
         """What the edited scenarios depend on, beside the recorded ones."""

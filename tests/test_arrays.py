@@ -10,7 +10,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from shiftsim import compiling
+from shiftsim import arrays
 
 KERNEL = """
 from shiftsim.arrays import kernel, lean_kernel
@@ -28,9 +28,9 @@ def add(x, y):
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A source file with two kernels, and a folder of its own for what is compiled."""
-    monkeypatch.setattr(compiling, "_USES_CACHE", False)
-    monkeypatch.setattr(compiling, "cache_folder", lambda file="": str(tmp_path / "kept"))
-    monkeypatch.setattr(compiling, "_SAID", set())
+    monkeypatch.setattr(arrays, "_USES_CACHE", False)
+    monkeypatch.setattr(arrays, "cache_folder", lambda file="": str(tmp_path / "kept"))
+    monkeypatch.setattr(arrays, "_SAID", set())
     path = tmp_path / "kernels.py"
     path.write_text(KERNEL.replace("FACTOR", "2"))
     return path
@@ -102,7 +102,7 @@ def test_code_of_another_signature_source_or_constant_is_not_used(file, tmp_path
     assert (add(1, 2), add(1.5, 2)) == (4, 5.0)
     assert hits(add) == 0
     # another file that the kernels depend on
-    monkeypatch.setattr(compiling, "_fingerprint", lambda path: "changed")
+    monkeypatch.setattr(arrays, "_fingerprint", lambda path: "changed")
     again = load(file)
     assert again(1, 2) == 4
     assert hits(again) == 0
