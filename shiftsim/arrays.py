@@ -178,7 +178,7 @@ class _NoCollection(event.Listener):
             gc.enable()
 
 
-event.register("numba:compile", _NoCollection())
+event.register("numba:compile", _NoCollection())  # type: ignore[no-untyped-call]
 
 # The entry point for C, which nobody calls, would take a tenth of the time to compile.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}

@@ -128,9 +128,7 @@ def next_lane(lanes: Lanes, edge: int) -> int:
 
 
 @lean_kernel
-def _trace(  # type: ignore[no-untyped-def]  # compiled
-    lanes: Lanes, edge: int, x: float, y: float, path: FloatArray
-):
+def _trace(lanes: Lanes, edge: int, x: float, y: float, path: FloatArray) -> tuple[int, float]:
     """Write the path from a point on: (P, 3) x, y, distance along it; find the red light.
 
     The first point is `_BEHIND` the agent. Returns how many points there are, and the distance to
