@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -13,7 +14,7 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, Start
+from shiftsim.train.driving import Driver, Job, Start, Student
 from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
 from shiftsim.train.settings import Settings
@@ -84,13 +85,17 @@ def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, m
     assert settings.network.read_bytes() == trained[0].best.read_bytes()
 
 
-def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy):
+def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypatch):
+    def veering(student, features):
+        return [np.ones(2, np.float32) for _ in features]
+
     def urgent(expert_steps):
         starts = tuple(Start(token, "none", 0, expert_steps) for token in sorted(tokens)[:2])
         return [x.is_urgent for x in driver(Job(starts, False, 0.3)).states]
 
     tokens = open_store(toy).tokens
     driver = Driver(str(toy), "deterministic:base")
+    monkeypatch.setattr(Student, "infer", veering)
     assert 0 < sum(urgent(0)) <= 2 * 15
     assert not any(urgent(-1))
 
