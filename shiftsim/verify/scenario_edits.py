@@ -38,8 +38,8 @@ from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 
 WINDOW = (20.0, 0.0, 0.5)  # s, s, share of the rows
 FORMULA, POSE, METRIC = 1e-12, 1e-6, 1e-6
-# m, m, rad, m/s: where the ego drove in rollouts of our own; nuPlan's reference allows 1e-3 m. One of
-# the ten, in which the ego drives into a vehicle, is 3e-5 m off, for a reason not known
+# m, m, rad, m/s: where the ego drove in rollouts of our own; nuPlan's reference allows 1e-3 m. One
+# of the ten, in which the ego drives into a vehicle, is 3e-5 m off, for a reason not known
 DRIVEN = 1e-4
 _ACCELERATIONS = {"accel_max": 1.0, "decel_max": 2.0}  # m/s^2, of interPlan's settings
 _WEIGHTS = {
