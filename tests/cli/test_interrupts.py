@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 
 import pytest
 
@@ -62,6 +63,15 @@ def test_an_interrupt_ends_in_one_line(words, work, hint, toy, tmp_path, capsys,
     assert hint.format(store=toy) in lines[-1]
 
 
+@pytest.fixture
+def interrupts():
+    """Interrupts are heard, also where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize("swallowed", ["lost", "changed"])
 def test_an_interrupt_that_a_library_catches_ends_the_command_too(
     swallowed, toy, capsys, monkeypatch
@@ -69,8 +79,7 @@ def test_an_interrupt_that_a_library_catches_ends_the_command_too(
     def work(*given, on_progress, **settings):
         try:
             os.kill(os.getpid(), signal.SIGINT)
-            while True:
-                pass
+            time.sleep(30.0)
         except KeyboardInterrupt:
             if swallowed == "changed":
                 raise SystemError("a library of C code") from None
