@@ -60,7 +60,7 @@ def test_plot_writes_a_figure(call, clean_run, tmp_path):
     ("words", "hint"),
     [
         (("view", "{run}", "ffff"), "hint:"),
-        (("view", "{run}", "0001", "-p", "nobody"), "check --planner"),
+        (("view", "{run}", "0001", "-p", "nobody"), "planners: constant-velocity, log-future"),
         (("plot", "{run}", "0001cafe", "-o", "a.bmp"), "pictures: .pdf"),
         (("view", "nowhere"), "hint:"),
     ],

@@ -226,6 +226,7 @@ def test_learning_depends_on_the_seed_and_not_on_the_number_of_threads(states):
     assert learnt(1, 1)[0] != one
 
 
+@pytest.mark.thorough
 def test_it_learns_a_few_states_by_heart(states):
     learner = Learner("cpu", 2, total=60, seed=0)
     losses = [learner.learn(states, draw_batch(states, (0, step))).loss for step in range(60)]
