@@ -1,6 +1,7 @@
 """Fixtures and hypothesis profiles shared by all tests."""
 
 import os
+import signal
 import tarfile
 from pathlib import Path
 
@@ -22,6 +23,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
 
 def pytest_configure(config: pytest.Config) -> None:
     """Workers would compile the same kernels side by side."""
+    # interrupts are heard, also where the tests run in the background of a shell
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     is_worker = hasattr(config, "workerinput")
     if not is_worker and getattr(config.option, "numprocesses", None):
         from kernels import compile_all

@@ -63,15 +63,6 @@ def test_an_interrupt_ends_in_one_line(words, work, hint, toy, tmp_path, capsys,
     assert hint.format(store=toy) in lines[-1]
 
 
-@pytest.fixture
-def interrupts():
-    """Interrupts are heard, also where the tests run in the background of a shell."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize("swallowed", ["lost", "changed"])
 def test_an_interrupt_that_a_library_catches_ends_the_command_too(
     swallowed, toy, capsys, monkeypatch
