@@ -1,13 +1,16 @@
 """interPlan's metrics and score, by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import cruise_scenario, straight_road
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import MULTIPLIERS, WEIGHTS
+from shiftsim.metrics import MULTIPLIERS, WEIGHTS, interplan
 from shiftsim.metrics.interplan import (
     LaneChanges,
+    _at_the_end,
     changes_between,
     final_score,
     interplan_score,
@@ -53,9 +56,38 @@ def test_an_ego_in_the_lane_beside_the_experts_needs_a_change():
     assert lane_changes_to_goal(straight_road(), log) == LaneChanges(0, 0)
     aside = log.ego.copy()
     aside[:, 1] = 3.5
-    from dataclasses import replace
-
     assert lane_changes_to_goal(straight_road(), replace(log, ego=aside)) == LaneChanges(1, 1)
+
+
+def test_the_end_is_in_the_last_block_of_the_experts_that_the_ego_was_in():
+    road = straight_road()
+    first, beside, later = road.edge("10"), road.edge("11"), road.edge("31")
+    assert road.block_of[first] == road.block_of[beside] != road.block_of[later]
+    assert _at_the_end(road, [first, later], [first, later]) == (later, later)
+    # the ego did not get as far as the expert, whose lane in that block counts
+    assert _at_the_end(road, [first, later], [later, beside]) == (later, later)
+    assert _at_the_end(road, [first], [later, beside]) == (first, beside)
+    assert _at_the_end(road, [first], [beside, later]) == (first, beside)
+    with pytest.raises(DataError, match="never on the route"):
+        _at_the_end(road, [first], [later])
+
+
+def test_the_experts_first_lane_comes_before_the_lanes_of_the_ego():
+    log = as_recorded(cruise_scenario(speed=14.0))
+    road, seen = straight_road(), []
+
+    def note(road, expert, ego):
+        seen.append((expert, ego))
+        return expert[0], ego[0]
+
+    aside = log.ego.copy()
+    aside[:, 1] = 3.5
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interplan, "_at_the_end", note)
+        lane_changes_to_goal(road, replace(log, ego=aside))
+    ((expert, ego),) = seen
+    assert ego[0] == expert[0]
+    assert len(ego) > 1
 
 
 def test_an_obstacle_is_where_the_experts_path_passes_it():
