@@ -152,7 +152,7 @@ function poseAt(fields, name, count, index, at) {
   ];
 }
 
-function drawAgents(context, fields, panel, at, highlighted, edited) {
+function drawAgents(context, fields, panel, at, highlighted, edited = new Set()) {
   const kinds = fields.get("tracks.kind").data;
   const size = fields.get("tracks.size").data;
   const valid = fields.get("tracks.valid").data;
