@@ -25,7 +25,7 @@ from shiftsim.sim.planner import (
     Observation,
     Planner,
     Sight,
-    past_rows,
+    rollout_rows,
     scene_info,
 )
 from shiftsim.sim.traffic import Traffic, make_traffic
@@ -91,8 +91,8 @@ class Rollout:
         # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
         self._times = scenario.iteration_times
-        rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
-        self._start = start = len(rows) - scenario.num_iterations  # row of iteration 0
+        rows, start = rollout_rows(scenario)
+        self._start = start
         # rows: the past samples, then the iterations; the ego is filled up to the present, the
         # tracks from the log until the traffic rewrites them
         self._time_us = scenario.time_us[rows]

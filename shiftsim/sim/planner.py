@@ -203,6 +203,12 @@ def past_rows(scenario: Scenario, iteration: int, samples: int = HISTORY_SAMPLES
     return rows[rows >= 0]
 
 
+def rollout_rows(scenario: Scenario) -> tuple[IntArray, int]:
+    """Rows of the log that a rollout has: past samples, then iterations; which is iteration 0."""
+    rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
+    return rows, len(rows) - scenario.num_iterations
+
+
 def observe_log(
     scenario: Scenario,
     iteration: int,

@@ -150,6 +150,17 @@ class Tracks:
             tuple(self.tokens[i] for i in where),
         )
 
+    def copy(self) -> "Tracks":
+        """The same tracks in arrays of their own, which can be written."""
+        return Tracks(
+            self.valid.copy(),
+            self.poses.copy(),
+            self.velocities.copy(),
+            self.sizes.copy(),
+            self.kinds,
+            self.tokens,
+        )
+
     def sealed(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
         arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)

@@ -1,7 +1,7 @@
 """Vehicles driven by planners: each is an ego of its own."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from shiftsim.errors import InvalidTrajectoryError, TrafficError
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.plan_check import find_fault, plain
-from shiftsim.sim.planner import Planner, SceneInfo, Sight
-from shiftsim.sim.traffic.learned.features import NO_LANE, choose_lane, lanes_of, next_lane
+from shiftsim.sim.planner import Planner, SceneInfo, Sight, rollout_rows
+from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, choose_lane, lanes_of, next_lane
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     NUM_STATE,
@@ -26,7 +26,6 @@ from shiftsim.world.state import (
 )
 
 ROUTE = 400.0  # m of lanes ahead that a vehicle's route leads over
-_CANDIDATES = 16
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
 
@@ -64,14 +63,11 @@ class PlannedTraffic:
         if own is not None:
             vehicles &= np.isin(np.arange(tracks.num_tracks), own)
         self._scenario, self._lanes = scenario, lanes_of(scenario.map)
-        first = int(scenario.iteration_rows[0])
-        step = scenario.row_step
-        rows = np.concatenate([first - step * np.arange(row, 0, -1), scenario.iteration_rows])
+        rows, _ = rollout_rows(scenario)
         self._time_us, self._clock = scenario.time_us[rows], scenario.time_us[rows].tolist()
         self._lights = scenario.traffic_lights.rows(rows)
         self._seen_ego = np.full((len(rows), NUM_STATE), np.nan)
         self._seen_ego[: row + 1] = scenario.ego[rows[: row + 1]]
-        self._row, self._known = row, row
         self._drivers = []
         for track in np.flatnonzero(vehicles).tolist():
             route = self._route(tracks.poses[row, track])
@@ -105,7 +101,7 @@ class PlannedTraffic:
 
     def _route(self, pose: FloatArray) -> tuple[str, ...]:
         """Roadblocks along the lanes ahead of a pose; none where it is on no lane."""
-        found, road = np.empty(_CANDIDATES, np.int64), self._scenario.map
+        found, road = np.empty(CANDIDATES, np.int64), self._scenario.map
         x, y, heading = pose.tolist()
         edge = choose_lane(self._lanes, x, y, heading, NO_LANE, found)
         blocks: list[int] = []
@@ -135,14 +131,9 @@ class PlannedTraffic:
             way = spans * ego[first, VX]
             ego[:first, 0] -= way * np.cos(ego[first, 2])
             ego[:first, 1] -= way * np.sin(ego[first, 2])
-        seen = Tracks(
-            tracks.valid.copy(),
-            tracks.poses.copy(),
-            tracks.velocities.copy(),
-            tracks.sizes.copy(),
-            np.where(np.arange(tracks.num_tracks) == track, AgentKind.VEHICLE, tracks.kinds),
-            tuple("ego" if i == track else name for i, name in enumerate(tracks.tokens)),
-        )
+        names = [*tracks.tokens]
+        names[track] = "ego"
+        seen = replace(tracks.copy(), tokens=tuple(names))
         planner = self._make()
         times = scenario.iteration_times
         planner.reset(

@@ -49,7 +49,7 @@ def labels_of(
 
 
 @kernel
-def _label(  # type: ignore[no-untyped-def]  # compiled
+def _label(
     valid: BoolArray,
     recorded: FloatArray,
     row: int,
@@ -57,7 +57,7 @@ def _label(  # type: ignore[no-untyped-def]  # compiled
     speeds: FloatArray,
     known: BoolArray,
     out: FloatArray,
-):
+) -> None:
     """Write the labels (A, 3); arguments as in `labels_of`."""
     for agent in range(len(poses)):
         last = row

@@ -9,8 +9,9 @@ import numpy as np
 from shiftsim.arrays import FloatArray, kernel
 from shiftsim.errors import DataError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.rings import convex_intersect
+from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic import LogReplay, Traffic
-from shiftsim.train.traffic.states import copied, rows_of
 from shiftsim.world.layers import in_any
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
@@ -79,9 +80,9 @@ def compare(
 
 
 def _measure(scenario: Scenario, traffic: Traffic, out: Realism, steps: int) -> None:
-    rows, start = rows_of(scenario)
+    rows, start = rollout_rows(scenario)
     recorded = scenario.tracks.rows(rows)
-    tracks, ego = copied(recorded), scenario.ego[scenario.iteration_rows]
+    tracks, ego = recorded.copy(), scenario.ego[scenario.iteration_rows]
     try:
         traffic.start(scenario, tracks, start)
         for iteration in range(steps):
@@ -121,32 +122,14 @@ def _touching(valid: np.ndarray, corners: FloatArray, hit: np.ndarray) -> None:
     count = valid.shape[1]
     for a in range(count):
         for b in range(a):
-            if valid[0, a] and valid[0, b] and _overlap(corners[0, a], corners[0, b]):
+            if valid[0, a] and valid[0, b] and convex_intersect(corners[0, a], corners[0, b]):
                 continue
             for row in range(1, len(valid)):
                 if (
                     valid[row, a]
                     and valid[row, b]
                     and abs(corners[row, a, 0, 0] - corners[row, b, 0, 0]) < 30.0
-                    and _overlap(corners[row, a], corners[row, b])
+                    and convex_intersect(corners[row, a], corners[row, b])
                 ):
                     hit[a] = hit[b] = True
                     break
-
-
-@kernel
-def _overlap(first: FloatArray, second: FloatArray) -> bool:
-    """Whether two boxes (4, 2) share a point."""
-    for pair in range(2):
-        box = first if pair == 0 else second
-        for side in range(2):
-            dx, dy = box[side + 1, 0] - box[side, 0], box[side + 1, 1] - box[side, 1]
-            low_a, high_a, low_b, high_b = np.inf, -np.inf, np.inf, -np.inf
-            for corner in range(4):
-                at = first[corner, 0] * dx + first[corner, 1] * dy
-                low_a, high_a = min(low_a, at), max(high_a, at)
-                at = second[corner, 0] * dx + second[corner, 1] * dy
-                low_b, high_b = min(low_b, at), max(high_b, at)
-            if low_a > high_b or low_b > high_a:
-                return False
-    return True

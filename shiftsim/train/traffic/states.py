@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.sim.planner import past_rows
+from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic.learned.features import AHEAD, NUM_FEATURES, PATH, REACH
 from shiftsim.sim.traffic.learned.model import LAG, LearnedTraffic
 from shiftsim.train.traffic.labels import labels_of
@@ -27,24 +27,6 @@ class States(NamedTuple):
     labels: NDArray[np.float32]  # (S, 3) acceleration, curvature, distance steered to
 
 
-def rows_of(scenario: Scenario) -> tuple[NDArray[np.int64], int]:
-    """Rows of a scenario that a rollout has: the past, then the iterations; where they begin."""
-    rows = np.concatenate([past_rows(scenario, 0)[:-1], scenario.iteration_rows])
-    return rows, len(rows) - scenario.num_iterations
-
-
-def copied(tracks: Tracks) -> Tracks:
-    """Tracks with arrays of their own."""
-    return Tracks(
-        tracks.valid.copy(),
-        tracks.poses.copy(),
-        tracks.velocities.copy(),
-        tracks.sizes.copy(),
-        tracks.kinds,
-        tracks.tokens,
-    )
-
-
 def states_of(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator, *, drives: bool
 ) -> States:
@@ -63,10 +45,10 @@ def join(parts: list[States]) -> States:
 def _recorded(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
 ) -> Iterator[States]:
-    rows, start = rows_of(scenario)
+    rows, start = rollout_rows(scenario)
     recorded = scenario.tracks.rows(rows)
     for iteration in range(int(random.integers(EVERY)), scenario.num_iterations - 1, EVERY):
-        tracks, row = copied(recorded), start + iteration
+        tracks, row = recorded.copy(), start + iteration
         if random.random() < 0.5:
             _push(tracks, row, random)
         traffic.start(scenario, tracks, start)
@@ -76,12 +58,12 @@ def _recorded(
 def _driven(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
 ) -> Iterator[States]:
-    rows, start = rows_of(scenario)
+    rows, start = rollout_rows(scenario)
     recorded = scenario.tracks.rows(rows)
     begin = int(random.integers(max(scenario.num_iterations - SEGMENT - 1, 1)))
     ego = scenario.ego[scenario.iteration_rows]
     while begin < scenario.num_iterations - 1:
-        tracks = copied(recorded)
+        tracks = recorded.copy()
         traffic.start(scenario, tracks, start)
         for iteration in range(begin, min(begin + SEGMENT, scenario.num_iterations - 1)):
             row = start + iteration

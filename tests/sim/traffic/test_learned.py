@@ -9,6 +9,7 @@ from worlds import cruise_scenario, moved, standing_tracks, straight_road
 from shiftsim.errors import CheckpointError, ConfigError, TrafficError
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
+from shiftsim.sim.traffic import following
 from shiftsim.sim.traffic.learned import features, network
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.sim.traffic.mixed import Mixed
@@ -118,14 +119,14 @@ def test_features_say_who_leads_and_how_far():
 
 
 def test_a_red_light_ahead_is_seen():
-    lanes = features.lanes_of(ROAD)
+    lanes = following.lanes_of(ROAD)
     path, edge = np.zeros((len(features.AHEAD) + 1, 3)), int(ROAD.outgoing.items[0])
     before = int(np.flatnonzero([edge in ROAD.outgoing.at(i) for i in range(len(ROAD.edges))])[0])
     x, y = ROAD.baselines.at(before)[-1]
-    heading = features._heading_at(ROAD.baselines, before, 1e9)
+    heading = following.heading_at(ROAD.baselines, before, 1e9)
     x, y = x - 12.0 * np.cos(heading), y - 12.0 * np.sin(heading)
     assert features._trace(lanes, before, x, y, path)[1] == np.inf
-    lanes.is_red[features.next_lane(lanes, before)] = True
+    lanes.is_red[following.next_lane(lanes, before)] = True
     assert features._trace(lanes, before, x, y, path)[1] == pytest.approx(12.0, abs=0.2)
 
 

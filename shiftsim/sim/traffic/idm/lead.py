@@ -9,7 +9,7 @@ from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.courtesy import ignores_ego_ahead
 from shiftsim.sim.traffic.idm.paths import remaining_path
-from shiftsim.sim.traffic.idm.scene import PROGRESS, RED, Footprints, Scene, Scratch
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
     UNSURE,
@@ -17,6 +17,7 @@ from shiftsim.sim.traffic.idm.shapes import (
     ring_gap,
     touches_corridor,
 )
+from shiftsim.sim.traffic.lights import RED
 
 FREE, OFF_PATH = -1, -2  # instead of a footprint: nobody ahead; outside of the own corridor
 _TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to see ties

@@ -16,8 +16,6 @@ from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
 from shiftsim.sim.traffic.idm.courtesy import make_courtesy, no_courtesy
 from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import (
-    GREEN,
-    RED,
     REPLAYED_KINDS,
     IdmParameters,
     Scene,
@@ -35,11 +33,12 @@ from shiftsim.sim.traffic.idm.step import (
     advance,
     write_agents,
 )
+from shiftsim.sim.traffic.lights import light_flags
 from shiftsim.world.lanes import find_start
 from shiftsim.world.map import NONE
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.script import CAUTIOUS, LOGGED, OFF
-from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, LightStatus, Tracks, center_poses
+from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
 
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
@@ -106,7 +105,7 @@ class IdmTraffic:
         # nuPlan rule 129: the first gaps are measured between boxes on the lanes, not footprints
         for agent, start in enumerate(placed):
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
-        self._light_edges, self._lights = _light_flags(scenario)
+        self._light_edges, self._lights = light_flags(scenario)
         # nuPlan rule 11: a difference of epoch seconds
         self._spans = np.diff(scenario.iteration_times * 1e-6)
         _remove(tracks, row, ~is_replayed)
@@ -173,20 +172,6 @@ class IdmTraffic:
         fleet = self._scene.fleet
         speeds: FloatArray = fleet.speed[fleet.alive]
         return speeds
-
-
-def _light_flags(scenario: Scenario) -> tuple[IntArray, IntArray]:
-    """(L,) edges with a light, and (T, L) which lights are listed at each iteration."""
-    lights, index = scenario.traffic_lights, scenario.map.edges.index
-    status = lights.status[scenario.iteration_rows]
-    flags = GREEN * (status == LightStatus.GREEN) + RED * (status == LightStatus.RED)
-    known = [i for i, name in enumerate(lights.connector_ids) if name in index]
-    named = np.array([index[lights.connector_ids[i]] for i in known], np.int64)
-    edges, place = np.unique(named, return_inverse=True)
-    out = np.zeros((len(edges), len(status)), np.int64)
-    # nuPlan rule 429: whoever asks for green finds green, whoever asks for red finds red
-    np.bitwise_or.at(out, place, flags[:, known].T)
-    return edges, np.ascontiguousarray(out.T)
 
 
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:

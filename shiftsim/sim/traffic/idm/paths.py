@@ -13,11 +13,9 @@ from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import interpolate, vertex_heading
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
-    GREEN,
     HEADING,
     MAX_ROUTE,
     PROGRESS,
-    RED,
     Fleet,
     Footprints,
     IdmParameters,
@@ -25,6 +23,7 @@ from shiftsim.sim.traffic.idm.scene import (
     Scene,
 )
 from shiftsim.sim.traffic.idm.shapes import bound_ring
+from shiftsim.sim.traffic.lights import GREEN, RED
 from shiftsim.world.lanes import initial_curvature
 from shiftsim.world.layers import Polylines
 

@@ -23,7 +23,6 @@ REPLAYED_KINDS = (
     AgentKind.GENERIC_OBJECT,
 )
 HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
-GREEN, RED = 1, 2  # lights of an edge, added up where several are listed
 MAX_ROUTE = 5  # segments an agent remembers, nuPlan
 _CURVE_CAPACITY = 256  # vertices of a footprint to begin with
 _EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the path

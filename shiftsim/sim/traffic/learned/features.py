@@ -11,8 +11,7 @@ import numpy as np
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import point_on_polyline, project_on_polyline
-from shiftsim.world.layers import Lists, Polygons, Polylines, containing
-from shiftsim.world.map import VectorMap
+from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, Lanes, choose_lane, next_lane
 from shiftsim.world.state import AgentKind
 
 AHEAD = np.array([3.0, 6.0, 10.0, 15.0, 22.0, 30.0, 40.0, 52.0])  # m along the path
@@ -21,29 +20,14 @@ OWN, LANE, LEADER, OTHER = 9, 5, 5, 7  # numbers for the agent, its lane, who le
 NUM_FEATURES = OWN + LANE + 2 * len(AHEAD) + LEADER + NEIGHBOURS * OTHER
 PATH = OWN + LANE  # first feature of the path
 REACH = 60.0  # m; what is farther away is not seen
-NO_LANE = -1
 _BEHIND = 2.0  # m that the path begins behind the agent
 _MARGIN = 0.3  # m beside the boxes within which somebody ahead is in the way
-_TURN, _ASIDE = 1.0, 3.0  # rad and m from a lane beyond which an agent does not follow it
-_KEPT = 0.4  # rad that another lane must fit better to take the place of the one followed
-_METRE = 0.15  # rad that a metre beside the centre line counts as, when lanes are chosen
-_CANDIDATES = 16  # lanes that may hold a point
 
 VEHICLE, PEDESTRIAN, BICYCLE = (
     int(AgentKind.VEHICLE),
     int(AgentKind.PEDESTRIAN),
     int(AgentKind.BICYCLE),
 )
-
-
-class Lanes(NamedTuple):
-    """What agents read of a map. E edges."""
-
-    polygons: Polygons  # areas of the edges
-    baselines: Polylines  # their centre lines
-    outgoing: Lists  # edges an edge leads to
-    speed_limits: FloatArray  # (E,) [m/s], NaN where the map has none
-    is_red: BoolArray  # (E,) whether a red light is listed for the edge in the present step
 
 
 class Motion(NamedTuple):
@@ -57,74 +41,6 @@ class Motion(NamedTuple):
     velocities: FloatArray  # (N, 2) in the map frame [m/s]
     sizes: FloatArray  # (N, 2) length, width [m]
     kinds: IntArray  # (N,) AgentKind
-
-
-def lanes_of(road: VectorMap) -> Lanes:
-    """What agents read of a map; no light is red yet."""
-    return Lanes(
-        road.edges.polygons,
-        road.baselines,
-        road.outgoing,
-        road.speed_limits,
-        np.zeros(len(road.edges), np.bool_),
-    )
-
-
-@lean_kernel
-def _heading_at(lines: Polylines, line: int, along: float) -> float:
-    """Direction of a line at an arc length [rad]."""
-    start, stop = lines.ptr[line], lines.ptr[line + 1]
-    length = lines.arc[stop - 1]
-    low = min(max(along - 0.5, 0.0), max(length - 1.0, 0.0))
-    ax, ay = point_on_polyline(lines.xy, lines.arc, start, stop, low)
-    bx, by = point_on_polyline(lines.xy, lines.arc, start, stop, low + 1.0)
-    return np.arctan2(by - ay, bx - ax)
-
-
-@lean_kernel
-def _misfit(lines: Polylines, line: int, x: float, y: float, heading: float) -> float:
-    """How badly a lane fits a pose: turn [rad], and metres aside counted as such; inf if not."""
-    start, stop = lines.ptr[line], lines.ptr[line + 1]
-    along = project_on_polyline(lines.xy, lines.arc, start, stop, x, y)
-    px, py = point_on_polyline(lines.xy, lines.arc, start, stop, along)
-    turn = abs(wrap_angle(heading - _heading_at(lines, line, along)))
-    aside = np.hypot(x - px, y - py)
-    if turn > _TURN or aside > _ASIDE:
-        return np.inf
-    return turn + _METRE * aside
-
-
-@lean_kernel
-def choose_lane(
-    lanes: Lanes, x: float, y: float, heading: float, followed: int, found: IntArray
-) -> int:
-    """The edge that a pose fits best, or NO_LANE; the one followed and those behind it first."""
-    best, least = NO_LANE, np.inf
-    count = min(containing(lanes.polygons, x, y, found), len(found))
-    for place in range(count):
-        cost = _misfit(lanes.baselines, found[place], x, y, heading)
-        if followed >= 0 and found[place] != followed:
-            cost += _KEPT
-            for entry in range(lanes.outgoing.ptr[followed], lanes.outgoing.ptr[followed + 1]):
-                if lanes.outgoing.items[entry] == found[place]:
-                    cost -= _KEPT
-        if cost < least:
-            best, least = found[place], cost
-    return best
-
-
-@lean_kernel
-def next_lane(lanes: Lanes, edge: int) -> int:
-    """The edge behind another one that bends least, or NO_LANE."""
-    lines, best, least = lanes.baselines, NO_LANE, np.inf
-    end = _heading_at(lines, edge, lines.arc[lines.ptr[edge + 1] - 1])
-    for entry in range(lanes.outgoing.ptr[edge], lanes.outgoing.ptr[edge + 1]):
-        after = lanes.outgoing.items[entry]
-        length = lines.arc[lines.ptr[after + 1] - 1]
-        bend = abs(wrap_angle(_heading_at(lines, after, length) - end))
-        if bend < least:
-            best, least = after, bend
-    return best
 
 
 @lean_kernel
@@ -180,7 +96,7 @@ def observe_agents(
 
     Absent agents get zeros.
     """
-    path, found = np.zeros((len(AHEAD) + 1, 3)), np.empty(_CANDIDATES, np.int64)
+    path, found = np.zeros((len(AHEAD) + 1, 3)), np.empty(CANDIDATES, np.int64)
     nearest, which = np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.int64)
     for place in range(len(own)):
         agent, row = own[place], out[place]

@@ -11,22 +11,20 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.sim.traffic.following import NO_LANE, Lanes, lanes_of
 from shiftsim.sim.traffic.learned.features import (
-    NO_LANE,
     NUM_FEATURES,
-    Lanes,
     Motion,
-    lanes_of,
     move_agents,
     observe_agents,
 )
 from shiftsim.sim.traffic.learned.network import WEIGHTS, controls, digest, load_weights
+from shiftsim.sim.traffic.lights import RED, light_flags
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
     AgentKind,
-    LightStatus,
     Tracks,
     center_poses,
     center_velocities,
@@ -61,7 +59,8 @@ class LearnedTraffic:
         self._features = np.zeros((len(self.own), NUM_FEATURES))
         self._moved = np.zeros((len(self.own), 4))
         self._spans = np.diff(scenario.iteration_times) * 1e-6
-        self._light_edges, self._red = _red_lights(scenario)
+        self._light_edges, lights = light_flags(scenario)
+        self._red = (lights & RED) != 0
         self._kinds = np.append(tracks.kinds, AgentKind.VEHICLE)
 
     def observe(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> FloatArray:
@@ -121,15 +120,3 @@ class LearnedTraffic:
             sizes=np.concatenate([tracks.sizes[row], _EGO_SIZE[None]]),
             kinds=self._kinds,
         )
-
-
-def _red_lights(scenario: Scenario) -> tuple[IntArray, np.ndarray]:
-    """(L,) edges with a light, and (T, L) whether a red one is listed at each iteration."""
-    lights, index = scenario.traffic_lights, scenario.map.edges.index
-    known = [i for i, name in enumerate(lights.connector_ids) if name in index]
-    named = np.array([index[lights.connector_ids[i]] for i in known], np.int64)
-    edges, place = np.unique(named, return_inverse=True)
-    is_red = lights.status[scenario.iteration_rows][:, known] == LightStatus.RED
-    out = np.zeros((len(edges), len(is_red)), np.bool_)
-    np.logical_or.at(out, place, is_red.T)
-    return edges, np.ascontiguousarray(out.T)
