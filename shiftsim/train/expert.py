@@ -13,9 +13,10 @@ from shiftsim.planners.learned.carl.planner import MAX_ACCELERATION, MAX_BRAKING
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.state import STEERING
+from shiftsim.world.state import STEERING, VX
 
 Action = NDArray[np.float32]
+SLOW, PARTING, HOLD = 0.3, 0.02, -0.3  # m/s; throttle of setting off; throttle of staying
 
 
 def encode(acceleration: float, steering_rate: float, steering: float, tau: float) -> Action:
@@ -27,6 +28,17 @@ def encode(acceleration: float, steering_rate: float, steering: float, tau: floa
     angle = steering + tau * steering_rate
     action = np.array([acceleration / most, angle / MAX_STEERING])
     return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+def hold(action: Action, speed: float) -> Action:
+    """The action, which brakes where a vehicle at `speed` [m/s] is to stand or come to a stand.
+
+    Braking at a stand changes nothing, as nobody drives backwards. But a network that is taught
+    a throttle of 0 there errs to either side, and creeps into what it waits for.
+    """
+    if speed < SLOW and action[0] < PARTING:
+        action[0] = min(float(action[0]), HOLD)
+    return action
 
 
 class Expert:
@@ -44,4 +56,5 @@ class Expert:
         now = observation.time_us
         status, acceleration, rate = track(now, ego, plan.time_us, plan.states, NUPLAN)
         raise_for_status(status, now, plan.time_us)
-        return encode(acceleration, rate, float(ego[STEERING]), self._tau)
+        action = encode(acceleration, rate, float(ego[STEERING]), self._tau)
+        return hold(action, float(ego[VX]))

@@ -11,7 +11,7 @@ from shiftsim.planners.learned.carl.planner import MAX_STEERING, command_of, mea
 from shiftsim.sim.loop import Setting, simulate
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.train import network as fast
-from shiftsim.train.expert import Expert, encode
+from shiftsim.train.expert import Expert, encode, hold
 from shiftsim.train.learning import (
     BATCH,
     LATE,
@@ -48,6 +48,15 @@ def test_with_a_tau_of_one_step_a_label_is_the_command_of_the_tracker():
     found = command_of(encode(-0.7, 0.11, ego[7], 0.1), ego)
     assert found.acceleration == pytest.approx(-0.7, rel=1e-5)
     assert found.steering_rate == pytest.approx(0.11, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("throttle", "speed", "held"),
+    [(0.0, 0.0, -0.3), (-0.1, 0.2, -0.3), (-0.8, 0.1, -0.8), (0.2, 0.0, 0.2), (-0.1, 0.4, -0.1)],
+)
+def test_who_is_to_stand_is_taught_to_brake(throttle, speed, held):
+    action = np.array([throttle, 0.1], np.float32)
+    np.testing.assert_allclose(hold(action, speed), [held, 0.1], rtol=1e-6)
 
 
 def test_the_expert_does_what_pdm_closed_and_the_tracker_do():
