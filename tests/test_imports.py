@@ -26,6 +26,7 @@ NEIGHBOURS = {
     "metrics": ("sim.log",),
     "view": ("report.palette", "report.words"),
     "train": ("env", "report.palette"),
+    "verify": ("compat.nuplan",),  # what nuPlan's own map answered is compared with what it says
 }
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
 MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/")

@@ -11,14 +11,12 @@ from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.files import TOLERANCE, Source, read_fields, verify_files
+from shiftsim.verify.files import COMPARED, TOLERANCE, Source, read_fields, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
 from shiftsim.world.map import VectorMap
 
-SCORE_TOLERANCES = dict.fromkeys(  # the other scores are 0 or 1
-    ("ego_progress_along_expert_route", "speed_limit_compliance", "score"), TOLERANCE
-)
+SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
 _PROGRESS = (
     "expert_total_progress_along_route",
     "ego_total_progress_along_route",
