@@ -17,7 +17,7 @@ LAYERS = (
     {"sim", "metrics", "data", "planners"},
     {"runs"},
     {"report", "view", "verify", "env", "train", "compat"},
-    {"api", "cli", "benchmarks", "__main__", "__init__"},
+    {"api", "cli", "benchmarks", "warmup", "__main__", "__init__"},
 )
 LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
 # what may be used of a neighbour in the same layer
