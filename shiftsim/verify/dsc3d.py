@@ -1,12 +1,12 @@
 """Compares DSC3D conversion with known answers: a real sample, and scripted recordings."""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -24,7 +24,6 @@ from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
 from shiftsim.verify.files import (
-    COMPARED,
     Source,
     open_tables,
     read_fields,
@@ -32,13 +31,14 @@ from shiftsim.verify.files import (
     verify_files,
 )
 from shiftsim.verify.report import Report
+from shiftsim.verify.tables import read_tables
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import center_poses
 
 _POSITION = 2e-2  # m: README of the scripted recordings
 _STEP_S, _ROUNDING = 0.05, 1e-9  # s, steps
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
-_FACTS: dict[str, float] = COMPARED["expected.json"]["atol"]
+FACTS = read_tables(__file__)
 _DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
 
 
@@ -91,14 +91,6 @@ class LocalMap:
         return [lanes[first : last + 1] for first, last in ends]
 
 
-class Sample(NamedTuple):
-    """The recording of the sample."""
-
-    site: Site
-    recording: Annotations
-    keys: list[list[LaneKey]]  # OpenDRIVE lanes at every row
-
-
 def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     """Compare reading and resampling with `expected*` files beside the folder `data`."""
     site = open_site(folder / "data")
@@ -106,69 +98,56 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
         report.skip("recordings beyond the first", len(site.recordings) - 1)
     recording, local = read_recording(site, site.recordings[0]), LocalMap(find_map(site))
     keys = [local.keys_at(x, y) for x, y in recording.bottom[:, :2].tolist()]
-    sample = Sample(site, recording, keys)
-    tables = {"expected_rows.parquet": _rows, "expected_20hz.parquet": _samples}
 
-    def table(path: Path) -> None:
-        expected = read_table(path, report)
-        ours, atol = tables[path.name](sample), COMPARED[path.name]["atol"]
-        expected.match("recording", ours, atol, angles={"yaw"})
-        expected.finish()
+    def rows(path: Path) -> None:
+        theirs = read_table(path, report)
+        theirs = theirs.at(np.lexsort((theirs["frame_id"], theirs["track_id"])))
+        FACTS["rows"].match(theirs, "recording", **_rows(site, recording, keys))
+        theirs.finish()
+
+    def samples(path: Path) -> None:
+        theirs = read_table(path, report)
+        FACTS["samples"].match(theirs, "recording", **_samples(recording))
+        theirs.finish()
 
     parts: dict[str, Callable[[Path], object]] = {
         "data": lambda path: report.note(_DERIVED),
-        "expected.json": lambda path: _verify_summary(read_fields(path, report), sample),
-        **dict.fromkeys(tables, table),
+        "expected_rows.parquet": rows,
+        "expected_20hz.parquet": samples,
+        "expected.json": lambda p: _verify_summary(read_fields(p, report), site, recording, keys),
     }
     verify_files(folder, report, parts)
 
 
-def _rows(sample: Sample) -> dict[str, Any]:
-    """All boxes as recorded, by frame and track."""
-    site, recording, keys = sample
-    order = np.lexsort((recording.track, recording.frame))
+def _rows(site: Site, recording: Annotations, keys: list[list[LaneKey]]) -> dict[str, Any]:
+    """All boxes as recorded, by track and frame."""
     utm = recording.bottom[:, :2] + site.offset[:2]
-    to_degrees = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True)
     lanes = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
-    ours = {
-        "frame_id": recording.frame * site.frame_distance,
-        "track_id": recording.track_ids[recording.track],
-        "road": [key.road for key in lanes],
-        "lane": [key.lane for key in lanes],
-        **_named("yaw pitch roll", recording.angles),
-        **_named("centre_x centre_y centre_z", recording.centers),
-        **_named("utm_x utm_y", utm),
-        **_named("lon lat", np.column_stack(to_degrees.transform(*utm.T))),
-    }
-    return {name: np.asarray(values)[order] for name, values in ours.items()}
-
-
-def _samples(sample: Sample) -> dict[str, Any]:
-    """The bottoms of all boxes at 20 Hz, by track and time."""
-    recording = replace(sample.recording, centers=sample.recording.bottom)
-    runs = find_runs(recording, ConversionConfig().max_hole_s)
-    ends = recording.time[runs.first] / _STEP_S, recording.time[runs.last] / _STEP_S
-    steps = [
-        np.arange(np.ceil(first - _ROUNDING), np.floor(last + _ROUNDING) + 1)
-        for first, last in zip(*ends, strict=True)
-    ]
-    run, step = np.repeat(np.arange(len(steps)), [*map(len, steps)]), np.concatenate(steps)
-    samples = sample_runs(recording, runs, run, step * _STEP_S)
     return {
-        "track_id": recording.track_ids[runs.track[run]],
-        "step": step.astype(np.int64),
-        "t": step * _STEP_S,
-        **_named("x y yaw", samples.poses),
-        **_named("vx vy", samples.velocities),
+        **{"recording": recording, "utm": utm, "lanes": [key.lane for key in lanes]},
+        "frames": recording.frame * site.frame_distance,
+        "ids": recording.track_ids[recording.track],
+        "roads": [key.road for key in lanes],
+        "degrees": pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T),
     }
 
 
-def _named(names: str, columns: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip(names.split(), columns.T, strict=True))
+def _samples(recording: Annotations) -> dict[str, Any]:
+    """The bottoms of all boxes at 20 Hz, by track and time."""
+    recording = replace(recording, centers=recording.bottom)
+    runs = find_runs(recording, ConversionConfig().max_hole_s)
+    first = np.ceil(recording.time[runs.first] / _STEP_S - _ROUNDING)
+    last = np.floor(recording.time[runs.last] / _STEP_S + _ROUNDING)
+    steps = [np.arange(*span) for span in zip(first, last + 1, strict=True)]
+    run, step = np.repeat(np.arange(len(steps)), [*map(len, steps)]), np.concatenate(steps)
+    ids, time = recording.track_ids[runs.track[run]], step * _STEP_S
+    samples = sample_runs(recording, runs, run, time)
+    return {"ids": ids, "steps": step.astype(np.int64), "time": time, "samples": samples}
 
 
-def _verify_summary(expected: Source, sample: Sample) -> None:
-    site, recording, keys = sample
+def _verify_summary(
+    expected: Source, site: Site, recording: Annotations, keys: list[list[LaneKey]]
+) -> None:
     report, folder = expected.report, site.folder / "annotations" / recording.name
     raw = read_table(folder / "annotations.parquet", report)
     order = np.lexsort((raw["frame_id"], raw["track_id"]))
@@ -176,41 +155,38 @@ def _verify_summary(expected: Source, sample: Sample) -> None:
     stamps = read_table(folder / "frames.parquet", report)["time"].astype("datetime64[us]")
     lag = (stamps - stamps[0]).astype(np.int64) * 1e-6 - recording.clock
     yaw, moving = recording.angles[:, 0], np.arctan2(velocity[:, 1], velocity[:, 0])
-    first, last = (str(stamps[i]).replace("T", " ") + "+00:00" for i in (0, -1))
-    ours = {
-        "rows": len(recording.track),
-        "frames": len(recording.clock),
-        "dt_s": recording.period,
-        "rate_hz": 1.0 / recording.period,
-        "duration_s": recording.duration,
-        "first_time": first,
-        "last_time": last,
-        "max_abs_time_minus_frameid_over_rate_s": np.abs(lag).max(),
-        "max_yaw_minus_velocity_heading_rad": np.abs(wrap_angles(yaw - moving)).max(),
-        "max_yaw_minus_rotation_z_rad": np.abs(yaw - raw["rotation_z"][order]).max(),
-        "boxes_in_exactly_one_driving_lane": sum(len(key) == 1 for key in keys),
-        "steps_20hz": int(np.floor(recording.duration / _STEP_S + _ROUNDING)) + 1,
+    facts = {
+        "recording": recording,
+        "rate": 1.0 / recording.period,
+        **{n: str(stamps[i]).replace("T", " ") for n, i in {"first": 0, "last": -1}.items()},
+        "lag": np.abs(lag).max(),
+        "to_velocity": np.abs(wrap_angles(yaw - moving)).max(),
+        "to_rotation": np.abs(yaw - raw["rotation_z"][order]).max(),
+        "alone": [key for key in keys if len(key) == 1],
+        "steps": int(np.floor(recording.duration / _STEP_S + _ROUNDING)) + 1,
     }
-    expected.match("recording", ours, _FACTS, quantity="summary")
-    speed = np.linalg.norm(velocity, axis=1)
-    tracks, names = expected.each("tracks")[0], recording.track_ids.astype(str).tolist()
-    report.compare("tracks", expected.name, names, sorted(tracks, key=int))
-    for number, name in enumerate(names):
+    FACTS["summary"].match(expected, "recording", **facts)
+    for number, where, track in _tracks(expected, recording):
         rows = np.flatnonzero(recording.track == number)
-        path = np.diff(recording.bottom[rows, :2], axis=0)
         lanes = {(key.road, key.lane) for row in rows for key in keys[row]}
-        ours = {
+        track.values["road_lane"].sort()
+        facts = {
             "category": recording.categories[number],
-            "rows": len(rows),
-            **_named("length width height", recording.sizes[number]),
-            "speed_min": speed[rows].min(),
-            "speed_max": speed[rows].max(),
-            "path_length_xy": np.linalg.norm(path, axis=1).sum(),
-            "road_lane": [[*lane] for lane in lanes],
+            "size": recording.sizes[number],
+            "speed": sorted(np.linalg.norm(velocity[rows], axis=1)),
+            "way": np.hypot(*np.diff(recording.bottom[rows, :2], axis=0).T).sum(),
+            "lanes": [list(lane) for lane in sorted(lanes)],
         }
-        track, where = tracks.each(name)[0], f"track {name}"
-        track.match(where, ours, _FACTS, quantity="track", unordered={"road_lane"})
+        FACTS["track"].match(track, where, **facts)
     expected.finish()
+
+
+def _tracks(expected: Source, recording: Annotations) -> Iterator[tuple[int, str, Source]]:
+    """Number, name and answers of every track; compares which there are."""
+    tracks, ids = expected.each("tracks")[0], recording.track_ids.tolist()
+    expected.report.compare("track ids", recording.name, ids, sorted(map(int, tracks)))
+    for number, track in enumerate(ids):
+        yield number, f"{recording.name} track {track}", tracks.each(str(track))[0]
 
 
 def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> None:
@@ -236,33 +212,33 @@ def _verify_scripted(expected: Source, folder: Path, maps: Path | None) -> None:
     report, name, config = expected.report, folder.name, ConversionConfig()
     site = open_site(folder / "data")
     recording = read_recording(site, site.recordings[0])
-    rate, rows = 1.0 / recording.period, len(recording.track)
-    facts = {"rate_hz": rate, "duration_s": recording.duration, "rows": rows}
-    expected.match(name, facts, _FACTS, quantity="recording")
-    tracks, ids = expected.each("tracks")[0], recording.track_ids.tolist()
-    report.compare("track ids", name, ids, sorted(map(int, tracks)))
-    for number, track in enumerate(ids):
-        own = {"category": recording.categories[number], "dim": recording.sizes[number]}
-        tracks.each(str(track))[0].match(f"{name} track {track}", own, _FACTS, quantity="track")
+    FACTS["recording"].match(expected, name, recording=recording, rate=1.0 / recording.period)
+    for number, where, track in _tracks(expected, recording):
+        own: dict[str, Any] = {
+            "category": recording.categories[number],
+            "size": recording.sizes[number],
+        }
+        FACTS["scripted"].match(track, where, **own)
     windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
     wanted, lanes = expected.each("windows"), dict[tuple[str, str], Any]()
+    ids = recording.track_ids.tolist()
     report.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):
-        judged = zip(window.tracks.tolist(), window.verdicts, window.partners, strict=True)
+        where, given = f"{name} window {window.span.start_s:g} s", theirs["verdict"]
         verdicts = {
-            str(ids[track]): verdict if partner < 0 else f"{verdict} with {ids[partner]}"
-            for track, verdict, partner in judged
+            str(ids[number]): verdict if partner < 0 else f"{verdict} with {ids[partner]}"
+            for number, verdict, partner in zip(
+                window.tracks, window.verdicts, window.partners, strict=True
+            )
         }
-        egos = [int(track) for track, verdict in verdicts.items() if verdict == EGO]
-        start, where = window.span.start_s, f"{name} window {window.span.start_s:g} s"
-        own = {"start_s": start, "egos": egos}
-        theirs.match(where, own, _FACTS, quantity="window", unordered={"egos"})
-        given = theirs["verdict"]
+        own = {"start_s": window.span.start_s}
+        own["egos"] = [int(name) for name, verdict in verdicts.items() if verdict == EGO]
+        theirs.match(where, own, quantity="window", unordered={"egos"})
         report.compare("tracks seen", where, sorted(verdicts), sorted(given))
-        for track in sorted(set(verdicts) & set(given)):
-            report.compare("verdict", f"{where} track {track}", verdicts[track], given[track])
+        for seen in sorted(set(verdicts) & set(given)):
+            report.compare("verdict", f"{where} track {seen}", verdicts[seen], given[seen])
         begin = f"{theirs['start_s']:.1f}"
-        lanes |= {(begin, track): way for track, way in theirs["lanes_from_t0"].items()}
+        lanes |= {(begin, ego): way for ego, way in theirs["lanes_from_t0"].items()}
     expected.used.add("note")
     places = [maps / expected["map"]] if maps is not None else []
     places += [folder / "data/map/map.xodr"]

@@ -14,13 +14,14 @@ from shiftsim.verify.files import COMPARED, Source, open_tables, read_json
 from shiftsim.verify.nuplan.maps import verify_maps
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import ego_columns, object_columns
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LightStatus
 
 LOG_TOLERANCES: dict[str, float] = COMPARED["log_ego.parquet"]["atol"]
-_LISTED, _META = (COMPARED[name]["atol"] for name in ("scenes.json", "scenario_meta.json"))
-POSE = _LISTED["mission_goal"]
+POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
+FACTS = read_tables(__file__)
 # What log_ego also holds: samples asked for, horizon in rows, direction, from which iteration
 _EXCERPTS = {
     "past_2s": (20, 40, -1, 0),
@@ -45,8 +46,9 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
         name = entry["scene"]
         with report.attempt("importer", name), open_log(folder / entry["db"]) as log:
             scene = scenes[name]
-            entry.match(name, _listed_facts(scene, log), _LISTED)
-            meta.each(name)[0].match(name, _scenario_facts(scene, log), _META, quantity="meta")
+            names = _facts(scene, log)
+            FACTS["listed"].match(entry, name, **names)
+            FACTS["meta"].match(meta.each(name)[0], name, **names)
             offered = bool(log.is_offered[log.row_of[entry["token"]]])
             report.compare("scenes.json offered by the log", name, offered, True)
             drawn = sorted(planner[9:] for of, planner in scripts if of == name)  # scripted_…
@@ -81,26 +83,8 @@ def name_rest(folder: Path, read: set[Path], report: Report) -> None:
     report.note("README.md (for reading)")
 
 
-def _listed_facts(scene: Scenario, log: Log) -> dict[str, Any]:
-    """An entry of `scenes.json`."""
-    return {
-        "scene": scene.log_name,
-        "db": f"logs/{scene.log_name}.db",
-        "map": log.map_name,
-        "token": scene.token,
-        "scenario_type": scene.scenario_type,
-        "t0_us": int(scene.iteration_times[0]),
-        "route_roadblock_ids": list(scene.route),
-        "mission_goal": scene.mission_goal,
-        "n_lidar_pc": len(log.time_us),
-        "n_tracks": log.database.query("SELECT COUNT(*) FROM track", "table 'track'")[0][0],
-        "time_jitter": bool((np.diff(log.time_us) != 50_000).any()),
-        "epsg": scene.map.epsg,
-    }
-
-
-def _scenario_facts(scene: Scenario, log: Log) -> dict[str, Any]:
-    """An entry of `scenario_meta.json`."""
+def _facts(scene: Scenario, log: Log) -> dict[str, Any]:
+    """What `logs.toml` speaks of."""
     times, begin = scene.iteration_times, log.row_of[scene.token]
     # nuPlan rule 602: both stamps become seconds first, the difference is cut to microseconds
     duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
@@ -109,18 +93,12 @@ def _scenario_facts(scene: Scenario, log: Log) -> dict[str, Any]:
     driven = read_ego(log, begin, len(log.time_us))
     driven = driven[excerpt_rows(log.time_us, int(times[0]), *samples) - begin]
     return {
-        "log_name": scene.log_name,
-        "token": scene.token,
-        "iterations": scene.num_iterations,
-        "route_roadblock_ids": list(scene.route),
-        "route_from_expert": [
-            scene.map.blocks.ids[block] for block in follow_blocks(scene.map, driven[:, :2])
-        ],
-        "mission_goal": scene.mission_goal,
-        "expert_goal_state": scene.expert[-1, :3],
-        "database_interval": 0.05 / scene.mapping[2],
-        "duration_s": int(duration * 1e6) / 1e6,
-        "time_us": times,
+        **{"scene": scene, "log": log, "road": scene.map, "times": times},
+        "num_tracks": log.database.query("SELECT COUNT(*) FROM track", "table 'track'")[0][0],
+        "jitter": bool((np.diff(log.time_us) != 50_000).any()),
+        "driven": follow_blocks(scene.map, driven[:, :2]),
+        "interval": _ROW / scene.mapping[2],
+        "duration": int(duration * 1e6) / 1e6,
     }
 
 
