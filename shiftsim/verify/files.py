@@ -131,30 +131,6 @@ class Source:
             agree &= self.report.compare(label, where, *sides, atol=bound, angle=angle)
         return agree
 
-    def match_tree(
-        self,
-        where: str,
-        ours: Mapping[str, Any],
-        atol: Tolerances = EXACT,
-        *,
-        quantity: str | None = None,
-        **options: Collection[str],
-    ) -> None:
-        """`match`, also within the objects and the lists of objects of a `.json`."""
-        prefix, plain = self.name if quantity is None else quantity, dict[str, Any]()
-        for name, value in ours.items():
-            items = value if isinstance(value, list) else [value]
-            if name not in self or not items or not isinstance(items[0], dict):
-                plain[name] = value
-                continue
-            label, parts = f"{prefix} {name}".strip(), self.each(name)
-            if items is value:
-                self.report.compare(f"number of {label}", where, len(items), len(parts))
-            for number, (item, part) in enumerate(zip(items, parts, strict=False)):
-                at = f"{where} {name} {number}" if items is value else where
-                part.match_tree(at, item, atol, quantity=label, **options)
-        self.match(where, plain, atol, quantity=quantity, **options)
-
     def match_rows(
         self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
     ) -> None:

@@ -14,7 +14,6 @@ from shiftsim.verify.files import COMPARED, fields_of, read_fields
 from shiftsim.verify.nuplan.logs import excerpt_rows, name_rest
 from shiftsim.verify.nuplan.maps import layer, nuplan_map, point
 from shiftsim.verify.report import Report
-from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, LightStatus, center_poses, speeds
 
@@ -45,42 +44,6 @@ def verify_nuplan_format(folder: Path, report: Report) -> None:
         start, map_name = int(log.time_us[0]), log.map_name
     road = load_map(find_maps(folder / "maps"), map_name)
     origin = np.array(_ORIGINS[road.epsg])
-    ours = {
-        "scenarios_all": len(list_scenarios(logs[0])),
-        "tagged": tagged,
-        "scenarios_by_type": len(list_scenarios(logs[0], types=frozenset([_TYPE]))),
-        **_scene_fields(read_scenario(logs[0], tagged[0][1], road, _MAPPING), start, origin),
-        **_map_fields(road, origin),
-    }
-    expected.match_tree(path.name, ours, _TOLERANCES, unordered=_UNORDERED)
-    expected.finish()
-    name_rest(folder, {*logs, path}, report)
-
-
-def _scene_fields(scene: Scenario, start: int, origin: FloatArray) -> dict[str, Any]:
-    row, moved = int(scene.iteration_rows[0]), np.append(origin, 0.0)
-    state, now = scene.ego[row], int(scene.time_us[row])
-    kinds = scene.tracks.kinds[scene.tracks.valid[row]]
-    lights = scene.traffic_lights.listed(row)
-    return {
-        "iterations": scene.num_iterations,
-        "interval": 0.05 / scene.mapping[2],
-        "ego_t0": {
-            "rear": state[:3] - moved,
-            "center": (center_poses(state[None, :3])[0] - moved)[:2],
-            "speed": float(speeds(state[None])[0]),
-            "t": now - start,
-        },
-        "goal": None if scene.mission_goal is None else scene.mission_goal - moved,
-        "route": list(scene.route),
-        "past2s": len(excerpt_rows(scene.time_us, now, 20, 40, -1)),
-        "future8s": len(excerpt_rows(scene.time_us, now, 80, 160, 1)),
-        "objects": [AgentKind(kind).name for kind in kinds.tolist()],
-        "lights": [[int(name), LightStatus(status).name] for name, status in lights],
-    }
-
-
-def _map_fields(road: VectorMap, origin: FloatArray) -> dict[str, Any]:
     world, place = nuplan_map(road), point(*(origin + _POINT))
     lanes = world.get_all_map_objects(place, layer("LANE"))
     things = {
@@ -89,10 +52,48 @@ def _map_fields(road: VectorMap, origin: FloatArray) -> dict[str, Any]:
         "roadblock": lanes[0].parent,
     }
     near = world.get_proximal_map_objects(place, _NEAR, world.get_available_map_objects())
-    area = layer("DRIVABLE_AREA")
-    return {
+    area, scene = layer("DRIVABLE_AREA"), read_scenario(logs[0], tagged[0][1], road, _MAPPING)
+    ours = {
+        "scenarios_all": len(list_scenarios(logs[0])),
+        "tagged": tagged,
+        "scenarios_by_type": len(list_scenarios(logs[0], types=frozenset([_TYPE]))),
         "lanes_at_point": [lane.id for lane in lanes],
-        **{name: fields_of(thing, COMPARED["readback"][name]) for name, thing in things.items()},
-        "proximal": {kind.name: len(found) for kind, found in near.items()},
         "in_drivable": [world.is_in_layer(point(*(origin + at)), area) for at in _DRIVABLE],
+        **_scene_fields(scene, origin),
+    }
+    parts = {name: fields_of(thing, COMPARED["readback"][name]) for name, thing in things.items()}
+    parts["proximal"] = {kind.name: len(found) for kind, found in near.items()}
+    parts["ego_t0"] = _ego_fields(scene, start, origin)
+    for name, part in parts.items():
+        theirs, label = expected.each(name)[0], f"readback {name}"
+        theirs.match(path.name, part, _TOLERANCES, quantity=label, unordered=_UNORDERED)
+    expected.match(path.name, ours, _TOLERANCES, unordered=_UNORDERED)
+    expected.finish()
+    name_rest(folder, {*logs, path}, report)
+
+
+def _ego_fields(scene: Scenario, start: int, origin: FloatArray) -> dict[str, Any]:
+    row = int(scene.iteration_rows[0])
+    state = scene.ego[row]
+    return {
+        "rear": state[:3] - np.append(origin, 0.0),
+        "center": center_poses(state[None, :3])[0, :2] - origin,
+        "speed": float(speeds(state)),
+        "t": int(scene.time_us[row]) - start,
+    }
+
+
+def _scene_fields(scene: Scenario, origin: FloatArray) -> dict[str, Any]:
+    row, now = int(scene.iteration_rows[0]), int(scene.iteration_times[0])
+    kinds, goal = scene.tracks.kinds[scene.tracks.valid[row]], scene.mission_goal
+    lights = scene.traffic_lights.listed(row)
+    return {
+        "iterations": scene.num_iterations,
+        "interval": 0.05 / scene.mapping[2],
+        "goal": None if goal is None else goal - np.append(origin, 0.0),
+        "route": list(scene.route),
+        "past2s": len(excerpt_rows(scene.time_us, now, 20, 40, -1)),
+        "future8s": len(excerpt_rows(scene.time_us, now, 80, 160, 1)),
+        "objects": [AgentKind(kind).name for kind in kinds.tolist()],
+        "lights": [[int(name), LightStatus(status).name] for name, status in lights],
     }
