@@ -1,6 +1,6 @@
 """What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -98,18 +98,16 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
     """
     blocks = world["roadblocks"] if "roadblocks" in world else {}
+
     road = build_map(
         "world",
         edges=[
             EdgeSpec(
-                id=edge["id"],
                 is_connector=_is_connector(edge["kind"], "lane", "connector"),
                 polygon=shapely.Polygon(edge["polygon"]),
                 baseline=np.array(edge["baseline"], np.float64),
                 block_id=edge["roadblock"] if blocks else "",
-                outgoing=edge["outgoing"],
-                speed_limit=edge["speed_limit"],
-                **{name: edge[name] for name in fields},
+                **{name: edge[name] for name in ("id", "outgoing", "speed_limit", *fields)},
             )
             for edge in world.each("edges")
         ],
@@ -121,9 +119,9 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
             )
             for name, block in blocks.items()
         ],
-        intersections=_areas(dict(enumerate(world["intersections"]))),
-        drivable_areas=_areas(dict(enumerate(world["drivable_area"]))) if blocks else (),
-        stop_polygons=_areas(stop_lines or {}),
+        intersections=_areas(enumerate(world["intersections"])),
+        drivable_areas=_areas(enumerate(world["drivable_area"])) if blocks else (),
+        stop_polygons=_areas((stop_lines or {}).items()),
     )
     # an edge of a map without blocks is in none
     lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
@@ -138,8 +136,8 @@ def _is_connector(kind: str, plain: str, connector: str) -> bool:
     return kind == connector
 
 
-def _areas(rings: Mapping[Any, Any]) -> list[AreaSpec]:
-    return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings.items()]
+def _areas(rings: Iterable[tuple[object, Any]]) -> list[AreaSpec]:
+    return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings]
 
 
 def make_scenario(

@@ -20,24 +20,8 @@ from shiftsim.world.state import AgentKind, Tracks
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 RECORDED = COMPARED["ego.parquet"]["recorded"]
 # how the devkit files each metric, and the units of scores that have one
-CATEGORIES, UNITS = (
-    {
-        metric: name
-        for name, metrics in COMPARED["metrics.parquet"][what].items()
-        for metric in metrics
-    }
-    for what in ("category", "unit")
-)
-_TABLES = (
-    "ego",
-    "objects",
-    "route",
-    "collisions",
-    "scores",
-    "metrics",
-    "statistics",
-    "time_series",
-)
+CATEGORIES, UNITS = (COMPARED["metrics.parquet"][what] for what in ("category", "unit"))
+_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 _CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
 
 
@@ -54,7 +38,7 @@ def verify_nuplan_metrics(
     `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
     tables = open_tables(expected, report, *_TABLES)
-    logs = open_tables(logged, report, "objects") if logged else tables
+    replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
     experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
     tables["objects"].table.note("no metric reads it", "height")
     for run in tables["ego"]:
@@ -63,10 +47,8 @@ def verify_nuplan_metrics(
             continue
         with report.attempt("recorded rollout", " ".join(run)):
             entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
-            objects = (
-                tables["objects"][run] if challenge == "R" else logs["objects"][scene, "NR", "*"]
-            )
-            log = _rollout(tables["ego"][run], experts[scene, "iteration"], objects, road)
+            seen = (tables["objects"], run) if challenge == "R" else (replayed, (scene, "NR", "*"))
+            log = _rollout(tables["ego"][run], experts[scene, "iteration"], seen[0][seen[1]], road)
             times = log.expert_time_us[: len(log.ego)]
             columns = {"iteration": np.arange(len(times)), "time_us": times}
             columns |= {name: worlds.ego_columns(log.ego)[name] for name in RECORDED}
