@@ -41,8 +41,8 @@ def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> 
         if path.suffix == ".parquet":
             file = read_table(path, report)
         else:
-            content = read_json(path)
-            content = {"rows": content} if isinstance(content, list) else content
+            content = read_json(path)  # crosswalks are a list
+            content = content if isinstance(content, dict) else {"rows": content}
             file = Source(path.stem, "field", content, report)
         compare(read(by_name[name]), file, by_name[name])
         if path.suffix == ".json" or file.num_rows:
@@ -144,14 +144,17 @@ def _verify_summary(od: OpenDrive, file: Source, path: Path) -> None:
         atol = gap if key.startswith(("max_", "parampoly3_")) else length
         file.match(f"{path.stem} {key}", {key: value}, atol, quantity="summary")
     # of the largest gap; where many gaps are rounding noise, one as large as ours
-    place, largest = file["max_geometry_gap_at"], file["max_geometry_gap_m"]
-    gaps, where = np.zeros(1), f"{path.stem} max_geometry_gap_at"
+    place, gaps, where = (
+        file["max_geometry_gap_at"],
+        np.zeros(1),
+        f"{path.stem} max_geometry_gap_at",
+    )
     if place is not None:
         geometries = od.roads[place[0]].geometries
         distance = np.abs([geometry.s - place[1] for geometry in geometries[1:]])
         file.report.compare("place of the largest gap", where, distance.min(), 0.0, atol=1e-9)
         gaps = ReferenceLine(geometries).joints()[0][[distance.argmin()]]
-    file.report.compare("largest gap", where, gaps[0], largest, atol=EXACT)
+    file.report.compare("largest gap", where, gaps[0], file["max_geometry_gap_m"], atol=EXACT)
 
 
 def summarize(od: OpenDrive, path: Path) -> dict[str, Any]:
@@ -212,15 +215,13 @@ def _verify_crosscheck(report: Report, path: Path) -> None:
     """Row counts of the reference's own comparison; its errors are those of another reader."""
     report.note(f"errors of libOpenDRIVE in {path.name}")
     for name, entry in read_json(path).items():
-        lines, lanes, summary = (
-            path.with_name(f"{name}.{kind}")
-            for kind in ("refline.parquet", "lanes.parquet", "summary.json")
-        )
-        status = "compared" if lines.is_file() else "no golden"
+        tables = [path.with_name(f"{name}.{kind}.parquet") for kind in ("refline", "lanes")]
+        status = "compared" if tables[0].is_file() else "no golden"
         report.compare("status", name, status, entry["status"])
-        for table, count in zip((lines, lanes), entry.get("rows", ()), strict=False):
+        for table, count in zip(tables, entry.get("rows", ()), strict=False):
             rows = read_table(table, report).num_rows if table.is_file() else None
             report.compare("rows of the reference", name, rows, count)
+        summary = path.with_name(f"{name}.summary.json")
         if "roads_junctions" in entry and summary.is_file():
             values = read_json(summary)
             ours = [values["roads"], values["junctions"]]

@@ -24,12 +24,10 @@ _NEARBY = (*_EDGES, "STOP_LINE")  # lie there
 
 def verify_maps(expected: Path, maps: dict[str, VectorMap], report: Report) -> None:
     """Compare map_objects, map_lines and map_queries with maps by name."""
-    for (name, table), compare in zip(
-        open_tables(expected, report, *_TABLES).items(), _TABLES.values(), strict=True
-    ):
+    for name, table in open_tables(expected, report, *_TABLES).items():
         for city, road in maps.items() if len(table) else ():
             with report.attempt(name, city):
-                compare(nuplan_map(road), city, table)
+                _TABLES[name](nuplan_map(road), city, table)
         table.finish()
 
 
@@ -62,10 +60,9 @@ def _compare_objects(road: Any, city: str, objects: Groups) -> None:
         rows = rows.at(np.argsort(rows["id"].astype(str), kind="stable"))
         if not rows.match(where, {"id": sorted(thing.id for thing in found)}):
             continue
-        details = zip(rows["polygon_wkb"], rows["attributes"], strict=True)
-        for thing, (polygon, attributes) in zip(
-            sorted(found, key=lambda thing: str(thing.id)), details, strict=True
-        ):
+        found.sort(key=lambda thing: thing.id)
+        details = zip(found, rows["polygon_wkb"], rows["attributes"], strict=True)
+        for thing, polygon, attributes in details:
             theirs = json.loads(attributes) | _outline(shapely.from_wkb(polygon))
             given = Source("map_objects", "attribute", theirs, objects.table.report)
             ours = fields_of(thing, fields) | _outline(thing.polygon)
