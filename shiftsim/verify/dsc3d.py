@@ -10,16 +10,14 @@ from typing import Any
 
 import numpy as np
 import pyproj
-import shapely
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.recording import Converted, convert_recording
 from shiftsim.data.deepplan.states import sample_runs
 from shiftsim.data.deepplan.windows import EGO, ConversionConfig, find_runs, judge_windows
 from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site, read_recording
-from shiftsim.data.opendrive.curves import ReferenceLine
-from shiftsim.data.opendrive.lanes import LaneKey, section_borders
-from shiftsim.data.opendrive.map import build_road_map
+from shiftsim.data.opendrive.lanes import LaneKey
+from shiftsim.data.opendrive.map import Origin, build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
@@ -49,19 +47,10 @@ class LocalMap:
         """Read and convert a map file."""
         self._drive = read_opendrive(path)
         self._map, made = build_road_map(self._drive, name=path.stem)
-        self._pieces: dict[int, list[tuple[LaneKey, shapely.Polygon]]] = defaultdict(list)
+        self._pieces: dict[int, list[Origin]] = defaultdict(list)  # in the direction of travel
         for origin in made.origins:
             if (lane := self._map.edges.index.get(origin.id)) is not None:
-                area = self._area(origin.key, *sorted((origin.begin, origin.end)))
-                self._pieces[lane].append((origin.key, area))
-
-    def _area(self, key: LaneKey, low: float, high: float) -> shapely.Polygon:
-        road = self._drive.roads[key.road]
-        s = np.linspace(low, high, max(2, round((high - low) / 0.5) + 1))
-        borders = section_borders(road, key.section, s, repair=True)
-        poses = ReferenceLine(road.geometries).evaluate(s)
-        inner, outer = (poses.offset(side[key.lane]) for side in (borders.inner, borders.outer))
-        return shapely.Polygon(np.concatenate([inner, outer[::-1]]))
+                self._pieces[lane].append(origin)
 
     def placed(self, site: Site) -> VectorMap:
         """The same map in UTM."""
@@ -70,19 +59,21 @@ class LocalMap:
 
     def keys_at(self, x: float, y: float) -> list[LaneKey]:
         """OpenDRIVE lanes behind the lanes of ours that hold a point."""
-        return self._behind(self._map.edges.containing(x, y).tolist(), x, y)
+        lanes = self._map.edges.containing(x, y).tolist()
+        return [self._key(lane, x, y) for lane in lanes if lane in self._pieces]
 
-    def _behind(self, lanes: list[int], x: float, y: float) -> list[LaneKey]:
-        """Of every lane of ours the piece that is nearest to a point."""
-        point = shapely.Point(x, y)
-        pieces = [self._pieces[lane] for lane in lanes if lane in self._pieces]
-        return [min(p, key=lambda piece: shapely.distance(piece[1], point))[0] for p in pieces]
+    def _key(self, lane: int, x: float, y: float) -> LaneKey:
+        pieces, share = self._pieces[lane], self._map.progress_on(lane, x, y)
+        ends = np.cumsum([abs(piece.end - piece.begin) for piece in pieces])
+        share *= ends[-1] / self._map.baselines.length(lane)
+        return pieces[int(np.searchsorted(ends[:-1], share, "right"))].key
 
     def sequences(self, centers: FloatArray) -> list[list[LaneKey]]:
         """OpenDRIVE lanes passed by centres (n, 3), without and with short pieces at the ends."""
         route = driven_route(self._map, centers)
-        behind = [self._behind(route.at(i), *xy) for i, xy in enumerate(centers[:, :2].tolist())]
-        pieces = [(k, len([*same])) for k, same in groupby(keys[0] for keys in behind if keys)]
+        points = zip(map(route.at, range(len(centers))), *centers[:, :2].T, strict=True)
+        keys = [self._key(lanes[0], x, y) for lanes, x, y in points if lanes]
+        pieces = [(key, len([*same])) for key, same in groupby(keys)]
         lanes = [key for key, _ in pieces]
         long = [i for i, (_, samples) in enumerate(pieces) if samples >= _MIN_PIECE]
         if not long:
