@@ -22,7 +22,9 @@ from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
 # keys and tolerances of files, and what of ours their fields are
-COMPARED: dict[str, Any] = tomllib.loads((Path(__file__).parent / "compared.toml").read_text())
+COMPARED: dict[str, Any] = tomllib.loads(
+    (Path(__file__).parent / "compared.toml").read_text("utf-8")
+)
 EXACT = 0.0
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 RUN_KEY = ("scene", "challenge", "planner")

@@ -39,37 +39,38 @@ def verify_nuplan_format(folder: Path, report: Report) -> None:
         raise DataError(f"{folder / 'logs'}: there is no log (.db)")
     for extra in logs[1:]:
         report.skip(f"logs/{extra.name}: a second log")
-    with open_log(logs[0]) as log:
+    with report.attempt("readback", path.name):
+        for name, part in _read_back(folder, logs[0]).items():
+            theirs, label = expected.each(name)[0] if name else expected, f"readback {name}".strip()
+            theirs.match(path.name, part, _TOLERANCES, quantity=label, unordered=_UNORDERED)
+    expected.finish()
+    name_rest(folder, {*logs, path}, report)
+
+
+def _read_back(folder: Path, path: Path) -> dict[str, dict[str, Any]]:
+    """Our side of the objects in the file, by name; its other fields are those of ``""``."""
+    with open_log(path) as log:
         tagged = [[t, i] for t, i in zip(log.types, log.tokens, strict=True) if t != "unknown"]
         start, map_name = int(log.time_us[0]), log.map_name
     road = load_map(find_maps(folder / "maps"), map_name)
-    origin = np.array(_ORIGINS[road.epsg])
+    scene, origin = read_scenario(path, tagged[0][1], road, _MAPPING), np.array(_ORIGINS[road.epsg])
     world, place = nuplan_map(road), point(*(origin + _POINT))
     lanes = world.get_all_map_objects(place, layer("LANE"))
-    things = {
-        "lane": lanes[0],
-        "connector": lanes[0].outgoing_edges[0],
-        "roadblock": lanes[0].parent,
-    }
     near = world.get_proximal_map_objects(place, _NEAR, world.get_available_map_objects())
-    area, scene = layer("DRIVABLE_AREA"), read_scenario(logs[0], tagged[0][1], road, _MAPPING)
-    ours = {
-        "scenarios_all": len(list_scenarios(logs[0])),
+    area = layer("DRIVABLE_AREA")
+    whole = {
+        "scenarios_all": len(list_scenarios(path)),
         "tagged": tagged,
-        "scenarios_by_type": len(list_scenarios(logs[0], types=frozenset([_TYPE]))),
+        "scenarios_by_type": len(list_scenarios(path, types=frozenset([_TYPE]))),
         "lanes_at_point": [lane.id for lane in lanes],
         "in_drivable": [world.is_in_layer(point(*(origin + at)), area) for at in _DRIVABLE],
-        **_scene_fields(scene, origin),
     }
-    parts = {name: fields_of(thing, COMPARED["readback"][name]) for name, thing in things.items()}
-    parts["proximal"] = {kind.name: len(found) for kind, found in near.items()}
-    parts["ego_t0"] = _ego_fields(scene, start, origin)
-    for name, part in parts.items():
-        theirs, label = expected.each(name)[0], f"readback {name}"
-        theirs.match(path.name, part, _TOLERANCES, quantity=label, unordered=_UNORDERED)
-    expected.match(path.name, ours, _TOLERANCES, unordered=_UNORDERED)
-    expected.finish()
-    name_rest(folder, {*logs, path}, report)
+    return {
+        **{name: fields_of(lanes[0], paths) for name, paths in COMPARED["readback"].items()},
+        "proximal": {kind.name: len(found) for kind, found in near.items()},
+        "ego_t0": _ego_fields(scene, start, origin),
+        "": whole | _scene_fields(scene, origin),
+    }
 
 
 def _ego_fields(scene: Scenario, start: int, origin: FloatArray) -> dict[str, Any]:
