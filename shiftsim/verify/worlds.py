@@ -24,6 +24,7 @@ EGO_COLUMNS = (
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
 BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
+_IS_CONNECTOR = {"lane": False, "connector": True, "roadblock": False, "roadblock_connector": True}
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
@@ -103,7 +104,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         "world",
         edges=[
             EdgeSpec(
-                is_connector=_is_connector(edge["kind"], "lane", "connector"),
+                is_connector=_IS_CONNECTOR[edge["kind"]],
                 polygon=shapely.Polygon(edge["polygon"]),
                 baseline=np.array(edge["baseline"], np.float64),
                 block_id=edge["roadblock"] if blocks else "",
@@ -114,7 +115,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         blocks=[
             BlockSpec(
                 id=name,
-                is_connector=_is_connector(block["kind"], "roadblock", "roadblock_connector"),
+                is_connector=_IS_CONNECTOR[block["kind"]],
                 polygon=shapely.Polygon(block["polygon"]),
             )
             for name, block in blocks.items()
@@ -128,12 +129,6 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     if lost:
         raise DataError(f"ids that name nothing: {', '.join(lost)}")
     return road
-
-
-def _is_connector(kind: str, plain: str, connector: str) -> bool:
-    if kind not in (plain, connector):
-        raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
-    return kind == connector
 
 
 def _areas(rings: Iterable[tuple[object, Any]]) -> list[AreaSpec]:
