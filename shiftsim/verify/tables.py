@@ -17,13 +17,15 @@ says what holds for the others, and how the report calls the section.
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.verify.files import EXACT, Source
+from shiftsim.verify.files import EXACT, Source, read_arrays, read_json
+from shiftsim.verify.report import Report
+from shiftsim.world.scenario import Scenario
 
 Row: TypeAlias = Any  # a path, text or number; a path and a tolerance; rows by name
 
@@ -35,7 +37,7 @@ class Table:
         self.about = {"called": None, "atol": EXACT, "optional": False, **rows.get("*", {})}
         self.rows = {name: row for name, row in rows.items() if name != "*"}
 
-    def match(self, theirs: Source, where: str, called: str = "", **names: Any) -> bool:
+    def match(self, theirs: Source, where: str, called: str = "", /, **names: Any) -> bool:
         """Compare ours with the values of all rows; whether all agree."""
         ours, bounds = {}, {}
         for name, row in self.rows.items():
@@ -50,6 +52,41 @@ def read_tables(module: str) -> dict[str, Table]:
     """The sections of the file beside a module, given by the path of the module."""
     content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
     return {name: Table(rows) for name, rows in content.items()}
+
+
+def verify_cases(
+    compare: Callable[..., None],
+    path: Path,
+    report: Report,
+    scenes: Mapping[str, Scenario] | None = None,
+) -> None:
+    """`compare` every case of a file, also with its scene; cases of other scenes are not covered.
+
+    Cases are the entries of a `.json`; arrays whose names begin with the same number, `3_name`; the
+    rows of all arrays.
+    """
+    cases = _read_cases(path, report)
+    for number, case in enumerate(cases):
+        scene = case["scene"] if scenes is not None else ""
+        if scenes is not None and scene not in scenes:
+            report.skip(f"{path.name}: scene {scene}, which is not at hand")
+            continue
+        where = f"{path.stem} {number} {scene}".strip()
+        with report.attempt(path.stem, where):
+            compare(case, where, *([] if scenes is None else [scenes[scene]]))
+        if case.rows is None or case is cases[-1]:  # rows share what was used
+            case.finish()
+
+
+def _read_cases(path: Path, report: Report) -> list[Source]:
+    if path.suffix == ".json":
+        return [Source(path.name, "field", case, report) for case in read_json(path)]
+    file = read_arrays(path, report)
+    if next(iter(file))[0].isdigit():
+        numbers = sorted({int(name.split("_")[0]) for name in file})
+        return [file.below(f"{number}_") for number in numbers]
+    # a shorter array fails where it is read; one that nothing reads is named as such
+    return [file.at(row) for row in range(max(map(len, file.values.values())))]
 
 
 def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
