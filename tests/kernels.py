@@ -13,7 +13,7 @@ from shiftsim.arrays import cache_folder
 from shiftsim.files import PACKAGE, sources
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.verify.warmup import SHARES, scene
+from shiftsim.warmup import SHARES, scene
 from shiftsim.world.scenario import Scenario
 
 GROUPS = (

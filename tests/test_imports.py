@@ -17,7 +17,7 @@ LAYERS = (
     {"sim", "metrics", "data", "planners"},
     {"runs"},
     {"report", "view", "verify", "env", "train", "compat"},
-    {"api", "cli", "benchmarks", "__main__", "__init__"},
+    {"api", "cli", "benchmarks", "warmup", "__main__", "__init__"},
 )
 LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
 # what may be used of a neighbour in the same layer
@@ -26,6 +26,7 @@ NEIGHBOURS = {
     "metrics": ("sim.log",),
     "view": ("report.palette", "report.words"),
     "train": ("env", "report.palette"),
+    "verify": ("compat.nuplan",),  # what nuPlan's own map answered is compared with what it says
 }
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
 MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/")

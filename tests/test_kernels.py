@@ -34,7 +34,7 @@ from shiftsim.sim.traffic import _MODELS
 from shiftsim.train.pictures import blocks_of
 from shiftsim.train.traffic.labels import labels_of
 from shiftsim.train.traffic.realism import compare
-from shiftsim.verify.warmup import SHARES
+from shiftsim.warmup import SHARES
 from shiftsim.world.layers import nearest
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind

@@ -8,7 +8,7 @@ import pytest
 from commands import call
 from stores import write_toy_store
 
-from shiftsim.verify.warmup import SHARES, warm_up
+from shiftsim.warmup import SHARES, warm_up
 
 STRAY = "open('stray-was-executed', 'a').write(__name__ + ' ')\nraise SystemExit('stray')\n"
 # modules of the standard library that workers import, and packages that may be missing

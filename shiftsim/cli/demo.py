@@ -42,7 +42,7 @@ def demo(
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
     from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
     from shiftsim.runs.config import DEFAULT_STORE, make_config
-    from shiftsim.verify.warmup import warm_up
+    from shiftsim.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():

@@ -101,7 +101,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
     from shiftsim.verify import verify
-    from shiftsim.verify.warmup import warm_up
+    from shiftsim.warmup import warm_up
 
     began = perf_counter()
     reports = []

@@ -9,25 +9,11 @@ from inspect import signature
 from pathlib import Path
 
 from shiftsim.errors import DataError
+from shiftsim.verify.files import COMPARED
 from shiftsim.verify.report import Report
 
 MODES = ("NR", "R", "PT")
-KINDS = {  # module of `verify_<kind>`, patterns that must all match something (`a|b`: either)
-    "nuplan": ("nuplan", "scenes.json", "expected/*.parquet"),
-    "nuplan_format": ("nuplan.format", "devkit_readback.json"),
-    "metric_worlds": ("metric_worlds", "metric_world_*.json"),
-    "pdm": ("pdm", "kernels/*.npz|kernels/*.json|routes.json|idm_calls.json|loop/steps.parquet"),
-    "nets": ("nets", "state_dict.json|route_correction*|plantf|pluto|diffusion_planner|carl"),
-    "dynamics": (
-        "dynamics",
-        "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*|comfort_*.npz|ego_*.npz|traj*.npz",
-    ),
-    "dsc3d_sample": ("dsc3d", "expected_rows.parquet", "data"),
-    "dsc3d_synthetic": ("dsc3d", "**/expected_ego_20hz.parquet"),
-    "opendrive": ("opendrive", "*.refline.parquet"),
-    "scenario_edits": ("scenario_edits", "tokens.json", "build.json", "traffic.json"),
-    "experiment": ("nuplan.experiment", "**/aggregator_metric|**/simulation_log"),
-}
+KINDS: dict[str, list[str]] = COMPARED["kinds"]
 
 
 def verify(

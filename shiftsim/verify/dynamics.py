@@ -1,9 +1,10 @@
 """Compares vehicle dynamics, tracker, noise, interpolation, comfort and IDM steps with nuPlan's.
 
-`CHECKS` has a function for each file, which computes the arrays of one case from the others.
+`CHECKS` has a function for each file, which computes the arrays of one case from the others; names
+of columns, labels and tolerances stand in `compared.toml`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,85 +14,58 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.metrics.comfort import BOUNDED_SIGNALS, comfort_signals, within_bounds
+from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
-from shiftsim.verify.files import EXACT, TOLERANCE, Source, read_arrays, verify_files
+from shiftsim.verify.files import COMPARED, Source, read_arrays, verify_files
 from shiftsim.verify.idm_worlds import verify_idm_world
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import ego_states
 from shiftsim.world import state
-from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX
+from shiftsim.world.state import NUM_STATE, PACIFICA, STEERING, VX
 
 Arrays: TypeAlias = dict[str, Any]
 
 GIVEN_STEERING = 0.1  # rad, of all states made from centres; not among their inputs
 LONGEST_PLAN_US = 3_600_000_000  # us, longer ones are broken input
 WINDOW_KNOTS = 81  # knots of the plan in closed loops of mode `window`
-LOOP_TOLERANCE = 1e-6  # closed loops: m, m/s, m/s^2, rad/s
-LOOP_ANGLE_TOLERANCE = 1e-7  # rad, closed loops
-TOLERANCES: Arrays = {  # of what `TOLERANCE` does not hold for
-    "": TOLERANCE,
-    "corners": 2e-9,  # m, coordinates near 4e6 are spaced 5e-10
-    "cmd": LOOP_TOLERANCE,
-    "state": np.where(
-        np.isin(np.arange(NUM_STATE), [HEADING, STEERING]), LOOP_ANGLE_TOLERANCE, LOOP_TOLERANCE
-    ),
-    **dict.fromkeys(("profile_time_s", "noise", "cmd_applied"), EXACT),
-}
-_POSE, _MOTION = ("x", "y", "heading"), ("vx", "vy", "ax", "ay")
-NAMES = {  # of columns, by the array that lists them
-    "state_columns": (*_POSE, *_MOTION, "steer", "steer_rate", "omega", "alpha"),
-    "centre_columns": (*_POSE, *_MOTION, "speed", "accel"),
-    "from_centre_columns": (*_POSE, *_MOTION, "omega", "alpha"),
-    "corner_order": ("FL", "RL", "RR", "FR"),
-    "flag_columns": (*BOUNDED_SIGNALS.values(), "ego_is_comfortable"),
-    "param_columns": ("target_velocity", "min_gap", "headway", "accel_max", "decel_max"),
-    "agent_columns": ("progress", "velocity"),
-    "lead_columns": ("progress", "velocity", "length_rear"),
-}
+_POSE = ("x", "y", "heading")
 
 
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    parts = {f"{stem}.npz": partial(_verify_file, report, *check) for stem, check in CHECKS.items()}
-    worlds = {"idm_world_*": partial(verify_idm_world, report=report)}
-    verify_files(folder, report, {**parts, **worlds, "meta.json": None})
+    parts = dict.fromkeys(CHECKS, partial(_verify_file, report))
+    worlds = {"idm_world_*": partial(verify_idm_world, report=report), "meta.json": None}
+    verify_files(folder, report, {**parts, **worlds})
 
 
-def _verify_file(
-    report: Report, compute: Callable[[Source], Arrays], lists: str, labels: str, path: Path
-) -> None:
-    file, names = read_arrays(path, report), lists.split()
-    file.note("label", *labels.split())
-    file.match("file", {name: NAMES[name] for name in names})
-    for number, case in enumerate(_cases(file, names)):
-        case.match(f"case {number}", compute(case), TOLERANCES)
+def _verify_file(report: Report, path: Path) -> None:
+    file, lists = read_arrays(path, report), COMPARED[path.name]["lists"]
+    file.note("label", *COMPARED[path.name]["labels"])
+    file.match("file", {name: COMPARED["dynamics"]["lists"][name] for name in lists})
+    for number, case in enumerate(_cases(file, lists)):
+        case.match(f"case {number}", CHECKS[path.name](case), COMPARED["dynamics"]["atol"])
     file.finish()
 
 
-def _cases(file: Source, names: list[str]) -> Iterator[Source]:
+def _cases(file: Source, lists: list[str]) -> Iterator[Source]:
     """The arrays of each case: a row of every array, or what `<prefix>_ptr` gives it of others."""
-    count = len(file["case"])
-    ends = {n.removesuffix("ptr"): file.take(n, count + 1) for n in file if n.endswith("_ptr")}
-    ragged: dict[str, IntArray] = {}
-    for name in set(file) - set(names) - {f"{prefix}ptr" for prefix in ends}:
-        size, divided = len(file.values[name]), np.arange(count + 1)
-        for prefix in filter(name.startswith, ends):
-            divided = ragged[name] = ends[prefix]
-        if divided[0] or divided[-1] != size or (np.diff(divided) < 0).any():
+    count, given = len(file["case"]), {n: v for n, v in file.values.items() if n not in lists}
+    ends = {name.removesuffix("ptr"): name for name in given if name.endswith("_ptr")}
+    divided = {prefix: file.take(name, count + 1) for prefix, name in ends.items()}
+    rows = {}
+    for name in set(given) - set(ends.values()):
+        ptr = next((divided[p] for p in divided if name.startswith(p)), np.arange(count + 1))
+        size = len(given[name])
+        if ptr[0] or ptr[-1] != size or (np.diff(ptr) < 0).any():
             raise DataError(f"array {name!r} has {size} rows, which are not those of {count} cases")
+        rows[name] = np.split(given[name], ptr[1:-1]) if name.startswith((*ends,)) else given[name]
     for case in range(count):
-        rows = {name: slice(*divided[case : case + 2]) for name, divided in ragged.items()}
-        values = {
-            name: array[rows.get(name, case)]
-            for name, array in file.values.items()
-            if name not in names and not name.endswith("_ptr")
-        }
+        values = {name: array[case] for name, array in rows.items()}
         yield Source(file.name, file.what, values, file.report, file.used)
 
 
@@ -231,17 +205,14 @@ def _idm_steps(case: Source) -> Arrays:
     return {"accel_unclipped": idm_acceleration(*given), "forward_euler": euler}
 
 
-_EGO = "state_columns centre_columns"
-_FRAMES = f"{_EGO} corner_order from_centre_columns"
-_IDM = "param_columns agent_columns lead_columns"
-CHECKS = {  # file: what computes a case, arrays that list `NAMES`, labels and what nothing uses
-    "bicycle_rollouts": (_bicycle, "state_columns", "case"),
-    "bicycle_steps": (_bicycle, _EGO, "case kind"),
-    "closed_loop": (_closed_loop, _EGO, "case shape"),
-    "closed_loop_noise": (_closed_loop_noise, _EGO, "case shape"),
-    "comfort_signals": (_comfort_signals, "flag_columns", "case sig_in_vx"),
-    "ego_state_frames": (_ego_frames, _FRAMES, "case"),
-    "idm_steps": (_idm_steps, _IDM, "case odeint rk45"),
-    "lqr_commands": (_lqr_commands, "state_columns", "case kind"),
-    "trajectory_interpolation": (_trajectory_interpolation, "state_columns", "case"),
+CHECKS = {
+    "bicycle_rollouts.npz": _bicycle,
+    "bicycle_steps.npz": _bicycle,
+    "closed_loop.npz": _closed_loop,
+    "closed_loop_noise.npz": _closed_loop_noise,
+    "comfort_signals.npz": _comfort_signals,
+    "ego_state_frames.npz": _ego_frames,
+    "idm_steps.npz": _idm_steps,
+    "lqr_commands.npz": _lqr_commands,
+    "trajectory_interpolation.npz": _trajectory_interpolation,
 }

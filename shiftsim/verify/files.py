@@ -6,7 +6,8 @@ covered. `match` compares values of ours with those of the same names.
 """
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -20,6 +21,10 @@ from numpy.typing import ArrayLike
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
+# keys and tolerances of files, and what of ours their fields are
+COMPARED: dict[str, Any] = tomllib.loads(
+    (Path(__file__).parent / "compared.toml").read_text("utf-8")
+)
 EXACT = 0.0
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 RUN_KEY = ("scene", "challenge", "planner")
@@ -128,30 +133,6 @@ class Source:
             agree &= self.report.compare(label, where, *sides, atol=bound, angle=angle)
         return agree
 
-    def match_tree(
-        self,
-        where: str,
-        ours: Mapping[str, Any],
-        atol: Tolerances = EXACT,
-        *,
-        quantity: str | None = None,
-        **options: Collection[str],
-    ) -> None:
-        """`match`, also within the objects and the lists of objects of a `.json`."""
-        prefix, plain = self.name if quantity is None else quantity, dict[str, Any]()
-        for name, value in ours.items():
-            items = value if isinstance(value, list) else [value]
-            if name not in self or not items or not isinstance(items[0], dict):
-                plain[name] = value
-                continue
-            label, parts = f"{prefix} {name}".strip(), self.each(name)
-            if items is value:
-                self.report.compare(f"number of {label}", where, len(items), len(parts))
-            for number, (item, part) in enumerate(zip(items, parts, strict=False)):
-                at = f"{where} {name} {number}" if items is value else where
-                part.match_tree(at, item, atol, quantity=label, **options)
-        self.match(where, plain, atol, quantity=quantity, **options)
-
     def match_rows(
         self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
     ) -> None:
@@ -174,6 +155,19 @@ class Source:
                 self.report.skip(f"{self.name}: {self.what} {name!r}")
         for part in (part for parts in self._parts.values() for part in parts):
             part.finish()
+
+
+def fields_of(thing: Any, paths: Mapping[str, str]) -> dict[str, Any]:
+    """What paths of `compared.toml` lead to; objects with an id are named by it."""
+    return {name: _follow(thing, path) for name, path in paths.items()}
+
+
+def _follow(thing: Any, path: str) -> Any:
+    for step in path.split("."):
+        thing = thing[int(step)] if step.isdecimal() else getattr(thing, step)
+        thing = thing() if callable(thing) else thing
+    several = isinstance(thing, (list, tuple))
+    return [getattr(x, "id", x) for x in thing] if several else getattr(thing, "id", thing)
 
 
 def read_arrays(path: Path, report: Report, name: str = "") -> Source:
@@ -212,9 +206,14 @@ class Groups(dict[tuple[str, ...], Source]):
     """
 
     def __init__(
-        self, table: Path | Source, report: Report, key: tuple[str, ...] = RUN_KEY
+        self,
+        table: Path | Source,
+        report: Report,
+        key: Sequence[str] = RUN_KEY,
+        atol: Tolerances = EXACT,
     ) -> None:
         self._asked: set[tuple[str, ...]] = set()
+        self.atol = atol  # unless a comparison names another
         if isinstance(table, Path) and not table.is_file():
             self.table = Source(table.stem, "column", {}, report)
             report.skip(f"{table.name} is missing")
@@ -226,9 +225,15 @@ class Groups(dict[tuple[str, ...], Source]):
         self._asked.add(key)
         return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
-    def match(self, key: tuple[str, ...], *args: Any, **options: Any) -> bool:
+    def match(
+        self,
+        key: tuple[str, ...],
+        ours: Mapping[str, Any],
+        atol: Tolerances | None = None,
+        **options: Any,
+    ) -> bool:
         """`Source.match` for the rows of a key."""
-        return self[key].match(" ".join(key), *args, **options)
+        return self[key].match(" ".join(key), ours, self.atol if atol is None else atol, **options)
 
     def match_keys(self, key: tuple[str, ...], ours: list[tuple[str, ...]]) -> None:
         """Compare which keys begin with `key`, by the rest of them."""
@@ -243,6 +248,16 @@ class Groups(dict[tuple[str, ...], Source]):
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
         if self._asked & set(self):
             self.table.finish()
+
+
+def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
+    """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`."""
+    paths = {name: folder / f"{name}.parquet" for name in names}
+    known = ("key", "atol")
+    return {
+        name: Groups(path, report, **{k: v for k, v in COMPARED[path.name].items() if k in known})
+        for name, path in paths.items()
+    }
 
 
 def verify_files(

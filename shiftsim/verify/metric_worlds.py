@@ -11,19 +11,14 @@ from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.files import TOLERANCE, Source, read_fields, verify_files
+from shiftsim.verify.files import COMPARED, TOLERANCE, Source, read_fields, verify_files
 from shiftsim.verify.report import Report
+from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
 from shiftsim.world.map import VectorMap
 
-SCORE_TOLERANCES = dict.fromkeys(  # the other scores are 0 or 1
-    ("ego_progress_along_expert_route", "speed_limit_compliance", "score"), TOLERANCE
-)
-_PROGRESS = (
-    "expert_total_progress_along_route",
-    "ego_total_progress_along_route",
-    "ego_expert_progress_along_route_ratio",
-)
+SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
+TABLES = read_tables(__file__)
 
 
 def verify_metric_worlds(folder: Path, report: Report) -> None:
@@ -66,7 +61,14 @@ def _verify_world(report: Report, path: Path) -> None:
     order = list(BOUNDED_SIGNALS.values())
     expected.match(where, {"comfort_flag_order": order}, quantity="")
     series = expected.each("series")[0]
-    series.match_tree(where, _series(measured, result, road), TOLERANCE, quantity="")
+    TABLES["series"].match(series, where, **_series(measured, result, road))
+    progress = series.each("progress_statistics")[0]
+    progress.match(where, _progress(result), TOLERANCE, quantity="progress_statistics")
+    contacts, found = series.each("collisions"), measured.collisions
+    report.compare("number of collisions", where, len(found), len(contacts))
+    for ours, theirs in zip(found, contacts, strict=False):
+        kind = f"{ours.collision_type.upper()}_COLLISION"
+        TABLES["collisions"].match(theirs, f"{where} {ours.token}", contact=ours, kind=kind)
     world.finish()
 
 
@@ -76,31 +78,23 @@ def known_scores(result: MetricResult) -> dict[str, float]:
     return {name: score for name, score in scores.items() if score is not None}
 
 
+def _progress(result: MetricResult) -> dict[str, float]:
+    ends = "_total_progress_along_route", "_expert_progress_along_route_ratio"
+    return {s.name: s.value for s in result.statistics if s.name.endswith(ends)}
+
+
 def _series(measured: Measurements, result: MetricResult, road: VectorMap) -> dict[str, Any]:
-    samples, ttc = range(len(measured.time_us)), measured.ttc.values
+    """What `metric_worlds.toml` speaks of."""
+    samples, corners, ttc = range(len(measured.time_us)), measured.corners, measured.ttc.values
     return {
-        "driven_route": [measured.route.ids(road, i) for i in samples],
-        "corner_routes": [
-            [measured.corners.ids(road, i, corner) for corner in range(4)] for i in samples
-        ],
-        "common_or_connected": measured.is_common.astype(np.int64),
-        "corners_in_drivable_area": (~measured.drivable.outside.any(axis=1)).astype(np.int64),
-        "at_fault_times": np.array(measured.at_fault_times, np.int64),
-        "at_fault_counts": at_fault_counts(measured.collisions),
-        "time_to_collision": np.where(np.isinf(ttc), np.nan, ttc),
-        "overspeed": measured.overspeed,
-        "progress_1s_along_lane": result.series["driving_direction_compliance"].values,
-        "ego_progress": measured.progress.ego,
-        "progress_statistics": {s.name: s.value for s in result.statistics if s.name in _PROGRESS},
-        "comfort_flags": within_bounds(measured.comfort, NUPLAN),
-        "comfort_flags_deepplan": within_bounds(measured.comfort, DEEPPLAN),
-        "collisions": [
-            {
-                "time_us": contact.time_us,
-                "token": contact.token,
-                "type": f"{contact.collision_type.upper()}_COLLISION",
-                "ego_delta_v": contact.delta_v,
-            }
-            for contact in measured.collisions
-        ],
+        **{"measured": measured, "result": result},
+        "route": [measured.route.ids(road, i) for i in samples],
+        "corners": [[corners.ids(road, i, corner) for corner in range(4)] for i in samples],
+        "common": measured.is_common.astype(np.int64),
+        "inside": (~measured.drivable.outside.any(axis=1)).astype(np.int64),
+        "at_fault": np.array(measured.at_fault_times, np.int64),
+        "counts": at_fault_counts(measured.collisions),
+        "ttc": np.where(np.isinf(ttc), np.nan, ttc),
+        "flags": within_bounds(measured.comfort, NUPLAN),
+        "deepplan": within_bounds(measured.comfort, DEEPPLAN),
     }

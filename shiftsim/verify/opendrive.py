@@ -13,34 +13,15 @@ from shiftsim.data.opendrive.areas import is_crosswalk, object_origin, object_ri
 from shiftsim.data.opendrive.curves import ReferenceLine, arc_length_deviation
 from shiftsim.data.opendrive.lanes import LaneKey, lane_links, section_borders
 from shiftsim.data.opendrive.reading import read_opendrive
-from shiftsim.data.opendrive.records import Lane, OpenDrive, Road, RoadObject
-from shiftsim.verify.files import Source, read_json, read_table, verify_files
+from shiftsim.data.opendrive.records import Lane, OpenDrive, Road
+from shiftsim.verify.files import COMPARED, Source, read_json, read_table, verify_files
 from shiftsim.verify.report import Report
 
 EXACT = 1e-6  # m, rad: tolerance of the folder's README
 CUBIC, CUBIC_HEADING = 2e-3, 1e-3  # m, rad: paramPoly3
 LENGTH_SHARE, LENGTH = 1e-3, 0.05  # of a length, or m
-COUNTS = {  # key of a summary → what our reader counts
-    "roads": "road",
-    "roads_in_junctions": "road in a junction",
-    "connections": "connection",
-    "lane_links_in_junctions": "lane link in a junction",
-    "lane_sections": "lane section",
-    "left_hand_roads": "road with left-hand traffic",
-    "width_records": "width",
-    "border_records": "border",
-    "lane_offset_records": "laneOffset",
-}
-TALLIES = {  # key of a summary → how the names of our counts begin
-    "junction_types": "junction type ",
-    "lane_types": "lane type ",
-    "geometry_kinds": "geometry ",
-    "speed_records": "speed ",
-    "objects": "object ",
-    "signals": "signal ",
-}
+COUNTS, TALLIES = (COMPARED["summary.json"][name] for name in ("counts", "tallies"))
 _CENTER_STEP = 0.25  # m, spacing of the summary's centre lines
-_CROSSCHECK = "crosscheck_libopendrive.json"
 
 
 def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> None:
@@ -60,15 +41,22 @@ def verify_opendrive(folder: Path, report: Report, maps: Path | None = None) -> 
         if path.suffix == ".parquet":
             file = read_table(path, report)
         else:
-            content = read_json(path)
-            content = {"rows": content} if isinstance(content, list) else content
+            content = read_json(path)  # crosswalks are a list
+            content = content if isinstance(content, dict) else {"rows": content}
             file = Source(path.stem, "field", content, report)
         compare(read(by_name[name]), file, by_name[name])
         if path.suffix == ".json" or file.num_rows:
             file.finish()
 
-    parts = {f"*.{kind}": partial(part, compare) for kind, compare in KINDS.items()}
-    verify_files(folder, report, {_CROSSCHECK: partial(_verify_crosscheck, report), **parts})
+    parts: dict[str, Callable[[Path], object]] = {
+        "crosscheck_libopendrive.json": partial(_verify_crosscheck, report),
+        "*.refline.parquet": partial(part, _verify_reference_lines),
+        "*.lanes.parquet": partial(part, _verify_lanes),
+        "*.topology.parquet": partial(part, _verify_topology),
+        "*.summary.json": partial(part, _verify_summary),
+        "*.crosswalks.json": partial(part, _verify_crosswalks),
+    }
+    verify_files(folder, report, parts)
 
 
 def _tolerance(line: ReferenceLine, s: FloatArray, cubic: float = CUBIC) -> FloatArray:
@@ -76,43 +64,39 @@ def _tolerance(line: ReferenceLine, s: FloatArray, cubic: float = CUBIC) -> Floa
 
 
 def _verify_reference_lines(od: OpenDrive, file: Source, path: Path) -> None:
-    compare = file.report.compare
-    roads = {road: rows for (road,), rows in file.groups("road").items()}
-    compare("roads with a reference line", path.stem, sorted(od.roads), sorted(roads))
-    for road in sorted(set(roads) & set(od.roads)):
-        where, line = f"{path.stem} road {road}", ReferenceLine(od.roads[road].geometries)
-        s, heading = roads[road]["s"], roads[road]["hdg"]
-        poses, extent = line.evaluate(s), [0.0, od.roads[road].stated_length]
-        compare("road extent", where, extent, s[[0, -1]], atol=EXACT)
-        compare("heading is wrapped", where, np.abs(heading).max() <= np.pi, True)
-        atol = _tolerance(line, s, CUBIC_HEADING)
-        compare("reference line hdg", where, poses.heading, heading, atol=atol, angle=True)
-        ours = {"x": poses.x, "y": poses.y, "kind": line.kinds(s)}
-        roads[road].match(where, ours, {"": _tolerance(line, s)}, quantity="reference line")
+    compare, roads = file.report.compare, file.groups("road")
+    compare(
+        "roads with a reference line", path.stem, sorted(od.roads), [r for (r,) in sorted(roads)]
+    )
+    for (name,), rows in roads.items():
+        where, road, s = f"{path.stem} road {name}", od.roads[name], rows["s"]
+        line = ReferenceLine(road.geometries)
+        poses, atol = line.evaluate(s), _tolerance(line, s)
+        ours = {"x": poses.x, "y": poses.y, "hdg": poses.heading, "kind": line.kinds(s)}
+        bounds = {"": atol, "hdg": _tolerance(line, s, CUBIC_HEADING)}
+        rows.match(where, ours, bounds, quantity="reference line", angles={"hdg"})
+        compare("road extent", where, [0.0, road.stated_length], s[[0, -1]], atol=EXACT)
+        compare("heading is wrapped", where, np.abs(rows["hdg"]).max() <= np.pi, True)
 
 
 def _verify_lanes(od: OpenDrive, file: Source, path: Path) -> None:
-    lanes = _lanes(od)
-    for (road_id, section, number), rows in file.groups("road", "section", "lane").items():
-        key = LaneKey(road_id, int(section), int(number))
-        where = f"{path.stem} road {road_id} section {section} lane {number}"
-        file.report.compare("lane exists", where, key in lanes, True)
-        if key not in lanes:
+    compare, lanes = file.report.compare, _lanes(od)
+    for (name, section, number), rows in file.groups("road", "section", "lane").items():
+        key = LaneKey(name, int(section), int(number))
+        where = f"{path.stem} road {name} section {section} lane {number}"
+        if not compare("lane exists", where, key in lanes, True):
             continue
-        road, s = od.roads[road_id], rows["s"]
+        road, s = od.roads[name], rows["s"]
         begin, end = road.sections[key.section].s, road.section_end(key.section)
         inside = begin - 1e-9 <= s.min() and s.max() <= end + 1e-9
-        file.report.compare("lane rows lie in their section", where, inside, True)
+        compare("lane rows lie in their section", where, inside, True)
         line, borders = ReferenceLine(road.geometries), section_borders(road, key.section, s)
         inner, outer, poses = borders.inner[key.lane], borders.outer[key.lane], line.evaluate(s)
         ours = {"type": [lanes[key].type] * len(s), "t_inner": inner, "t_outer": outer}
-        rows.match(where, ours, EXACT, quantity="lane")
-        lines = {"c": 0.5 * (inner + outer), "i": inner, "o": outer}
-        points = {name: poses.offset(t) for name, t in lines.items()}
-        columns = {
-            f"{p}{axis}": xy[:, i] for p, xy in points.items() for i, axis in enumerate("xy")
-        }
-        rows.match(where, columns, {"": _tolerance(line, s)}, quantity="lane")
+        for letter, t in {"c": 0.5 * (inner + outer), "i": inner, "o": outer}.items():
+            ours |= dict(zip((f"{letter}x", f"{letter}y"), poses.offset(t).T, strict=True))
+        atol: dict[str, Any] = {"t_inner": EXACT, "t_outer": EXACT, "": _tolerance(line, s)}
+        rows.match(where, ours, atol, quantity="lane")
 
 
 def _lanes(od: OpenDrive) -> dict[LaneKey, Lane]:
@@ -125,25 +109,21 @@ def _lanes(od: OpenDrive) -> dict[LaneKey, Lane]:
 
 
 def _verify_topology(od: OpenDrive, file: Source, path: Path) -> None:
-    lanes, sides = _lanes(od), ("from", "to")
-    columns = [f"{side}_{what}" for side in sides for what in ("road", "section", "lane", "type")]
-    theirs = {" ".join(map(str, row)) for row in zip(*(file[c] for c in columns), strict=True)}
-    links = lane_links(od, Counter())
+    lanes, links = _lanes(od), lane_links(od, Counter())
+    ends = [
+        f"{end}_{what}" for end in ("from", "to") for what in ("road", "section", "lane", "type")
+    ]
+    theirs = {" ".join(map(str, row)) for row in zip(*map(file.__getitem__, ends), strict=True)}
     ours = {
-        " ".join(f"{' '.join(map(str, key))} {lanes[key].type}" for key in link) for link in links
+        " ".join(f"{k.road} {k.section} {k.lane} {lanes[k].type}" for k in link) for link in links
     }
     file.report.compare("number of lane links", path.stem, len(links), file.num_rows)
-    for link in sorted(ours ^ theirs):
-        what = "missing" if link in theirs else "too many"
-        file.report.fail("lane links", path.stem, f"{what}: {link}")
-
-
-def _crosswalks(od: OpenDrive) -> list[tuple[Road, RoadObject]]:
-    return [(r, thing) for r in od.roads.values() for thing in r.objects if is_crosswalk(thing)]
+    file.report.compare("lane links", path.stem, sorted(ours), sorted(theirs))
 
 
 def _verify_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
-    known = {f"{road.id} {thing.id}": (road, thing) for road, thing in _crosswalks(od)}
+    pairs = [(r, thing) for r in od.roads.values() for thing in r.objects if is_crosswalk(thing)]
+    known = {f"{road.id} {thing.id}": (road, thing) for road, thing in pairs}
     rows = {f"{row['road']} {row['object']}": row for row in file.each("rows")}
     file.report.compare("crosswalks", path.stem, sorted(known), sorted(rows))
     for key in set(known) & set(rows):
@@ -158,34 +138,32 @@ def _verify_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
 
 
 def _verify_summary(od: OpenDrive, file: Source, path: Path) -> None:
-    kinds = {geometry.kind for road in od.roads.values() for geometry in road.geometries}
-    gap = CUBIC if "paramPoly3" in kinds else EXACT
+    gap = CUBIC if od.counts.get("geometry paramPoly3") else EXACT
     for key, value in summarize(od, path).items():
-        atol = 0.0
-        if key.startswith(("max_", "parampoly3_")):
-            atol = gap
-        elif "length" in key:
-            atol = max(LENGTH_SHARE * abs(file[key]), LENGTH)
+        length = max(LENGTH_SHARE * abs(file[key]), LENGTH) if "length" in key else 0.0
+        atol = gap if key.startswith(("max_", "parampoly3_")) else length
         file.match(f"{path.stem} {key}", {key: value}, atol, quantity="summary")
     # of the largest gap; where many gaps are rounding noise, one as large as ours
-    place, largest = file["max_geometry_gap_at"], file["max_geometry_gap_m"]
-    gaps, where = np.zeros(1), f"{path.stem} max_geometry_gap_at"
+    place, gaps, where = (
+        file["max_geometry_gap_at"],
+        np.zeros(1),
+        f"{path.stem} max_geometry_gap_at",
+    )
     if place is not None:
         geometries = od.roads[place[0]].geometries
         distance = np.abs([geometry.s - place[1] for geometry in geometries[1:]])
         file.report.compare("place of the largest gap", where, distance.min(), 0.0, atol=1e-9)
         gaps = ReferenceLine(geometries).joints()[0][[distance.argmin()]]
-    file.report.compare("largest gap", where, gaps[0], largest, atol=EXACT)
+    file.report.compare("largest gap", where, gaps[0], file["max_geometry_gap_m"], atol=EXACT)
 
 
 def summarize(od: OpenDrive, path: Path) -> dict[str, Any]:
     """Counts and lengths of a file, as in the reference summaries."""
-    lanes, roads = _lanes(od), od.roads.values()
+    lanes, roads, links = _lanes(od), od.roads.values(), lane_links(od, Counter())
     joints = [np.array(ReferenceLine(road.geometries).joints()) for road in roads]
     gaps, turns = np.concatenate([np.zeros((2, 1)), *joints], axis=1)
     cubics = [g for road in roads for g in road.geometries if g.kind == "paramPoly3"]
     lengths = np.sum([(0.0, 0.0), *map(_driving_lengths, roads)], axis=0).tolist()
-    links = lane_links(od, Counter())
     driving = [pair for pair in links if {lanes[key].type for key in pair} == {"driving"}]
     tallies = {
         key: {k.removeprefix(start): n for k, n in od.counts.items() if k.startswith(start)}
@@ -209,7 +187,7 @@ def summarize(od: OpenDrive, path: Path) -> dict[str, Any]:
         "max_geometry_gap_m": gaps.max(),
         "max_geometry_heading_gap_rad": turns.max(),
         "parampoly3_arc_vs_linear_param_max_m": max(map(arc_length_deviation, cubics), default=0.0),
-        "crosswalk_objects": len(_crosswalks(od)),
+        "crosswalk_objects": sum(is_crosswalk(thing) for road in roads for thing in road.objects),
         "lane_edges_all_types": len(links),
         "lane_edges_driving_to_driving": len(driving),
         "driving_lanes_without_successor": num_driving - len({start for start, _ in driving}),
@@ -237,23 +215,14 @@ def _verify_crosscheck(report: Report, path: Path) -> None:
     """Row counts of the reference's own comparison; its errors are those of another reader."""
     report.note(f"errors of libOpenDRIVE in {path.name}")
     for name, entry in read_json(path).items():
-        kinds = ("refline", "lanes")
-        paths = [path.with_name(f"{name}.{kind}.parquet") for kind in kinds if "rows" in entry]
-        counts = [read_table(p, report).num_rows if p.is_file() else None for p in paths]
-        report.compare("rows of the reference", name, counts, entry.get("rows", []))
+        tables = [path.with_name(f"{name}.{kind}.parquet") for kind in ("refline", "lanes")]
+        status = "compared" if tables[0].is_file() else "no golden"
+        report.compare("status", name, status, entry["status"])
+        for table, count in zip(tables, entry.get("rows", ()), strict=False):
+            rows = read_table(table, report).num_rows if table.is_file() else None
+            report.compare("rows of the reference", name, rows, count)
         summary = path.with_name(f"{name}.summary.json")
         if "roads_junctions" in entry and summary.is_file():
             values = read_json(summary)
             ours = [values["roads"], values["junctions"]]
             report.compare("roads and junctions", name, ours, entry["roads_junctions"])
-        status = "compared" if path.with_name(f"{name}.refline.parquet").is_file() else "no golden"
-        report.compare("status", name, status, entry["status"])
-
-
-KINDS = {  # what compares the files with these endings
-    "refline.parquet": _verify_reference_lines,
-    "lanes.parquet": _verify_lanes,
-    "topology.parquet": _verify_topology,
-    "summary.json": _verify_summary,
-    "crosswalks.json": _verify_crosswalks,
-}

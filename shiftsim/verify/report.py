@@ -62,50 +62,37 @@ class Report:
         up to whole turns. `atol`, of all values or of each, is the absolute tolerance of floats:
         strings, booleans and integers are compared exactly.
         """
-        tally = self._count(quantity)
+        tally = self.quantities.setdefault(quantity, Quantity())
         tally.tolerance = max(tally.tolerance, float(np.max(atol, initial=0.0)))
         ours, theirs = _array(actual), _array(expected)
         if ours.shape != theirs.shape:
-            return self._differ(quantity, where, f"shape {ours.shape}, not {theirs.shape}")
+            return self.fail(quantity, where, f"shape {ours.shape}, not {theirs.shape}")
         if ours.dtype.kind == "f" and theirs.dtype.kind == "O":
             with suppress(TypeError, ValueError):  # not numbers
                 theirs = theirs.astype(np.float64)
-        kinds = ours.dtype.kind + theirs.dtype.kind
-        if set(kinds) <= set("fiub") and "f" in kinds:
-            left, right = ours.astype(np.float64), theirs.astype(np.float64)
-            same = (left == right) | (np.isnan(left) & np.isnan(right))
-            with np.errstate(invalid="ignore"):
-                gap = left - right
-                gap = (gap + np.pi) % (2.0 * np.pi) - np.pi if angle else gap
-                error = np.where(same, 0.0, np.abs(gap))
-            error = np.where(np.isnan(error), np.inf, error)
-            if error.size:
-                tally.max_error = max(tally.max_error, float(error.max()))
+        kinds = {ours.dtype.kind, theirs.dtype.kind}
+        if kinds <= set("fiub") and "f" in kinds:
+            error = _errors(ours.astype(np.float64), theirs.astype(np.float64), angle)
+            tally.max_error = max(tally.max_error, float(error.max(initial=0.0)))
             bad = np.atleast_1d(error > np.asarray(atol))
         else:
             bad = np.atleast_1d(ours != theirs)
-        if not bad.any():
-            return True
-        first = tuple(np.argwhere(bad)[0].tolist())
-        got, want = (np.asarray(np.atleast_1d(side)[first]).tolist() for side in (ours, theirs))
-        at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
-        count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
-        return self._differ(quantity, where, f"{got!r}, not {want!r}{at}{count}")
-
-    def _count(self, quantity: str) -> Quantity:
-        tally = self.quantities.setdefault(quantity, Quantity())
+        if bad.any():
+            first = tuple(np.argwhere(bad)[0].tolist())
+            got, want = (np.asarray(np.atleast_1d(x)[first]).tolist() for x in (ours, theirs))
+            at = f" at {', '.join(map(str, first))}" if ours.ndim else ""
+            count = f" ({int(bad.sum())} of {bad.size} values)" if bad.size > 1 else ""
+            return self.fail(quantity, where, f"{got!r}, not {want!r}{at}{count}")
         tally.cases += 1
-        return tally
-
-    def _differ(self, quantity: str, where: str, what: str) -> bool:
-        self.quantities[quantity].mismatches += 1
-        self.mismatches.append(f"{quantity}: {where}: {what}")
-        return False
+        return True
 
     def fail(self, quantity: str, where: str, why: str) -> bool:
-        """Count one case as differing because it could not be computed; False."""
-        self._count(quantity)
-        return self._differ(quantity, where, why)
+        """Count one case as differing; False."""
+        tally = self.quantities.setdefault(quantity, Quantity())
+        tally.cases += 1
+        tally.mismatches += 1
+        self.mismatches.append(f"{quantity}: {where}: {why}")
+        return False
 
     @contextmanager
     def attempt(self, quantity: str, where: str) -> Iterator[None]:
@@ -131,21 +118,20 @@ class Report:
 
     def lines(self, max_mismatches: int = 50) -> list[str]:
         """The report as text; the last line is the summary."""
-        out = [
-            f"{name}: {tally.cases - tally.mismatches}/{tally.cases} equal, "
-            f"max |Δ| {tally.max_error:.3g} (tolerance {tally.tolerance:.3g})"
-            for name, tally in self.quantities.items()
-        ]
-        out += [f"not compared: {what}" for what in self.informative]
-        out += [f"not covered: {what} ({count})" for what, count in self.not_covered.items()]
-        out += [f"MISMATCH {line}" for line in self.mismatches[:max_mismatches]]
-        if len(self.mismatches) > max_mismatches:
-            out.append(f"… and {len(self.mismatches) - max_mismatches} more mismatches")
-        out.append(
+        more, skipped = len(self.mismatches) - max_mismatches, sum(self.not_covered.values())
+        return [
+            *(
+                f"{name}: {tally.cases - tally.mismatches}/{tally.cases} equal, "
+                f"max |Δ| {tally.max_error:.3g} (tolerance {tally.tolerance:.3g})"
+                for name, tally in self.quantities.items()
+            ),
+            *(f"not compared: {what}" for what in self.informative),
+            *(f"not covered: {what} ({count})" for what, count in self.not_covered.items()),
+            *(f"MISMATCH {line}" for line in self.mismatches[:max_mismatches]),
+            *([f"… and {more} more mismatches"] if more > 0 else []),
             f"{self.num_cases} cases covered, {len(self.mismatches)} mismatches, "
-            f"{sum(self.not_covered.values())} not covered"
-        )
-        return out
+            f"{skipped} not covered",
+        ]
 
     def exit_code(self, *, require_all: bool = False) -> int:
         """0 all equal, 1 a mismatch, 2 nothing covered, 3 not all covered and all required."""
@@ -154,6 +140,15 @@ class Report:
         if self.num_cases == 0:
             return 2
         return 3 if require_all and self.not_covered else 0
+
+
+def _errors(ours: np.ndarray, theirs: np.ndarray, angle: bool) -> np.ndarray:
+    """Distances of floats; 0 between NaNs, infinite between a NaN and a number."""
+    with np.errstate(invalid="ignore"):
+        gap = ours - theirs
+        gap = np.abs((gap + np.pi) % (2.0 * np.pi) - np.pi) if angle else np.abs(gap)
+    same = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs))
+    return np.where(same, 0.0, np.where(np.isnan(gap), np.inf, gap))
 
 
 def _array(value: Any) -> np.ndarray[Any, Any]:

@@ -1,6 +1,6 @@
 """What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +24,7 @@ EGO_COLUMNS = (
 )
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
 BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
+_IS_CONNECTOR = {"lane": False, "connector": True, "roadblock": False, "roadblock_connector": True}
 _SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
 
 
@@ -98,32 +99,30 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
     """
     blocks = world["roadblocks"] if "roadblocks" in world else {}
+
     road = build_map(
         "world",
         edges=[
             EdgeSpec(
-                id=edge["id"],
-                is_connector=_is_connector(edge["kind"], "lane", "connector"),
+                is_connector=_IS_CONNECTOR[edge["kind"]],
                 polygon=shapely.Polygon(edge["polygon"]),
                 baseline=np.array(edge["baseline"], np.float64),
                 block_id=edge["roadblock"] if blocks else "",
-                outgoing=edge["outgoing"],
-                speed_limit=edge["speed_limit"],
-                **{name: edge[name] for name in fields},
+                **{name: edge[name] for name in ("id", "outgoing", "speed_limit", *fields)},
             )
             for edge in world.each("edges")
         ],
         blocks=[
             BlockSpec(
                 id=name,
-                is_connector=_is_connector(block["kind"], "roadblock", "roadblock_connector"),
+                is_connector=_IS_CONNECTOR[block["kind"]],
                 polygon=shapely.Polygon(block["polygon"]),
             )
             for name, block in blocks.items()
         ],
-        intersections=_areas(dict(enumerate(world["intersections"]))),
-        drivable_areas=_areas(dict(enumerate(world["drivable_area"]))) if blocks else (),
-        stop_polygons=_areas(stop_lines or {}),
+        intersections=_areas(enumerate(world["intersections"])),
+        drivable_areas=_areas(enumerate(world["drivable_area"])) if blocks else (),
+        stop_polygons=_areas((stop_lines or {}).items()),
     )
     # an edge of a map without blocks is in none
     lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
@@ -132,14 +131,8 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     return road
 
 
-def _is_connector(kind: str, plain: str, connector: str) -> bool:
-    if kind not in (plain, connector):
-        raise DataError(f"kind {kind!r} is neither {plain!r} nor {connector!r}")
-    return kind == connector
-
-
-def _areas(rings: Mapping[Any, Any]) -> list[AreaSpec]:
-    return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings.items()]
+def _areas(rings: Iterable[tuple[object, Any]]) -> list[AreaSpec]:
+    return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings]
 
 
 def make_scenario(

@@ -8,8 +8,9 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.metrics import Measurements, MetricResult, judge, measure
+from shiftsim.sim.log import SimulationLog
 from shiftsim.verify import worlds
-from shiftsim.verify.files import EXACT, RUN_KEY, TOLERANCE, Groups, Source
+from shiftsim.verify.files import COMPARED, EXACT, Groups, Source, open_tables
 from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
@@ -17,31 +18,11 @@ from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, Tracks
 
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
-PROFILE_KEY = (*RUN_KEY, "thresholds")
-_TABLES = {
-    **dict.fromkeys(("objects", "route", "collisions"), RUN_KEY),
-    "scores": PROFILE_KEY,
-    "metrics": (*PROFILE_KEY, "metric"),
-    "statistics": (*PROFILE_KEY, "metric", "statistic"),
-    "time_series": (*RUN_KEY, "metric"),
-}
-# coordinates near 4e6 are spaced 5e-10
-RECORDED = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": TOLERANCE}
+RECORDED = COMPARED["ego.parquet"]["recorded"]
+# how the devkit files each metric, and the units of scores that have one
+CATEGORIES, UNITS = (COMPARED["metrics.parquet"][what] for what in ("category", "unit"))
+_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 _CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
-# how the devkit files each metric: the category of those that are not of Planning, and the units
-# of scores that have one
-CATEGORIES = {
-    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
-    **dict.fromkeys(("ego_jerk", "ego_lon_jerk", "ego_yaw_acceleration"), "Dynamics"),
-    **dict.fromkeys(("ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
-    **dict.fromkeys(("ego_yaw_rate", "no_ego_at_fault_collisions"), "Dynamics"),
-}
-UNITS = {
-    **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
-    **dict.fromkeys(("drivable_area_compliance", "time_to_collision_within_bound"), "bool"),
-    **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
-    "driving_direction_compliance": "bool",
-}
 
 
 def verify_nuplan_metrics(
@@ -56,45 +37,41 @@ def verify_nuplan_metrics(
 
     `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
-    runs = Groups(expected / "ego.parquet", report)
-    tables = {n: Groups(expected / f"{n}.parquet", report, key) for n, key in _TABLES.items()}
-    replayed = Groups(logged / "objects.parquet", report) if logged else tables["objects"]
-    experts = Groups((logged or expected) / "log_ego.parquet", report, ("scene", "kind"))
+    tables = open_tables(expected, report, *_TABLES)
+    replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
+    experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
     tables["objects"].table.note("no metric reads it", "height")
-    for run in runs:
-        if mode not in (None, run[1]):
+    for run in tables["ego"]:
+        scene, challenge, _ = run
+        if mode not in (None, challenge):
             continue
         with report.attempt("recorded rollout", " ".join(run)):
-            entry, objects = scenes.entries[run[0]], replayed[run[0], "NR", "*"]
-            if run[1] == "R":
-                objects = tables["objects"][run]
-            road = scenes.maps[entry["map"]]
-            measured = _measure(run, runs[run], objects, experts[run[0], "iteration"], road)
-            _compare_run(run, measured, road, tables)
+            entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
+            seen = (tables["objects"], run) if challenge == "R" else (replayed, (scene, "NR", "*"))
+            log = _rollout(tables["ego"][run], experts[scene, "iteration"], seen[0][seen[1]], road)
+            times = log.expert_time_us[: len(log.ego)]
+            columns = {"iteration": np.arange(len(times)), "time_us": times}
+            columns |= {name: worlds.ego_columns(log.ego)[name] for name in RECORDED}
+            tables["ego"].match(run, columns, RECORDED, quantity="recorded")
+            measured = measure(log, road)
+            tables["route"].match(run, _route(measured, road))
+            tables["collisions"].match(run, _collisions(measured))
             for thresholds, profile in PROFILES.items():
                 result = judge(measured, profile)
                 _compare_profile((*run, thresholds), result, entry, tables)
                 if profile == "nuplan":
                     _compare_series(run, result, tables["time_series"])
-    for table in (runs, *tables.values()):
+    for table in tables.values():
         table.finish(mode)
 
 
-def _measure(
-    run: tuple[str, ...], rows: Source, objects: Source, expert: Source, road: VectorMap
-) -> Measurements:
-    """Compare what the tables say of the ego itself, and measure the rollout."""
+def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> SimulationLog:
     ego, logged = (
         worlds.ego_states({n: part[n] for n in worlds.EGO_COLUMNS}) for part in (rows, expert)
     )
     times, tracks = expert["time_us"].astype(np.int64), tracks_of(objects, len(ego))
-    scenario = worlds.make_scenario(run[0], road, times, logged, tracks)
-    log = replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
-    columns, count = worlds.ego_columns(ego), len(logged) - 1
-    ours = {"iteration": np.arange(count), "time_us": times[:count]}
-    ours |= {name: columns[name] for name in RECORDED}
-    rows.match(" ".join(run), ours, RECORDED, quantity="recorded")
-    return measure(log, road)
+    scenario = worlds.make_scenario("recorded", road, times, logged, tracks)
+    return replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
 
 
 def tracks_of(rows: Source, count: int) -> Tracks:
@@ -114,21 +91,22 @@ def tracks_of(rows: Source, count: int) -> Tracks:
     return worlds.make_tracks((count, len(kinds)), where, values, list(kinds.values()), list(kinds))
 
 
-def _compare_run(
-    run: tuple[str, ...], measured: Measurements, road: VectorMap, tables: dict[str, Groups]
-) -> None:
-    """Compare what no threshold enters: routes and collisions."""
-    samples = range(len(measured.time_us))
-    ours = {
+def _route(measured: Measurements, road: VectorMap) -> dict[str, Any]:
+    samples, corners = range(len(measured.time_us)), enumerate(_CORNERS)
+    return {
         "iteration": np.arange(len(samples)),
         "center": [",".join(measured.route.ids(road, i)) for i in samples],
         "in_common_or_connected": measured.is_common,
+        **{
+            name: [",".join(measured.corners.ids(road, i, c)) for i in samples]
+            for c, name in corners
+        },
     }
-    for corner, column in enumerate(_CORNERS):
-        ours[column] = [",".join(measured.corners.ids(road, i, corner)) for i in samples]
-    tables["route"].match(run, ours)
+
+
+def _collisions(measured: Measurements) -> dict[str, Any]:
     found = measured.collisions
-    contacts = {
+    return {
         "time_us": [c.time_us for c in found],
         "track_token": [c.token for c in found],
         "type": [AgentKind(c.kind).name for c in found],
@@ -137,7 +115,6 @@ def _compare_run(
         "at_fault": [c.at_fault for c in found],
         "timestamp_has_at_fault": [c.time_us in measured.at_fault_times for c in found],
     }
-    tables["collisions"].match(run, contacts, TOLERANCE)
 
 
 def _compare_profile(
@@ -147,7 +124,7 @@ def _compare_profile(
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
     row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
     row |= {"score": result.score}
-    tables["scores"].match(key, {name: [value] for name, value in row.items()}, SCORE_TOLERANCES)
+    tables["scores"].match(key, {name: [value] for name, value in row.items()})
     tables["metrics"].match_keys(key, [(name,) for name in scores])
     for name, score in scores.items():
         filed = {"category": [CATEGORIES.get(name, "Planning")], "unit": [UNITS.get(name)]}
@@ -156,9 +133,9 @@ def _compare_profile(
     found = result.statistics
     tables["statistics"].match_keys(key, [(s.metric, s.name) for s in found])
     for s in found:
-        filed = {"unit": [s.unit or None], "type": [s.kind or None]}
-        atol = {"value": EXACT if s.unit in ("boolean", "count") else TOLERANCE}
-        tables["statistics"].match((*key, s.metric, s.name), {**filed, "value": [s.value]}, atol)
+        ours = {"unit": [s.unit or None], "type": [s.kind or None], "value": [s.value]}
+        is_exact = s.unit in ("boolean", "count")
+        tables["statistics"].match((*key, s.metric, s.name), ours, EXACT if is_exact else None)
 
 
 def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -> None:
@@ -171,5 +148,5 @@ def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -
             "time_us": times,
             "value": ours.values,
         }
-        atol = {"value": EXACT if ours.unit == "boolean" else TOLERANCE}
+        atol = EXACT if ours.unit == "boolean" else None
         table.match((*run, metric), columns, atol, quantity="series")

@@ -17,17 +17,17 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
-from shiftsim.verify.files import TOLERANCE, Groups, Source
+from shiftsim.verify.files import COMPARED, TOLERANCE, Source, open_tables
 from shiftsim.verify.metric_worlds import known_scores
-from shiftsim.verify.nuplan.metrics import PROFILE_KEY, PROFILES, tracks_of
+from shiftsim.verify.nuplan.metrics import PROFILES, tracks_of
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks, Trajectory
 
-EGO_TOLERANCES = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # rad; m, m/s …
-# m, rad, m/s; the README of the folder allows 1e-3 m
-OBJECT_TOLERANCES = {"x": 1e-4, "y": 1e-4, "heading": 1e-5, "vx": 1e-4, "vy": 1e-4}
+EGO_TOLERANCES, OBJECT_TOLERANCES = (
+    COMPARED[f"{name}.parquet"]["atol"] for name in ("ego", "objects")
+)
 EVERY = 10  # iterations between recorded plans; the last one is recorded as well
 CHALLENGES = {  # controller and traffic
     "NR": ("lqr", "nonreactive"),
@@ -49,30 +49,28 @@ def verify_simulation(
 
     `scripted.parquet` is beside the folder; `logged` has the table of logged objects.
     """
-    runs = Groups(folder / "ego.parquet", report)
-    objects = Groups(folder / "objects.parquet", report)
-    replayed = Groups(logged / "objects.parquet", report) if logged else objects
-    scores = Groups(folder / "scores.parquet", report, PROFILE_KEY)
+    runs, objects, scores = open_tables(folder, report, "ego", "objects", "scores").values()
+    replayed = open_tables(logged, report, "objects")["objects"] if logged else objects
     for key in dict.fromkeys([*runs, *(key for key in objects if key[1] == "R")]):
-        (scene, challenge, planner), where = key, " ".join(key)
+        scene, challenge, planner = key
         if mode not in (None, challenge):
             continue
-        with report.attempt("simulation", where):
+        with report.attempt("simulation", " ".join(key)):
             if challenge not in CHALLENGES or scene not in scenes:
                 raise DataError("no such challenge or scene")
             controller, traffic = CHALLENGES[challenge]
             driver = _load_planner(planner, folder.parent / "scripted.parquet")
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
             samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
-            runs.match(key, samples | ego_columns(log.ego), EGO_TOLERANCES, quantity="ego")
+            runs.match(key, samples | ego_columns(log.ego), quantity="ego")
             if challenge == "R":
-                found = _objects(log, replayed[scene, "NR", "*"])
-                objects.match(key, found, OBJECT_TOLERANCES, quantity="reactive")
+                shown = _objects(log, replayed[scene, "NR", "*"])
+                objects.match(key, shown, quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                rated = known_scores(judge(measured, profile)).items()
-                columns = {name: [score] for name, score in rated}
-                scores.match((*key, thresholds), columns, TOLERANCE, quantity="simulated score")
+                rated = known_scores(judge(measured, profile))
+                columns = {name: [score] for name, score in rated.items()}
+                scores.match((*key, thresholds), columns, quantity="simulated score")
     if mode in (None, "R"):
         objects.table.finish()
 
@@ -111,9 +109,7 @@ def verify_planners(
     folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
 ) -> None:
     """Plan again at every iteration of `trajectories.parquet` (of one mode) and compare states."""
-    plans = Groups(folder / "trajectories.parquet", report)
-    egos = Groups(folder / "ego.parquet", report)
-    objects = Groups(folder / "objects.parquet", report)
+    plans, egos, objects = open_tables(folder, report, "trajectories", "ego", "objects").values()
     for key in {**dict.fromkeys(egos), **dict.fromkeys(plans)}:
         scene, challenge, name = key
         if name.startswith(_SCRIPTED) or mode not in (None, challenge):

@@ -82,6 +82,11 @@ class BridgeMap(AbstractMap):
             found = self._made[layer, index] = kind(self, getattr(self.source, layer), index)
         return found
 
+    def objects(self, layer: Any) -> list[Any]:
+        """All objects of a layer, in the order of the source; not part of nuPlan's interface."""
+        span = self._span(layer)
+        return [self.object(span.name, index) for index in range(span.first, span.stop)]
+
     def get_available_map_objects(self) -> list[Any]:
         """Layers whose objects can be asked for."""
         return [layer for layer in self._spans if layer != _LAYERS.DRIVABLE_AREA]

@@ -73,7 +73,7 @@ class BridgePolyline(PolylineMapObject):
 
     def get_nearest_pose_from_position(self, point: Point2D) -> Any:
         """The nearest point of the line, heading for the point 0.5 m further on it."""
-        # at the end of the line the heading is that of its last 0.5 m
+        # nuPlan rule 601: at the end of the line the heading is that of its last 0.5 m
         arc = self.get_nearest_arc_length_from_position(point)
         here, behind, ahead = (
             self._point(arc + offset) for offset in (0.0, -_HEADING_STEP, _HEADING_STEP)
@@ -82,7 +82,10 @@ class BridgePolyline(PolylineMapObject):
         return StateSE2(*here.tolist(), float(np.arctan2(step[1], step[0])))
 
     def get_curvature_at_arc_length(self, arc_length: float) -> float:
-        """Curvature of the circle through three points 2 m apart, positive to the left [1/m]."""
+        """Curvature of the circle through three points 2 m apart, positive to the left [1/m].
+
+        nuPlan rule 605: near the ends of the line the middle one is moved inward.
+        """
         assert 0.0 <= arc_length <= self.length, f"{arc_length} m is not on the line"
         half = min(_CURVATURE_STEP, 0.5 * self.length)
         middle = min(max(arc_length, half), self.length - half)
@@ -266,7 +269,7 @@ class BridgeIntersection(_Mapped, Intersection):
 
 
 class BridgeArea(_Mapped, PolygonMapObject):
-    """A crosswalk, a walkway or a car park."""
+    """A crosswalk, a walkway, a car park or a drivable area."""
 
 
 KINDS = {  # of the objects of a layer; lane connectors, the last of the edges, have their own
@@ -277,4 +280,5 @@ KINDS = {  # of the objects of a layer; lane connectors, the last of the edges, 
     "crosswalks": BridgeArea,
     "walkways": BridgeArea,
     "car_parks": BridgeArea,
+    "drivable_areas": BridgeArea,
 }

@@ -11,18 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from subprocess import DEVNULL
 
 import numpy as np
 
-from shiftsim.files import fresh_python
+from shiftsim.files import PACKAGE, fresh_python
 from shiftsim.sim.log import SimulationLog
+from shiftsim.verify.metric_worlds import read_world
+from shiftsim.verify.worlds import make_scenario, make_tracks
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA
 
-WORLD = Path(__file__).parent / "reference" / "metric_worlds" / "metric_world_21.json"
+WORLD = PACKAGE / "verify" / "reference" / "metric_worlds" / "metric_world_21.json"
 
 
 @contextmanager
@@ -31,7 +32,7 @@ def warm_up(*shares: str) -> Iterator[None]:
 
     A share that fails is left to whoever runs into its cause.
     """
-    command = "import sys; from shiftsim.verify.warmup import SHARES; SHARES[sys.argv[1]]()"
+    command = "import sys; from shiftsim.warmup import SHARES; SHARES[sys.argv[1]]()"
     start = partial(subprocess.Popen, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
     starts = [fresh_python(command, share) for share in shares or SHARES]
     processes = [start(words, env=environment) for words, environment in starts]
@@ -91,9 +92,6 @@ SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
 
 def _rollout() -> tuple[SimulationLog, VectorMap]:
     """A drive past a car and a pedestrian, and its map."""
-    from shiftsim.verify.metric_worlds import read_world
-    from shiftsim.verify.worlds import make_tracks
-
     log, road = read_world(json.loads(WORLD.read_text("utf-8")))
     values = np.ones((len(log.time_us), 2, 7))
     values[..., :3] = log.ego[:, None, :3] + [[12.0, 0.0, 0.0], [30.0, 0.0, 0.0]]
@@ -104,8 +102,6 @@ def _rollout() -> tuple[SimulationLog, VectorMap]:
 
 def scene() -> Scenario:
     """A scenario of a dozen iterations: a small map with a route, a car, a pedestrian."""
-    from shiftsim.verify.worlds import make_scenario
-
     log, road = _rollout()
     out = make_scenario(log.token, road, log.time_us, log.ego, log.tracks)
     return replace(out, iteration_rows=np.arange(12, dtype=np.int64), route=("R1", "RC1", "R2"))
