@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,19 +12,19 @@ from shiftsim.sim.planner import scene_info
 from shiftsim.verify.files import TOLERANCE, Groups, Source, read_arrays, read_json
 from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
 from shiftsim.verify.nuplan.runs import CHALLENGES, Seen, verify_simulation
-from shiftsim.verify.pdm.steps import STEP_TOLERANCE, compare_scores, step_arrays
+from shiftsim.verify.pdm.steps import compare_scores, step_arrays
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.world import state
+from shiftsim.verify.tables import read_tables
 from shiftsim.world.scenario import Scenario
 
+TABLES = read_tables(__file__)
 PLAN_TOLERANCES = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: stored as 32 bit floats
+STEP_TOLERANCE = 1e-6  # m, rad, m/s …
 _TABLES = (
     *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects", "ego"),
     *("steps", "proposals"),
 )
-_DRIVEN = ("sim_x", "sim_y", "sim_heading", "sim_vx", "sim_ax", "sim_steering")
-_ENDS = [state.X, state.Y, state.HEADING, state.VX, state.AX, state.STEERING]  # likewise
 
 
 def verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None = None) -> None:
@@ -60,7 +59,10 @@ def verify_calls(
             seen = Seen(scenes[scene], egos[key], objects[key], challenge)
             call, file = (scene, challenge), read_arrays(arrays, report, "PDM")
             planner = _compare_calls(where, seen, steps[call], proposals[call], file)
-            _compare_facts(where, seen, planner, static.each(scene)[0].each(challenge)[0])
+            facts, line = static.each(scene)[0].each(challenge)[0], planner.centerline
+            assert line is not None
+            names = {"road": seen.scenario.map, "scenario": seen.scenario, "planner": planner}
+            TABLES["facts"].match(facts, where, path=make_path(line), nothing=None, **names)
     for table in (steps, proposals):
         table.finish(mode)
     if mode is None:
@@ -77,10 +79,11 @@ def _compare_calls(
     planner.reset(scene_info(seen.scenario, planner=planner))
     count, per_call = len(seen.ego), proposals.num_rows // len(seen.ego)
     calls, numbers = np.arange(count), np.arange(per_call)
-    times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
     steps.match(where, {"iteration": calls})
     rows = {"proposal": np.tile(numbers, count), "iteration": np.repeat(calls, per_call)}
     proposals.match(where, rows)
+    times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
+    file.match(where, {"trajectory_time_us": times})
     plans = file.take("trajectory", count, STEPS + 1, 3).astype(np.float64)
     plans[:, :, :2] += file.take("trajectory_origin", 3)[:2]
     for index, plan in enumerate(plans):
@@ -88,45 +91,19 @@ def _compare_calls(
         step, sight = planner.step(observation), planner.seen
         assert sight is not None
         row, theirs = steps.at(index), proposals.at(numbers + index * per_call)
-        ours: dict[str, Any] = {
-            "time_us": observation.time_us,
-            "current_lane_id": road.edges.ids[sight.lane],
-            "speed_limit_mps": float(road.speed_limits[sight.lane]),
-            "collided_ids": ",".join(planner.collided),
-            "n_map_tokens": len(sight.tokens),
-            "n_drivable_tokens": len(sight.place.selected),
-        }
-        row.match(at, ours, quantity="PDM step")
+        names = {"road": road, "seen": observation, "sight": sight}
+        names["limit"] = float(road.speed_limits[sight.lane])
+        names["collided"] = ",".join(planner.collided)
+        TABLES["step"].match(row, at, **names)
         row.match(at, {"best_score": theirs["score"].max()}, TOLERANCE, quantity="PDM")
-        ends = dict(zip(_DRIVEN, step.driven.states[:, -1, _ENDS].T, strict=True))
-        theirs.match(at, ends, STEP_TOLERANCE, quantity="PDM")
+        TABLES["ends"].match(theirs, at, ends=step.driven.states[:, -1])
         choice = (int(row["best"]), bool(row["braked"]))
         if compare_scores(at, seen.ego[index], sight, step, theirs, choice):
             file.report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
         if f"proposals_{index}" in file:
             ids = [*road.edges.ids, *road.car_parks.ids]
-            arrays: dict[str, Any] = step_arrays(step)
-            arrays["proposals"] = arrays.pop("proposal_poses")
-            arrays["map_tokens"] = sight.tokens
-            arrays["drivable_tokens"] = [ids[area] for area in sight.place.selected.tolist()]
-            stored = {f"{name}_{index}": array for name, array in arrays.items()}
-            file.match(at, stored, STEP_TOLERANCE)
-    file.match(where, {"trajectory_time_us": times})
+            areas = [ids[area] for area in sight.place.selected.tolist()]
+            arrays = {"map_tokens": sight.tokens, "drivable_tokens": areas, **step_arrays(step)}
+            file.match(at, {f"{name}_{index}": arrays[name] for name in arrays}, STEP_TOLERANCE)
     file.finish()
     return planner
-
-
-def _compare_facts(where: str, seen: Seen, planner: PdmClosed, facts: Source) -> None:
-    """Compare what is decided once per scenario."""
-    road, route, line = seen.scenario.map, planner.route, planner.centerline
-    assert route is not None
-    assert line is not None
-    ours = {
-        "scenario_route_ids": list(seen.scenario.route),
-        "route_ids": [road.blocks.ids[block] for block in route.corrected],
-        "route_lane_ids": [road.edges.ids[edge] for edge in route.lanes.tolist()],
-        "centerline": line,
-        "centerline_length": float(make_path(line).progress[-1]),
-        "ego_state": None,
-    }
-    facts.match(where, ours, TOLERANCE, quantity="PDM static")

@@ -20,21 +20,16 @@ from shiftsim.planners.proposals.contacts import Others
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
-from shiftsim.verify.files import TOLERANCE, Source, read_arrays, read_fields, read_json
+from shiftsim.verify.files import Source, read_arrays, read_fields, read_json
 from shiftsim.verify.report import Report
+from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
 from shiftsim.world.layers import make_polygons
 from shiftsim.world.state import HEADING, PACIFICA, VX, VY, center_poses
 
-STEP_TOLERANCE = 1e-6  # m, rad, m/s …; coordinates near 5e6 are spaced 1e-9
-SHOWN_FORECASTS = (0, 11, 40)  # time indices of `map_boxes`
+TABLES = read_tables(__file__)
 UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
 ASIDE = np.array([1e-6, 3e-6])  # m, moves what is exactly ahead or behind to a side
-SCORE_COLUMNS = (  # of the reference, in the order of the fields of `Scores`
-    *("score", "no_collision", "drivable_area", "driving_direction", "progress", "ttc", "comfort"),
-    *("progress_raw", "collision_idx", "ttc_idx"),
-)
-SCORE_TOLERANCES = {"score": TOLERANCE, "progress": TOLERANCE, "progress_raw": STEP_TOLERANCE}
 
 
 def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
@@ -47,35 +42,39 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
     ego = np.array(inputs["ego_state"], np.float64)
     seen, collided, step = _plan(inputs, ego)
-    scores = step.scores
-    ours = {
-        "map_tokens": seen.tokens,
-        "collided_ids": collided,
-        "map_boxes": seen.forecast.others.boxes[[index // 2 for index in SHOWN_FORECASTS]],
-        "trajectory_time_us": int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1),
-        **step_arrays(step),
-    }
-    file.match(where, ours, STEP_TOLERANCE)
+    made = {"seen": seen, "collided": collided, "step": step, "arrays": step_arrays(step)}
+    made["boxes"] = seen.forecast.others.boxes[[0, 5, 20]]  # two time indices each
+    made["times"] = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
+    TABLES["step"].match(file, where, **made)
     rows = [file["scores"], *file.take("multi", 3, -1), *file.take("weighted", 3, -1)]
-    rows += [file[name] for name in SCORE_COLUMNS[7:]]
-    theirs = Source("PDM", "score", dict(zip(SCORE_COLUMNS, rows, strict=True)), report)
+    rows += [file[name] for name in ("progress_raw", "collision_idx", "ttc_idx")]
+    theirs = Source("PDM", "score", dict(zip(TABLES["scores"].rows, rows, strict=True)), report)
     choice = (int(file["best"]), bool(file["braked"]))
     if compare_scores(where, ego, seen, step, theirs, choice):
-        file.match(where, {"trajectory_rear": step.poses}, STEP_TOLERANCE)
+        TABLES["plan"].match(file, where, **made)
     file.note("compared where the same proposal is chosen", "trajectory_rear")
     inputs.finish()
     file.finish()
+    scores = step.scores
     facts[where] = {
-        "best": step.best,
-        "braked": step.braked,
+        **made,
         "best_score": float(scores.total.max()),
-        "n_objects": len(inputs["objects"]),
-        "red": len(inputs["red_light_lane_ids"]),
-        "collided": len(collided),
-        "zero_scores": int((scores.total == 0.0).sum()),
-        "at_fault": int(np.isfinite(scores.collision_index).sum()),
-        "ttc": int(np.isfinite(scores.ttc_index).sum()),
+        "objects": inputs["objects"],
+        "red": inputs["red_light_lane_ids"],
+        "zero": np.flatnonzero(scores.total == 0.0),
+        "at_fault": np.flatnonzero(np.isfinite(scores.collision_index)),
+        "too_near": np.flatnonzero(np.isfinite(scores.ttc_index)),
     }
+
+
+def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
+    """Compare the entries of `step_core_summary.json` with what the steps came to."""
+    for entry in read_json(path):
+        name, theirs = entry.get("case", "?"), Source(path.name, "field", entry, report)
+        theirs.note("label", "case")
+        with report.attempt("PDM step summary", name):
+            TABLES["summary"].match(theirs, name, **facts[name])
+            theirs.finish()
 
 
 def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
@@ -88,8 +87,7 @@ def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
     chosen = around.select_tracks(tracks, center[0], center[1], set(), DEFAULT)
     rings = {part["id"]: np.array(part["exterior"], np.float64) for part in parts}
     reds = {around.LIGHT_TOKEN + name: rings[name] for name in inputs["red_light_lane_ids"]}
-    is_closed = {name: int((ring[0] == ring[-1]).all()) for name, ring in reds.items()}
-    lights = [ring[: len(ring) - is_closed[name]] for name, ring in reds.items()]
+    lights = [ring[:-1] if (ring[0] == ring[-1]).all() else ring for ring in reds.values()]
     forecast = around.make_forecast(tracks, chosen, red_lights([], lights))
     tokens = [*(tracks.tokens[i] for i in chosen.tolist()), *reds]
     size = np.array([PACIFICA.length, PACIFICA.width])
@@ -98,15 +96,14 @@ def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
     line = np.array(inputs["centerline"], np.float64)
     paths = [make_path(line), *(make_path(offset_poses(line, s)) for s in DEFAULT.lateral_offsets)]
     crossings = make_polygons([[np.array(r, np.float64)] for r in inputs["intersections"]])
-    numbers = np.arange(len(parts))
-    on_route = np.array([part["on_route"] for part in parts], np.bool_)
+    numbers, on_route = np.arange(len(parts)), np.array([p["on_route"] for p in parts], np.bool_)
     areas = areas_of(make_polygons([[ring] for ring in rings.values()]), on_route, numbers)
-    place = Place(areas, numbers, crossings, paths[0])
-    limit = inputs["speed_limit_mps"]
+    place, limit = Place(areas, numbers, crossings, paths[0]), inputs["speed_limit_mps"]
     limit = DEFAULT.fallback_velocity if limit is None else limit
-    targets = limit * np.array(DEFAULT.speed_fractions)
     scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
-    step = plan_step(ego, targets, scene, place, PACIFICA, DEFAULT)
+    step = plan_step(
+        ego, limit * np.array(DEFAULT.speed_fractions), scene, place, PACIFICA, DEFAULT
+    )
     return Seen(forecast, tokens, place, -1), [tokens[i] for i in hit], step
 
 
@@ -114,12 +111,9 @@ def step_arrays(step: Step) -> dict[str, np.ndarray]:
     """Proposals, leads, driven states and areas of a step by the names of the reference."""
     made, shape = step.proposals, step.driven.states.shape[:2]
     # the best proposal goes on to 8 s; what is recorded ends where proposals are compared
-    poses, motion, leads = (
-        array[:, :, : SCORED + 1].reshape(*shape, -1)
-        for array in (made.poses, made.motion, made.leads)
-    )
-    rolled = {"proposal_poses": poses, "idm": motion, "lead": leads}
-    return {**rolled, "simulated": step.driven.states, "ego_areas": step.scores.flags}
+    rolled = {"proposals": made.poses, "idm": made.motion, "lead": made.leads}
+    arrays = {n: array[:, :, : SCORED + 1].reshape(*shape, -1) for n, array in rolled.items()}
+    return {**arrays, "simulated": step.driven.states, "ego_areas": step.scores.flags}
 
 
 def compare_scores(
@@ -132,8 +126,7 @@ def compare_scores(
 ) -> bool:
     """Compare scores, choice and brake decision of a step; whether both chose the same plan."""
     ours, report = _settled(where, seen, step, theirs), theirs.report
-    values = dict(zip(SCORE_COLUMNS, ours, strict=False))  # not the flags behind the scores
-    theirs.match(where, values, SCORE_TOLERANCES, quantity="PDM")
+    TABLES["scores"].match(theirs, where, scores=ours)
     best = int(np.argmax(ours.total))
     report.compare("PDM choice", where, best, choice[0])
     is_slow = np.hypot(ego[VX], ego[VY]) <= DEFAULT.brake_speed
@@ -148,27 +141,22 @@ def _settled(where: str, seen: Seen, step: Step, theirs: Source) -> Scores:
     The bearing is an arccos of a number that may round beyond 1 where an object is exactly ahead or
     behind; then it is overlooked. Either outcome is accepted there, and named.
     """
-    ours, given, index = step.scores, theirs["ttc"], theirs["ttc_idx"]
+    ours, index = step.scores, theirs["ttc_idx"]
+    if (ours.ttc_index == index).all():
+        return ours
     states, others = step.driven.states, seen.forecast.others
-    exempt = (ours.ttc != given) | (ours.ttc_index != index)
-    if exempt.any():
-        counted = others._replace(centroids=others.centroids + ASIDE)
-        overlooked = others._replace(ignored=others.ignored | _in_line(states, others))
-        outcomes = [
-            score(states, seen.place, boxes, ego_box(PACIFICA), DEFAULT).ttc_index
-            for boxes in (counted, overlooked)
-        ]
-        exempt &= (index == outcomes).any(axis=0) & (np.isfinite(index) == (given < 1.0))
-    for row in np.flatnonzero(exempt).tolist():
-        note = "an object exactly ahead or behind"
-        theirs.report.note(f"PDM ttc at {where}, proposal {row}: {note}")
-    ttc = np.where(exempt, given, ours.ttc)
+    counted = others._replace(centroids=others.centroids + ASIDE)
+    overlooked = others._replace(ignored=others.ignored | _in_line(states, others))
+    for boxes in (counted, overlooked):
+        other = score(states, seen.place, boxes, ego_box(PACIFICA), DEFAULT)
+        rows = (ours.ttc_index != index) & (other.ttc_index == index)
+        for row in np.flatnonzero(rows).tolist():
+            note = "an object exactly ahead or behind"
+            theirs.report.note(f"PDM ttc at {where}, proposal {row}: {note}")
+        ttc, ttc_index = np.where(rows, (other.ttc, index), (ours.ttc, ours.ttc_index))
+        ours = ours._replace(ttc=ttc, ttc_index=ttc_index)
     factor = ours.no_collision * ours.drivable * ours.direction
-    return ours._replace(
-        ttc=ttc,
-        ttc_index=np.where(exempt, index, ours.ttc_index),
-        total=factor * weigh(ours.progress, ttc, ours.comfort, DEFAULT),
-    )
+    return ours._replace(total=factor * weigh(ours.progress, ours.ttc, ours.comfort, DEFAULT))
 
 
 def _in_line(states: FloatArray, others: Others) -> BoolArray:
@@ -178,17 +166,5 @@ def _in_line(states: FloatArray, others: Others) -> BoolArray:
     for later in TTC_STEPS:
         away = others.centroids[(times + later) // 2] - states[:, :, None, :2]
         aside = np.abs(cos * away[..., 1] - sin * away[..., 0])
-        is_exact = aside < UNSTABLE_BEARING * np.linalg.norm(away, axis=-1)
-        out |= is_exact.any(axis=(0, 1))
+        out |= (aside < UNSTABLE_BEARING * np.linalg.norm(away, axis=-1)).any(axis=(0, 1))
     return out
-
-
-def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
-    """Compare the entries of `step_core_summary.json` with what the steps came to."""
-    for entry in read_json(path):
-        name = entry.get("case", "?")
-        theirs = Source("step_core_summary.json", "field", entry, report)
-        theirs.note("label", "case")
-        with report.attempt("PDM step summary", name):
-            theirs.match(name, facts[name], TOLERANCE, quantity="PDM summary")
-            theirs.finish()

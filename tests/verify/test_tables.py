@@ -1,0 +1,124 @@
+"""Tables of what is compared with what: where ours is, tolerances, texts, cases of files."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from shiftsim.verify.files import Source
+from shiftsim.verify.report import ERRORS, Report
+from shiftsim.verify.tables import Table, read_tables, verify_cases
+
+ROAD = SimpleNamespace(blocks=SimpleNamespace(ids=["B0", "B1", "B2"]))
+NAMES = {
+    "road": ROAD,
+    "tracks": SimpleNamespace(tokens=("t0", "t1")),
+    "step": SimpleNamespace(best=2, poses=np.arange(6.0).reshape(2, 3)),
+    "made": {"lanes": [4, 5, 6]},
+    "chosen": np.array([2, 0]),
+}
+
+
+def compared(rows, theirs, **names):
+    report = Report()
+    Table(rows).match(Source("file", "array", theirs, report), "case 0", **NAMES, **names)
+    return report
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "other"),
+    [
+        ("step.best", 2, 3),
+        ("made.lanes", [4, 5, 6], [4, 5, 7]),
+        ("step.poses[1, 2]", 5.0, 5.1),
+        ("step.poses[-1]", [3.0, 4.0, 5.0], [3.0, 4.0, 5.1]),
+        ("step.poses[:, :2]", [[0.0, 1.0], [3.0, 4.0]], [[0.0, 1.0], [3.0, 4.1]]),
+        ("number of made.lanes", 3, 4),
+        ("blocks of step.best", "B2", "B1"),
+        ("blocks of chosen", ["B2", "B0"], ["B0", "B2"]),
+        ("tracks of made.lanes[:0]", [], ["t0"]),
+        ("= planner {step.best}", "planner 2", "planner 3"),
+        ("= planner *", "planner of somebody", "a planner"),
+        (41, 41, 42),
+        ({"lanes": "made.lanes", "text": "= *"}, {"lanes": [4, 5, 6], "text": "?"}, {"lanes": []}),
+    ],
+)
+def test_a_row_says_where_ours_is(row, value, other):
+    assert compared({"x": row}, {"x": value}).mismatches == []
+    assert compared({"x": row}, {"x": other}).mismatches
+    assert compared({"x": row}, {}).mismatches
+
+
+def test_a_row_may_have_a_tolerance_of_its_own():
+    rows = {"*": {"atol": 1e-3}, "a": "step.poses[0]", "b": ["step.poses[0]", [0.0, 0.0, 0.1]]}
+    near, far = np.array([0.0, 1.0, 2.01]), np.array([0.01, 1.0, 2.0])
+    assert len(compared(rows, {"a": near, "b": near}).mismatches) == 1
+    assert compared(rows, {"a": near, "b": near}).mismatches[0].startswith("file a")
+    assert len(compared(rows, {"a": far, "b": far}).mismatches) == 2
+
+
+def test_a_tolerance_may_depend_on_the_variant():
+    rows = {"x": ["step.poses[0, 1]", {"base": 1e-3, "drive": 1e-1}]}
+    assert compared(rows, {"x": 1.01}, variant="base").mismatches
+    assert compared(rows, {"x": 1.01}, variant="drive").mismatches == []
+
+
+def test_rows_of_an_optional_section_may_be_missing_and_not_differ():
+    rows = {"*": {"optional": True, "called": "PDM"}, "x": "step.best", "y": "step.best"}
+    report = compared(rows, {"y": 3})
+    assert [line.split(":")[0] for line in report.mismatches] == ["PDM y"]
+
+
+def cases_of(path, compare):
+    report = Report()
+    verify_cases(compare, path, report)
+    return report
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+def test_cases_are_the_rows_or_the_numbered_arrays_of_a_file(tmp_path, numbered):
+    rows = {"x": np.arange(3.0), "y": np.arange(3.0) ** 2}
+    parts = {f"{i}_{name}": array[i] for name, array in rows.items() for i in range(3)}
+    np.savez(tmp_path / "file.npz", **(parts if numbered else rows))
+    report = cases_of(
+        tmp_path / "file.npz", lambda case, where: case.match(where, {"y": case["x"] * 2.0})
+    )
+    assert [line.split(":")[1].strip() for line in report.mismatches] == ["file 1"]
+    assert report.num_cases == 3
+    assert report.not_covered == {}
+
+
+@pytest.mark.parametrize("short", ["x", "y"])
+def test_an_array_with_fewer_rows_is_a_mismatch_and_one_that_nothing_reads_is_named(
+    tmp_path, short
+):
+    arrays = {"x": np.arange(3.0), "y": np.arange(3.0), "more": np.zeros(1)}
+    np.savez(tmp_path / "file.npz", **{**arrays, short: arrays[short][:2]})
+    report = cases_of(
+        tmp_path / "file.npz", lambda case, where: case.match(where, {"y": case["x"]})
+    )
+    assert len(report.mismatches) == 1
+    assert list(report.not_covered) == ["file: array 'more'"]
+
+
+def test_an_array_without_a_number_among_those_with_one_is_refused(tmp_path):
+    np.savez(tmp_path / "file.npz", **{"0_x": [1], "y": [1]})
+    with pytest.raises(ERRORS, match="invalid literal"):
+        cases_of(tmp_path / "file.npz", lambda case, where: None)
+
+
+def test_a_case_that_fails_is_a_mismatch_and_the_others_are_compared(tmp_path):
+    path = tmp_path / "file.json"
+    path.write_text(json.dumps([{"x": 1}, {"y": 1}, {"x": 2, "z": 3}]))
+    report = cases_of(path, lambda case, where: case.match(where, {"x": case["x"]}))
+    assert len(report.mismatches) == 1
+    assert report.num_cases == 3
+    assert set(report.not_covered) == {"file.json: field 'y'", "file.json: field 'z'"}
+
+
+def test_a_table_is_read_from_beside_the_module(tmp_path):
+    (tmp_path / "part.toml").write_text('[ends]\n"*" = { atol = 1e-9 }\n"a/b" = "line[-1]"\n')
+    tables = read_tables(str(tmp_path / "part.py"))
+    assert tables["ends"].rows == {"a/b": "line[-1]"}
+    assert tables["ends"].about["atol"] == 1e-9
