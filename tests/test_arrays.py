@@ -167,3 +167,53 @@ def test_processes_at_the_same_time_leave_whole_files(file, tmp_path):
     assert (add(1, 2), add(1.5, 2), add(1, 2.5)) == (4, 5.0, 4.5)
     assert hits(add) == 3
     assert len(kept(tmp_path)) == 5
+
+
+LOADED = """
+import sys
+import numpy as np
+from shiftsim.arrays import kernel
+
+@kernel
+def norms(points):
+    out = np.empty(len(points))
+    for i in range(len(points)):
+        out[i] = np.hypot(points[i, 0], points[i, 1]) % 4.0
+    if out[0] < 0.0:
+        raise ValueError("never")
+    return out
+
+@kernel
+def digest(text):
+    return hash(text) == hash("a") and text in {"a": 1}
+
+@kernel
+def product(points):
+    return norms(points).sum() * np.linalg.norm(np.dot(points.T, points))
+
+points = np.array([[3.0, 4.0], [6.0, 8.0]])
+print(norms(points).tolist(), digest("a") if "hash" in sys.argv else "")
+print("numba.np.arraymath" in sys.modules)
+if "more" in sys.argv:
+    print(round(product(points), 6), norms(points.T.copy()).round(6).tolist())
+print(sum(norms.stats.cache_hits.values()), sum(digest.stats.cache_hits.values()))
+"""
+
+
+def test_kept_kernels_are_used_without_all_that_numba_compiles_with(tmp_path):
+    """What is loaded calls only what is there, and what is compiled later finds the rest."""
+    path = tmp_path / "program.py"
+    path.write_text(LOADED)
+    place = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(arrays.PACKAGE.parent)}
+
+    def lines(*words: str) -> list[str]:
+        command = [sys.executable, str(path), *words]
+        done = subprocess.run(command, env=os.environ | place, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    assert lines("hash") == ["[1.0, 2.0] True", "True", "0 0"]
+    assert lines() == ["[1.0, 2.0] ", "False", "1 0"]
+    assert lines("hash") == ["[1.0, 2.0] True", "True", "1 1"]
+    loaded, *rest = lines("more")[1:]
+    assert (loaded, rest) == ("False", ["375.0 [2.708204, 0.944272]", "1 0"])

@@ -6,13 +6,22 @@ kernels it calls.
 
 import json
 import os
+import resource
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from shiftsim.data.demo.store import demo_store
 
+# what every command needs that loads a kernel
+LEAST = """
+import numba, numpy, sys
+from shiftsim.geometry.rings import orientation
+orientation(0.0, 0.0, 1.0, 0.0, 0.0, 1.0)
+"""
 SHOWN = 20  # the dearest kernels
 CHILD = """
 import json, sys
@@ -64,3 +73,28 @@ def test_first_run_after_an_install(planner, traffic, note, size, tmp_path):
         print(f"  {seconds:6.3f} s  {name}")
     note(total=total, compiling=compiled)
     assert len(own) > 50
+
+
+def cpu_seconds(command: list[str]) -> float:
+    """CPU time of a command and its children."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def test_warm_start(note, size, tmp_path):
+    """A whole command whose kernels are kept, against what loading one kernel takes."""
+    store, out = demo_store(tmp_path / "demo"), tmp_path / "run"
+    words = ["-p", "constant-velocity", "--store", str(store), "--limit", "1", "--workers", "1"]
+    whole = [sys.executable, "-m", "shiftsim", "run", *words, "--out", str(out)]
+    least = [sys.executable, "-c", LEAST]
+    seconds: dict[str, list[float]] = {"whole": [], "least": []}
+    for _ in range(size(5) + 1):  # the first ones compile
+        for name, command in (("whole", whole), ("least", least)):
+            shutil.rmtree(out, ignore_errors=True)
+            seconds[name].append(cpu_seconds(command))
+    best = {name: min(values) for name, values in seconds.items()}
+    print(f"\nwarm start: {best['whole']:.2f} CPU-s, {best['whole'] / best['least']:.2f} x least")
+    note(**best)
+    assert Path(out).is_dir()

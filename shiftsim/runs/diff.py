@@ -14,12 +14,13 @@ import pyarrow as pa
 from shiftsim.errors import ConfigError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
-from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts import Task, stored_plans
+from shiftsim.sim.log import NUM_KEPT
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
 _KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
-_LATER = ("degraded", "plan_poses", "command_", "noise_")
+_LATER = ("degraded", "plan_steps", "command_", "noise_")
 _UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
 _UNITS |= {"m": "m", "rad": "rad"}
 _AXES = ("x [m]", "y [m]", "heading [rad]")
@@ -208,7 +209,9 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     rows = min(len(first), len(second))
     best: tuple[int, str] | None = None
     for name in _ordered(set(first.schema.names) & set(second.schema.names)):
-        row = _first_difference(_values(first[name], rows), _values(second[name], rows))
+        if first[name].null_count or second[name].null_count:
+            continue  # noise that a key makes, which is the same
+        row = _first_difference(_values(first, name, rows), _values(second, name, rows))
         if row is not None and (best is None or row < best[0]):
             best = (row, name)
     if best is None and len(first) == len(second):
@@ -218,7 +221,7 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     seconds = float((times[row].as_py() - times[0].as_py()) * 1e-6)
     if not name:
         return Departure(row, seconds, "length of the rollout", len(first), len(second))
-    ours, theirs = (np.ravel(_values(table[name], rows)[row]) for table in (first, second))
+    ours, theirs = (np.ravel(_values(table, name, rows)[row]) for table in (first, second))
     index = _first_difference(ours, theirs) or 0
     return Departure(row, seconds, _quantity(name, index), float(ours[index]), float(theirs[index]))
 
@@ -231,9 +234,11 @@ def _ordered(names: Iterable[str]) -> list[str]:
     return sorted((name for name in names if name not in _KEYS), key=rank)
 
 
-def _values(column: pa.Array, rows: int) -> np.ndarray:
-    """(rows, …) numbers of a column of numbers, or of lists of numbers."""
-    array = column.slice(0, rows)
+def _values(table: pa.RecordBatch, name: str, rows: int) -> np.ndarray:
+    """(rows, …) numbers of a column of numbers, or of lists of numbers; poses of plans."""
+    if name == "plan_steps":
+        return stored_plans(table.slice(0, rows)).reshape(rows, 3 * NUM_KEPT)
+    array = table[name].slice(0, rows)
     if pa.types.is_list(array.type):
         flat = array.flatten().to_numpy(zero_copy_only=False).astype(np.float64)
         return flat.reshape(rows, -1) if rows else flat
@@ -250,7 +255,7 @@ def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
 
 
 def _quantity(name: str, index: int) -> str:
-    if name == "plan_poses":
+    if name == "plan_steps":
         pose, axis = divmod(index, 3)
         return f"plan, pose {pose} {_AXES[axis]}"
     if name.startswith("track_"):

@@ -172,7 +172,7 @@ class Run:
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.
         """
-        return complete_rollout(self.rollout_rows(task), scenario)
+        return complete_rollout(self.rollout_rows(task), scenario, task)
 
     def rollout_rows(self, task: Task) -> pa.RecordBatch:
         """One stored rollout as it lies on disk, a row per sample.

@@ -1,7 +1,8 @@
 """Rollouts: a row per sample on the way from a worker to a file, and Parquet files of many of them.
 
 What the scenario holds already is not kept again: recorded tracks (unless the traffic reacts),
-lights, route and expert come back from the store when a rollout is read.
+lights, route and expert come back from the store when a rollout is read, and noise from its key.
+Plans, which no score depends on, are rounded (`pack_plans`).
 
 A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
 into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers, and
@@ -26,7 +27,8 @@ from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import DataError
 from shiftsim.files import draft
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import SimulationLog, pack_plans, unpack_plans
+from shiftsim.sim.noise import sample_noise
 from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
@@ -38,38 +40,47 @@ def _list_of(kind: pa.DataType) -> pa.DataType:
     return pa.list_(pa.field("item", kind, nullable=False))
 
 
-def _without_nulls(columns: dict[str, pa.DataType]) -> pa.Schema:
-    return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
+def _schema(columns: dict[str, pa.DataType]) -> pa.Schema:
+    return pa.schema(
+        [pa.field(name, kind, nullable=name in _NOISE_COLUMNS) for name, kind in columns.items()]
+    )
 
 
-STATES = _without_nulls(
+STATES = _schema(
     {
         "time_us": pa.int64(),
         **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
-        "planning_seconds": pa.float64(),
+        "planning_seconds": pa.float32(),
         "degraded": pa.bool_(),
-        "plan_poses": _list_of(pa.float64()),
+        "plan_steps": _list_of(pa.int32()),
     }
 )
-TRACKS = _without_nulls(
+_BEFORE = {  # columns of older versions that were another type, or had another name
+    "planning_seconds": ("planning_seconds", pa.float64()),
+    "plan_steps": ("plan_poses", _list_of(pa.float64())),
+}
+TRACKS = _schema(
     {
         "track_valid": _list_of(pa.bool_()),
         **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
     }
 )
+_FIELDS = {field.name: field for field in STATES}
 FOLDER = "rollouts"
 _PART = re.compile(r"part-\d+\.parquet")
 _MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
 _MAX_GROUP = 16, 16 << 20
-# states hardly compress and are never searched: what costs more time brings next to nothing
+# states hardly compress and are never searched: what costs more time brings next to nothing, but
+# bytes in planes
 _WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
     "compression_level": 1,
     "use_dictionary": ["planner", "noise", "token"],
+    "use_byte_stream_split": [*EGO_COLUMNS, *_COMMAND_COLUMNS],
     "write_statistics": False,
 }
 _NAME = pa.dictionary(pa.int32(), pa.string())
-_KEY = _without_nulls(
+_KEY = _schema(
     {"planner": _NAME, "noise": _NAME, "seed": pa.int64(), "token": _NAME, "iteration": pa.int64()}
 )
 
@@ -97,17 +108,44 @@ class Place(NamedTuple):
     rows: int  # number of its rows
 
 
-def rollout_rows(log: SimulationLog, *, with_tracks: bool) -> pa.RecordBatch:
-    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones."""
+def rollout_rows(
+    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True
+) -> pa.RecordBatch:
+    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones.
+
+    Noise that `complete_rollout` can make again from the task is left out: null.
+    """
     columns = [pa.array(log.time_us)]
-    for values in (log.ego, log.commands, log.noise):
+    for values in (log.ego, log.commands):
         columns += map(pa.array, np.ascontiguousarray(values.T))
-    columns += [pa.array(log.planning_seconds), pa.array(log.degraded), _lists(log.plans)]
+    empty = [pa.nulls(len(log.time_us), pa.float64())] * len(_NOISE_COLUMNS)
+    columns += map(pa.array, np.ascontiguousarray(log.noise.T)) if with_noise else empty
+    columns += [pa.array(log.planning_seconds.astype(np.float32)), pa.array(log.degraded)]
+    columns.append(_packed(log.plans, log.ego))
     if not with_tracks:
         return pa.RecordBatch.from_arrays(columns, schema=STATES)
     tracks = log.tracks
     columns += map(_lists, (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes))
     return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
+
+
+def _packed(plans: np.ndarray, ego: np.ndarray) -> pa.Array:
+    """(K, P, 3) poses as a column `plan_steps`."""
+    lengths, steps = pack_plans(plans, ego)
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    kind = STATES.field("plan_steps").type
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(steps), type=kind)
+
+
+def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
+    """(K, P, 3) poses of the plans of a stored rollout, rounded.
+
+    Raises:
+        ValueError: They are damaged.
+    """
+    column = rows["plan_steps"]
+    lengths = np.diff(column.offsets.to_numpy()).astype(np.int64)
+    return unpack_plans(lengths, column.flatten().to_numpy(), _stack(rows, EGO_COLUMNS))
 
 
 def encode_rows(rows: pa.RecordBatch) -> bytes:
@@ -148,8 +186,8 @@ def _from_lists(column: pa.Array, shape: tuple[int, ...], where: str) -> np.ndar
         raise DataError(what, hint="make the run again") from error
 
 
-def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
-    """A stored rollout, completed by what its scenario holds already.
+def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> SimulationLog:
+    """The stored rollout of a task, completed by its noise and what its scenario holds already.
 
     The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log.
 
@@ -168,6 +206,14 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
     ego = _stack(rows, EGO_COLUMNS)
     where = f"the rollout of scenario {scenario.token!r}"
     require(RUN, "state", ego, f"{where}: an ego")
+    try:
+        plans = stored_plans(rows)
+    except ValueError as error:
+        raise DataError(f"{where}: damaged plans: {error}", hint="make the run again") from error
+    if rows[_NOISE_COLUMNS[0]].null_count:
+        noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
+    else:
+        noise = _stack(rows, _NOISE_COLUMNS)
     tracks = scenario.tracks.rows(samples)
     if "track_valid" in rows.schema.names:
         shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
@@ -186,9 +232,9 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario) -> SimulationLog:
         expert_ego=scenario.expert,
         route=scenario.route,
         commands=_stack(rows, _COMMAND_COLUMNS),
-        noise=_stack(rows, _NOISE_COLUMNS),
-        plans=_from_lists(rows["plan_poses"], (-1, 3), where),
-        planning_seconds=np.array(rows["planning_seconds"].to_numpy()),
+        noise=noise,
+        plans=plans,
+        planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
         degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
     )
 
@@ -237,7 +283,9 @@ class RolloutReader:
             self._file, self._path, self._group = _opened(place.file), place.file, -1
             columns = {column.name: column.type for column in self._file.schema_arrow}
             for column in [*STATES, *(c for c in TRACKS if c.name in columns)]:
-                if columns.get(column.name) != column.type:
+                name, kind = _BEFORE.get(column.name, ("", None))
+                is_old = name in columns and columns[name] == kind
+                if not is_old and columns.get(column.name) != column.type:
                     what = f"column {column.name!r} is missing or not {column.type}"
                     raise _unreadable(place.file, TypeError(what))
             found = self._file.metadata
@@ -256,7 +304,24 @@ class RolloutReader:
         rows = self._rows.slice(first, place.rows).combine_chunks()
         if len(rows) != place.rows:
             raise _unreadable(place.file, IndexError(f"rows {place.row} and after are cut off"))
-        return rows.to_batches()[0]
+        try:
+            return _as_today(rows.to_batches()[0])
+        except ValueError as error:
+            raise _unreadable(place.file, error) from error
+
+
+def _as_today(rows: pa.RecordBatch) -> pa.RecordBatch:
+    """A rollout as this version stores it, whichever has written it."""
+    if "plan_poses" in rows.schema.names:
+        plans = rows["plan_poses"].flatten().to_numpy().reshape(len(rows), -1, 3)
+        seconds = rows["planning_seconds"].cast(pa.float32())
+        steps = _packed(plans, _stack(rows, EGO_COLUMNS))
+        for name, column in zip(_BEFORE, (seconds, steps), strict=True):
+            place = rows.schema.get_field_index(_BEFORE[name][0])
+            rows = rows.set_column(place, STATES.field(name), column)
+        schema = pa.schema([_FIELDS.get(field.name, field) for field in rows.schema])
+        rows = pa.RecordBatch.from_arrays(rows.columns, schema=schema)
+    return rows
 
 
 class PartWriter:

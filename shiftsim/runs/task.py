@@ -28,7 +28,7 @@ from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task, encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
-from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.noise import NoiseModel, is_standard
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import Traffic
 from shiftsim.world.scenario import Scenario
@@ -171,7 +171,8 @@ class TaskRunner:
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             # walkers of an edit wait for the ego
             own_tracks = self.config.traffic != "nonreactive" or self.edits is not None
-            stored = encode_rows(rollout_rows(log, with_tracks=own_tracks))
+            own_noise = not is_standard(self.noises[task.noise])
+            stored = encode_rows(rollout_rows(log, with_tracks=own_tracks, with_noise=own_noise))
         return TaskResult(
             task,
             OK,

@@ -7,10 +7,15 @@ iterations: the state reached after the last planner call is never stored.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
+
+NUM_KEPT = 18  # poses of a plan
+_PER_UNIT = np.array([1e3, 1e3, 1e4])  # whole numbers per m, m, rad: what a picture can show
+_MOST = 2.0e8  # of them; second differences with their sign then fit into 32 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +36,7 @@ class SimulationLog:
         noise: (K, 2) what was added to them.
         plans: (K, P, 3) poses of the plan: every 0.1 s over its first second, from the moment of
             planning on, then every second to 8 s (P = 18); NaN where it does not reach, and where a
-            command was returned. Rollouts of older versions end with the first second (P = 11).
+            command was returned. Of a rollout from disk they are rounded to 1 mm and 0.1 mrad.
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
 
@@ -64,6 +69,48 @@ class SimulationLog:
         )
 
 
+def pack_plans(plans: FloatArray, ego: FloatArray) -> tuple[IntArray, NDArray[np.int32]]:
+    """Plans as few small numbers: what bends of the path remain to the next pose, 1 mm or 0.1 mrad.
+
+    Args:
+        plans: (K, P, 3) as in `SimulationLog`; poses behind the first NaN are left out.
+        ego: (K, 11) states they begin at.
+
+    Returns:
+        `lengths`: (K,) numbers of each plan, three per pose; `steps`: the numbers of all. They are
+        second differences along the plan of its offsets from the ego, their sign in the last bit.
+    """
+    known = ~np.isnan(plans[..., 0])
+    steps = plans - ego[:, None, :3]
+    steps *= _PER_UNIT
+    np.rint(steps, out=steps)
+    is_whole = bool(known.all())
+    if not is_whole:
+        known = np.logical_and.accumulate(known, axis=1)
+        steps[~known] = 0.0
+    np.maximum(np.minimum(steps, _MOST, out=steps), -_MOST, out=steps)
+    bends = steps.astype(np.int32)
+    for _ in range(2):
+        bends[:, 1:] -= bends[:, :-1].copy()
+    coded = (bends << 1) ^ (bends >> 31)
+    return 3 * known.sum(axis=1), (coded if is_whole else coded[known]).ravel()
+
+
+def unpack_plans(lengths: IntArray, steps: IntArray, ego: FloatArray) -> FloatArray:
+    """The plans (K, 18, 3) that `pack_plans` made numbers of, rounded.
+
+    Raises:
+        ValueError: The numbers are not whole poses, or more than 18 of them.
+    """
+    if (lengths > 3 * NUM_KEPT).any():
+        raise ValueError(f"a plan of {lengths.max() // 3} poses")
+    known = np.arange(NUM_KEPT) < lengths[:, None] // 3
+    bends = np.zeros((*known.shape, 3), np.int64)
+    bends[known] = ((steps >> 1) ^ -(steps & 1)).reshape(-1, 3)
+    offsets = np.cumsum(np.cumsum(bends, axis=1), axis=1) / _PER_UNIT
+    return np.where(known[..., None], ego[:, None, :3] + offsets, np.nan)
+
+
 def as_recorded(scenario: Scenario) -> SimulationLog:
     """The recording of a scenario as if it had been driven, without commands and plans."""
     rows = scenario.iteration_rows[:-1]
@@ -79,7 +126,7 @@ def as_recorded(scenario: Scenario) -> SimulationLog:
         route=scenario.route,
         commands=np.full((count, 2), np.nan),
         noise=np.zeros((count, 2)),
-        plans=np.full((count, 18, 3), np.nan),
+        plans=np.full((count, NUM_KEPT, 3), np.nan),
         planning_seconds=np.zeros(count),
         degraded=np.zeros(count, np.bool_),
     )

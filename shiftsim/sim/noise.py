@@ -115,6 +115,11 @@ def parse_noise(name: str) -> NoiseModel:
     return NoiseModel(kind, accel, rate, name=name)
 
 
+def is_standard(model: NoiseModel) -> bool:
+    """Whether the name of a model says all of it, to everybody and for ever."""
+    return model.name in NOISE_NAMES and model == parse_noise(model.name)
+
+
 def sample_noise(
     model: NoiseModel | str, *, seed: int, token: str, num_steps: int, dt: float = 0.1
 ) -> FloatArray:

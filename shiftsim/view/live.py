@@ -172,7 +172,7 @@ class LiveRun:
             return None
         (result,) = found
         scenario = self._read(result.task.token)
-        log = complete_rollout(decode_rows(result.rollout), scenario)
+        log = complete_rollout(decode_rows(result.rollout), scenario, result.task)
         planner, noise, seed, _ = result.task
         shown = Shown(planner, noise, seed, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])

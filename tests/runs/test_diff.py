@@ -127,11 +127,12 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
     if field == "plans":
         log = replace(log, plans=np.zeros((len(log.time_us), 2, 3)))
     values = np.array(getattr(log, field))
-    values[row].reshape(-1)[1] += 1e-9
+    step = 2e-3 if field == "plans" else 1e-9  # plans are stored in millimetres
+    values[row].reshape(-1)[1] += step
     tables = [rollout_rows(one, with_tracks=True) for one in (log, replace(log, **{field: values}))]
     found = find_departure(*tables)
     assert (found.iteration, found.quantity) == (row, quantity)
-    assert found.second - found.first == pytest.approx(1e-9, rel=1e-4)
+    assert found.second - found.first == pytest.approx(step, rel=1e-4)
 
 
 def test_a_shorter_rollout_differs_in_length(runs):

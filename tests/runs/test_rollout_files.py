@@ -4,6 +4,7 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -23,8 +24,10 @@ from shiftsim.runs.rollouts import (
     RolloutReader,
     Task,
     encode_rows,
+    stored_plans,
     without_key,
 )
+from shiftsim.sim.log import pack_plans, unpack_plans
 
 MANIFEST = {
     "format": 4,
@@ -43,14 +46,30 @@ def made_up(length, *, value=0.0, tracks=None):
     columns = []
     for field in STATES if tracks is None else [*STATES, *TRACKS]:
         if pa.types.is_list(field.type):
-            width = {"plan_poses": 54, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
-            size = width if field.name == "plan_poses" else width * tracks
-            item = bool if pa.types.is_boolean(field.type.value_type) else float
-            columns.append(pa.array([[item(value)] * size] * length, field.type))
+            width = {"plan_steps": 54, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
+            size = width if field.name == "plan_steps" else width * tracks
+            items = pa.array([value] * size).cast(field.type.value_type)
+            columns.append(pa.array([items] * length, field.type))
         else:
             columns.append(pa.array([value] * length).cast(field.type))
     schema = STATES if tracks is None else pa.schema([*STATES, *TRACKS])
     return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def as_before(rows, plans):
+    """A rollout as versions before this one stored it."""
+    kind = pa.list_(pa.field("item", pa.float64(), nullable=False))
+    columns = {name: rows[name] for name in rows.schema.names}
+    seconds = columns["planning_seconds"].cast(pa.float64())
+    columns["planning_seconds"] = seconds
+    columns.pop("plan_steps")
+    poses = pa.array(list(plans.reshape(len(rows), -1)), kind)
+    names, values = list(columns), list(columns.values())
+    place = names.index("degraded") + 1
+    names.insert(place, "plan_poses")
+    values.insert(place, poses)
+    fields = [pa.field(n, v.type, nullable=False) for n, v in zip(names, values, strict=True)]
+    return pa.RecordBatch.from_arrays(values, schema=pa.schema(fields))
 
 
 def key(number):
@@ -204,3 +223,46 @@ def test_the_rollouts_of_a_scenario_lie_together(tmp_path):
         ("y", "a"),
         ("y", "b"),
     ]
+
+
+@pytest.mark.parametrize("poses", [11, 18])
+@pytest.mark.parametrize("tracks", [None, 2])
+def test_rollouts_of_versions_before_are_read_and_kept_beside_new_ones(tmp_path, poses, tracks):
+    rows = made_up(5, tracks=tracks)
+    plans = np.linspace(0.0, 30.0, 5 * poses * 3).reshape(5, poses, 3)
+    plans[3, 4:] = np.nan
+    writer = PartWriter(tmp_path)
+    old = writer.add(key(0), as_before(rows, plans))
+    writer.close()
+    assert "plan_poses" in pq.read_schema(old.file).names
+    found = without_key(RolloutReader().read(old))
+    assert found.schema == rows.schema
+    assert found.drop_columns(["plan_steps"]).equals(rows.drop_columns(["plan_steps"]))
+    expected = np.full((5, 18, 3), np.nan)
+    expected[:, :poses] = plans
+    np.testing.assert_allclose(stored_plans(found), expected, rtol=0.0, atol=0.501e-3)
+    both = [writer.add(key(1), found), writer.add(key(2), rows)]
+    writer.close()
+    reader = RolloutReader()
+    assert without_key(reader.read(both[0])).equals(found)
+    assert without_key(reader.read(both[1])).equals(rows)
+
+
+@given(
+    st.lists(st.integers(0, 18), min_size=1, max_size=6),
+    st.floats(-1e5, 1e5),
+    st.floats(-1.9e5, 1.9e5),
+)
+def test_plans_are_rounded_and_nothing_else(lengths, place, size):
+    ego = np.full((len(lengths), 11), place)
+    plans = place + size * np.sin(np.arange(len(lengths) * 54.0)).reshape(-1, 18, 3)
+    plans[..., 2] = np.sin(plans[..., 2]) * 3.2 + place
+    for plan, length in zip(plans, lengths, strict=True):
+        plan[length:] = np.nan
+    back = unpack_plans(*pack_plans(plans, ego), ego)
+    np.testing.assert_array_equal(np.isnan(back), np.isnan(plans))
+    away = np.abs(np.nan_to_num(back - plans))
+    assert away[..., :2].max() < 0.5001e-3
+    assert away[..., 2].max() < 0.5001e-4
+    again = unpack_plans(*pack_plans(back, ego), ego)
+    np.testing.assert_array_equal(again, back)
