@@ -87,7 +87,7 @@ class RunConfig:
     """
 
     planners: tuple[str, ...] = _setting(
-        (), "Name or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
+        (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
     )
     noise: tuple[str, ...] = _setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
