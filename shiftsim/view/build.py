@@ -255,7 +255,7 @@ def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def _what(violated: Mapping[str, float | None]) -> str:
     """First violations in words, in the order of the metrics."""
     known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
-    return ", ".join(w if time is None else f"{w} {time:.1f} s" for w, time in known)
+    return ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in known)
 
 
 def _safe(text: str) -> str:

@@ -116,7 +116,7 @@ def test_the_worst_are_ten_in_words_and_without_markup_of_theirs():
     assert "<script" not in table
     assert table.count("<tr>") == 11
     assert table.index(">89.00<") < table.index(">98.00<")
-    assert "at-fault collision 4.3 s, little progress" in table
+    assert "at-fault collision 4.3\u00a0s, little progress" in table
     assert f'href="{page_name(HOSTILE + "11")}#t=4.30&amp;focus=2"' in table
     assert ">97.50<" not in table
     assert "The worst 10 of 12 scenarios" in table
