@@ -19,16 +19,20 @@ from shiftsim.files import place_of
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.planners.original import Original
 from shiftsim.sim.loop import Rollout
-from shiftsim.sim.plan_check import SHORT, find_fault, is_short
+from shiftsim.sim.plan_check import FAR, SHORT, find_fault, is_short
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command, Trajectory
 
 CALLS = 20  # of a scenario that is only begun
-NEAR = 2.0  # m, and
-FAR = 20.0  # m between the ego and the start of a plan: a warning, an error
+NEAR = 2.0  # m between the ego and the start of a plan: a warning; beyond FAR an error
 TURNED = 1.0  # rad between the ego's heading and that of the plan's start: a warning
 FULL_TURN = 2.0 * np.pi + 1e-9  # rad; a heading beyond it is most likely in degrees
 SLOW = 0.1  # s per plan: slower than real time
+# m/s² and rad/s: no car brakes so, or turns its wheels so
+STRONGEST = {"acceleration": 30.0, "steering_rate": 10.0}
+COARSE = 0.05  # m between neighbouring positions of 32 bits
+
+HANGS = "ends"  # the rule that an interrupt during the check shows to be broken
 
 Plans: TypeAlias = list[Trajectory | Command]
 
@@ -39,11 +43,14 @@ _HINTS = {  # by the name of the rule: what to do
     "pickles": "define the class at the top of a module, and open files, models and locks in "
     "reset(), not in the constructor",
     "runs": "repair the planner",
+    HANGS: "look there for a loop that does not end, or waits",
     "inputs untouched": "work on copies: the arrays of scene and observation belong to the "
     "simulator",
     "starts at the ego": "poses are the rear axle in the map frame, from observation.ego.pose on; "
     "shiftsim.geometry.boxes.from_frame brings ego-frame poses there",
     "heading": "headings are radians in the map frame, counter-clockwise from +x",
+    "precision": "keep positions in float64, or compute near the ego and add its position last",
+    "units": "accelerations are m/s^2 and steering rates rad/s",
     "deterministic": "seed random numbers in reset(), from scene.token for example",
     "survives reset": "clear all state of the scenario before in reset()",
     "company": "keep nothing of a scenario in the class, the module, or what forks share",
@@ -87,7 +94,8 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
         if other is not None and not any(found.severity == "error" for found in findings):
             _check_company(original, first, scenario, other, findings)
         findings.append(_run_time(np.array(seconds[1:] or seconds)))
-    return sorted(findings, key=lambda found: ("error", "warning", "note").index(found.severity))
+    once = dict.fromkeys(findings)  # what holds of every drive is said once
+    return sorted(once, key=lambda found: ("error", "warning", "note").index(found.severity))
 
 
 def _run_time(seconds: FloatArray) -> Finding:
@@ -106,7 +114,7 @@ def _error(check: str, message: str) -> Finding:
 def _make(factory: Callable[[], Any], findings: list[Finding]) -> Any:
     try:
         return factory()
-    except Exception as error:  # any failure of users' code becomes a finding
+    except (Exception, SystemExit) as error:  # any failure of users' code becomes a finding
         text = f"making the planner failed: {_describe(error)}"
         findings.append(_error("constructor", text))
         return None
@@ -163,7 +171,12 @@ def _drive(
                 return None
             with warnings.catch_warnings(action="ignore"):  # what they say is among the findings
                 rollout.advance(plan)
-    except Exception as error:  # any failure of users' code becomes a finding
+    except KeyboardInterrupt as error:
+        if not (where := place_of(error)):
+            raise
+        findings.append(_error(HANGS, f"{step} had not ended when you interrupted it ({where})"))
+        return None
+    except (Exception, SystemExit) as error:  # any failure of users' code becomes a finding
         if "read-only" in str(error) or "WRITEABLE" in str(error):
             text = f"{step} writes into its inputs: {_describe(error)}"
             findings.append(_error("inputs untouched", text))
@@ -179,6 +192,8 @@ def _judge(plan: object, ego: FloatArray, times: IntArray) -> Finding | None:
     fault = find_fault(plan, now_us, int(times[1]))
     if fault is not None:
         return Finding("error", fault.check, fault.message, fault.hint)
+    if isinstance(plan, Command):
+        return _check_command(plan)
     if not isinstance(plan, Trajectory):
         return None
     found = _check_start(plan.starting_at(now_us), now_us, ego)
@@ -187,7 +202,24 @@ def _judge(plan: object, ego: FloatArray, times: IntArray) -> Finding | None:
         found = replace(_error("heading", text), severity="warning")
     if found is None and is_short(plan):
         found = Finding("warning", "length", SHORT, "plan 1 s ahead and more")
-    return found
+    return found or _check_precision(plan.states[:, :2])
+
+
+def _check_command(command: Command) -> Finding | None:
+    for name, most in STRONGEST.items():
+        if abs(value := float(getattr(command, name))) > most:
+            text = f"the command has {name} {value:.3g}: no car does more than {most:g}"
+            return replace(_error("units", text), severity="warning")
+    return None
+
+
+def _check_precision(places: FloatArray) -> Finding | None:
+    small = places.astype(np.float32)
+    step = float(np.spacing(np.abs(small)).max())
+    if step < COARSE or not np.array_equal(small, places):
+        return None
+    text = f"all positions of the plan are numbers of 32 bits, which are {step:g} m apart here"
+    return replace(_error("precision", text), severity="warning")
 
 
 def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | None:
@@ -229,8 +261,12 @@ def _check_company(
         for found in elsewhere
         if found.check not in {known.check for known in findings}
     )
-    again = _drive(original.copy(), scenario, [])
-    if again is not None and (where := _first_difference(first, again)) is not None:
+    failed: list[Finding] = []
+    again = _drive(original.copy(), scenario, failed)
+    if again is None:
+        text = f"after scenario {other.token}, {failed[-1].message}"
+        findings.append(_error("company", text))
+    elif (where := _first_difference(first, again)) is not None:
         text = f"after scenario {other.token} the planner differs at iteration {where}"
         findings.append(_error("company", text))
 
@@ -248,6 +284,6 @@ def _content(plan: object) -> object:
     return times.tolist(), states.tobytes(), plan.relative
 
 
-def _describe(error: Exception) -> str:
+def _describe(error: BaseException) -> str:
     where = place_of(error)
     return f"{type(error).__name__}: {error}{where and f' ({where})'}"

@@ -10,6 +10,7 @@ import importlib
 import inspect
 import logging
 import pickle
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -106,7 +107,7 @@ def planner_factory(spec: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
-            hint=_import_hint(module_name),
+            hint=_import_hint(module_name, error),
         ) from error
     factory = getattr(module, attribute, None)
     if not callable(factory):
@@ -286,10 +287,16 @@ def _require_methods(name: str, planner: object) -> None:
             )
 
 
-def _import_hint(module_name: str) -> str:
+def _import_hint(module_name: str, error: ImportError) -> str:
     if not module_name.endswith(".py"):
         return "install it, or run from the folder that holds it"
-    return "repair it" if Path(module_name).is_file() else "check the path"
+    if not Path(module_name).is_file():
+        return "check the path"
+    if "relative import" in str(error):
+        return "import from the same folder without dots, as in `from helper import thing`"
+    if isinstance(error, ModuleNotFoundError):
+        return f"install it where shiftsim is: {sys.executable} -m pip install …"
+    return "rename the file" if "rename the file" in str(error) else "repair it"
 
 
 def _bind(spec: str, factory: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:

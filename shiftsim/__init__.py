@@ -1,9 +1,11 @@
 """Closed-loop evaluation of driving planners with nuPlan's semantics."""
 
 import sys
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # type checkers take this name for true; nothing is imported for it
 if TYPE_CHECKING:
+    from typing import Any
+
     from shiftsim.api import Run as Run
     from shiftsim.api import load_planner as load_planner
     from shiftsim.api import open_run as open_run
@@ -53,7 +55,7 @@ _PUBLIC = {
 __all__ = list(_PUBLIC)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name not in _PUBLIC:
         raise AttributeError(f"module 'shiftsim' has no attribute {name!r}")
     from importlib import import_module
@@ -68,7 +70,7 @@ class _Moved:
     """Asked last, for modules that nobody else knows: import paths of earlier versions."""
 
     @staticmethod
-    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+    def find_spec(name: str, path: "Any" = None, target: "Any" = None) -> "Any":
         if not name.startswith("shiftsim."):
             return None
         from shiftsim._moved import find_spec

@@ -1,4 +1,8 @@
-"""`python -m shiftsim` is the command `shiftsim`."""
+"""The command `shiftsim`, also as `python -m shiftsim`.
+
+It hears an interrupt before anything heavy is imported, so that one which comes early ends in one
+line as well.
+"""
 
 import os
 import sys
@@ -6,7 +10,26 @@ import sys
 if not sys.flags.safe_path and sys.path[0] in ("", os.getcwd()):
     del sys.path[0]  # the current folder: what lies in it is not code
 
-from shiftsim.cli import main
+
+def _leave(*signal: object) -> None:
+    over = "\r" if os.isatty(2) else ""  # the ^C of the terminal
+    os.write(2, f"{over}error: interrupted\n".encode())
+    os._exit(130)
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        import signal
+
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _leave)
+        from shiftsim.cli import main as run
+
+        run()
+    except KeyboardInterrupt:  # before the command line has begun, or after it has ended
+        _leave()
+
 
 if __name__ == "__main__":
     main()

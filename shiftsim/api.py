@@ -18,7 +18,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import Planner
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
+from shiftsim.world.scenario import Scenario, require_scenario
 from shiftsim.world.state import speeds
 
 
@@ -231,7 +231,7 @@ def simulate(
         The rollout, K = T - 1 samples.
 
     Raises:
-        ConfigError: A setting or the planner is unknown.
+        ConfigError: A setting or the planner is unknown, or there is no scenario.
         DataError: The scenario has fewer than three iterations.
         PlannerError: The planner returned something that cannot be executed.
 
@@ -241,6 +241,7 @@ def simulate(
         log = shiftsim.simulate(scenario, "idm", noise="ou-high")
         ```
     """
+    require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
 

@@ -49,6 +49,8 @@ def test_the_representations_are_one_short_line_with_what_matters(store, scenari
         (scenario, scenario.token),
         (scenario.map, f"{scenario.map.num_lanes} lanes"),
         (scenario.map.edges, f"{len(scenario.map.edges)} objects"),
+        (scenario.map.baselines, f"{len(scenario.map.edges)} lines"),
+        (scenario.map.outgoing, f"{len(scenario.map.edges)} lists"),
         (scenario.tracks, f"{scenario.tracks.num_tracks} tracks"),
         (scenario.traffic_lights, "connectors"),
         (scene_info(scenario), scenario.map.name),
@@ -94,6 +96,16 @@ def test_a_scenario_is_found_by_the_beginning_of_its_token(store):
         store["nothing"]
     with pytest.raises(shiftsim.ShiftsimError, match="4 scenarios of store 'toy' begin with ''"):
         store[""]
+
+
+def test_what_is_no_scenario_is_refused_with_what_to_write(store, log):
+    for use, hint in (
+        (lambda: store[0], r"store\[store.tokens\[0\]\] is the first one"),
+        (lambda: shiftsim.simulate("0000cafe", "idm"), r"open_store\(.*\)\[TOKEN\]"),
+        (lambda: shiftsim.show(log), r"shiftsim.show\(scenario, …\)"),
+    ):
+        with pytest.raises(shiftsim.ShiftsimError, match=hint):
+            use()
 
 
 def test_a_planner_is_made_or_driven_by_its_name(scenario, log):

@@ -19,7 +19,7 @@ from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.plausible import require_plausible, require_rows, require_scenarios
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
-from shiftsim.errors import DataError, beginning
+from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -78,6 +78,11 @@ class ScenarioStore:
         Raises:
             ConfigError: There is no such scenario, or there are several.
         """
+        if not isinstance(token, str):
+            raise ConfigError(
+                f"a scenario is named by its token, not by {token!r}",
+                hint="store[store.tokens[0]] is the first one; all: `for scenario in store`",
+            )
         return self.read(beginning(f"store {self.path.name!r}", "scenario", token, self.tokens))
 
     def __contains__(self, token: object) -> bool:

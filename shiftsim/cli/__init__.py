@@ -350,8 +350,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     gc.set_threshold(_FEW_LOOKS)
     atexit.register(gc.freeze)
     before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:
+    if callable(before):  # else it is ignored, as in the background of a shell
         signal.signal(signal.SIGINT, _Interrupt())
+    sys.unraisablehook = _raised_nowhere
     try:
         code = _run([word for word in words if word != "--debug"], debug)
     except BrokenPipeError:  # the reader of our output has left, as `| head` does
@@ -359,12 +360,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _USAGE
     finally:
         signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = sys.__unraisablehook__
     sys.exit(code)
 
 
+def _raised_nowhere(found: Any) -> None:
+    """No words on an interrupt where nothing can be raised: `progress_bar` knows that it came."""
+    if found.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(found)
+
+
 def _run(words: list[str], debug: bool) -> int:
-    command = typer.main.get_command(app)
     try:
+        command = typer.main.get_command(app)
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED

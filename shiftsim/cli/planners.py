@@ -59,7 +59,10 @@ def list_planners(as_json: Json = False, debug: Debug = False) -> None:
 def check_one_planner(
     planner: Annotated[
         str,
-        typer.Argument(help="Name or package.module:Class.", autocompletion=completion.planners),
+        typer.Argument(
+            help="Name, ./file.py:Class or package.module:Class.",
+            autocompletion=completion.planners,
+        ),
     ],
     planner_arg: Annotated[
         list[str] | None, typer.Option("--planner-arg", help="key=value; repeatable.")
@@ -73,7 +76,7 @@ def check_one_planner(
     debug: Debug = False,
 ) -> None:
     """Does a planner obey the contract? Says what is wrong, and what to do."""
-    from shiftsim.planners.contract import check_planner
+    from shiftsim.planners.contract import HANGS, check_planner
     from shiftsim.planners.registry import load_planner
     from shiftsim.runs.config import parse_argument
     from shiftsim.runs.scenarios import open_named_store
@@ -84,12 +87,16 @@ def check_one_planner(
         arguments[name] = value
     scenes = open_named_store(store)
     scenario = scenes[token or scenes.tokens[0]]
-    others = (scenes.read(name) for name in scenes.tokens if name != scenario.token)
+    rows = scenes.summary().select(["city", "token"]).to_pylist()
+    others = [row for row in rows if row["token"] != scenario.token]
+    # of another map where there is one: a planner that keeps the map of the first shows there
+    others.sort(key=lambda row: row["city"] == scenario.city)
     with output_kept():
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
-        findings = check_planner(make, scenario, next(others, None))
-    findings = list(dict.fromkeys(findings))  # what holds of every drive is said once
+        findings = check_planner(
+            make, scenario, scenes.read(others[0]["token"]) if others else None
+        )
     errors = [finding for finding in findings if finding.severity == "error"]
     doubts = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
@@ -102,6 +109,8 @@ def check_one_planner(
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
         verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
+    if any(finding.check == HANGS for finding in errors):
+        raise KeyboardInterrupt
     if errors:
         raise typer.Exit(_USAGE)
 

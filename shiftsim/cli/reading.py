@@ -42,7 +42,7 @@ def report(
     figures: Annotated[
         bool, typer.Option("--figures", help="Pictures as well, into --out (RUN/report).")
     ] = False,
-    worst: Annotated[int, typer.Option(help="Name the N worst rollouts.")] = 5,
+    worst: Annotated[int, typer.Option(help="Name the N worst scenarios.")] = 5,
     out: Annotated[Path | None, typer.Option(help="Write everything into this folder.")] = None,
     site: Annotated[
         Path | None,
@@ -131,14 +131,14 @@ def _write_pages(
 
 def _say_worst(runs: "Sequence[Run]", count: int) -> None:
     from shiftsim.report.scores import worst_rollouts
+    from shiftsim.report.words import task_words
 
     for run in runs:
         rows = worst_rollouts(run, count)
         if rows:
-            say(f"\n worst of {run.path.name}")
+            say(f"\n worst scenarios of {run.path.name}, each by its worst rollout")
         for row in rows:
-            seed = "" if row["noise"] == "none" else f" seed {row['seed']}"
-            where = f"{row['token']}  {row['planner']} {row['noise']}{seed}"
+            where = f"{row['token']}  {task_words(row)}"
             say(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
 
 
@@ -178,6 +178,8 @@ def explain(
         for task in tasks:
             for line in (*explain_lines(task), ""):
                 say(line)
+    if any(run.rollout_places.values() for run in runs):
+        say(f"see it: shiftsim view {source} {token}")
 
 
 def diff(

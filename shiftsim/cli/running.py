@@ -227,13 +227,16 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
 
 def _show(finished: "Run", *, allow_partial: bool) -> None:
     from shiftsim.report.scores import failures, score_table, worst_rollouts
+    from shiftsim.report.words import task_words
 
     counts = finished.manifest["counts"]
     say()
     say(score_table([finished], allow_partial=allow_partial))
     bad = [row for row in worst_rollouts(finished, 3) if row["cls"] < 1.0]
     if bad:
-        words = (f"{row['token']} {row['planner']} {row['cls']:.2f} {row['reason']}" for row in bad)
+        words = (
+            f"{row['token']} {task_words(row)} {row['cls']:.2f} {row['reason']}" for row in bad
+        )
         say(f" worst: {' · '.join(words)}")
     lost = failures(finished)
     alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}

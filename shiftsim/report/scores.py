@@ -171,9 +171,14 @@ def _cells_in_full(
 
 
 def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
-    """The rollouts with the lowest scores: key, `cls`, and the `reason` in words."""
+    """The scenarios with the lowest scores, each by its worst rollout.
+
+    Each with the key of that rollout, its `cls`, and the `reason` in words.
+    """
     keys = [("cls", "ascending"), *((name, "ascending") for name in Task._fields)]
-    rows = run.scores.sort_by(keys).slice(0, count).to_pylist()
+    ordered = run.scores.sort_by(keys)
+    _, firsts = np.unique(ordered["token"].to_numpy(), return_index=True)
+    rows = ordered.take(np.sort(firsts)[:count]).to_pylist()
     tokens = pa.array([row["token"] for row in rows], pa.string())
     metrics = run.metrics.filter(pc.is_in(run.metrics["token"], value_set=tokens)).to_pylist()
     violated = {(_key(row), row["metric"]): row["first_violation_s"] for row in metrics}

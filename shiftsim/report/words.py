@@ -50,6 +50,12 @@ def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
     return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
 
 
+def task_words(row: Mapping[str, Any]) -> str:
+    """Planner and noise of a rollout, as "idm ou-high seed 1"; clean ones have no seed."""
+    seed = "" if row["noise"] == "none" else f" seed {row['seed']}"
+    return f"{row['planner']} {row['noise']}{seed}"
+
+
 def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
     """A row of `metrics.parquet` with a violation, as "at-fault collision, pedestrian 17, …"."""
     words, partner = [REASONS.get(row["metric"], row["metric"])], row["partner_token"]

@@ -87,7 +87,7 @@ class RunConfig:
     """
 
     planners: tuple[str, ...] = _setting(
-        (), "Name or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
+        (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
     )
     noise: tuple[str, ...] = _setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
@@ -193,7 +193,10 @@ def _check(name: str, value: Any, kind: Any, option: Option) -> None:
             f"{name} is {value!r}, which is not text in UTF-8", hint="give it another name"
         ) from error
     if isinstance(value, tuple) and len(set(value)) != len(value):
-        raise ConfigError(f"{name} {list(value)!r}: a value is listed twice")
+        raise ConfigError(
+            f"{name} {list(value)!r}: a value is listed twice",
+            hint="give each planner a `name` of its own" if name == "planners" else "",
+        )
     if option.choices:
         one_of(name, value.partition(":")[0], option.choices)
     if option.least is not None and not option.least <= value < math.inf:

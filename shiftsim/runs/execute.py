@@ -26,7 +26,6 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_named_store, write_bundle
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
-from shiftsim.sim.plan_check import SHORT
 
 if TYPE_CHECKING:
     from shiftsim.runs.workers import MakeFunction, Outcome
@@ -159,14 +158,14 @@ def record(
     on_progress: Watch,
 ) -> None:
     """Put results on disk as they come, batch by batch, and tell how far the run is."""
-    short = set[str]()
+    doubted = set[str]()
     for results in batches:
         for result in results:
             add(result)
             progress = progress.after(result)
-            if result.is_short and result.task.planner not in short:
-                short.add(result.task.planner)
-                _LOG.warning("planner %s: %s", result.task.planner, SHORT)
+            if result.doubt and result.task.planner not in doubted:
+                doubted.add(result.task.planner)
+                _LOG.warning("planner %s: %s", result.task.planner, result.doubt)
         on_progress(replace(progress, news=results))
 
 

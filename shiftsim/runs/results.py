@@ -121,7 +121,7 @@ class TaskResult:
     # the rows of `metrics.parquet` beyond the key
     metrics: list[dict[str, Any]] = field(default_factory=list)
     rollout: bytes = b""  # the rollout, encoded; empty when it is not to be stored
-    is_short: bool = False  # whether the tracker was given a plan of less than 1 s
+    doubt: str = ""  # why the first plan is most likely not what was meant
 
 
 @dataclass(frozen=True)

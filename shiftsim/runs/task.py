@@ -180,7 +180,7 @@ class TaskRunner:
             scores=scores,
             metrics=metrics,
             rollout=stored,
-            is_short=rollout.is_short,
+            doubt=rollout.doubt,
         )
 
     def _setting(self, task: Task) -> Setting:

@@ -19,7 +19,7 @@ from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.plan_check import SHORT, find_fault, is_short, plain
+from shiftsim.sim.plan_check import doubt_of, find_fault, plain
 from shiftsim.sim.planner import (
     BatchPlanner,
     Observation,
@@ -87,7 +87,7 @@ class Rollout:
         self.scenario = scenario
         self.planner = planner
         self.iteration = 0
-        self.is_short = False  # whether the tracker was given a first plan of less than 1 s
+        self.doubt = ""  # why the first plan is most likely not what was meant
         # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
         self._times = scenario.iteration_times
@@ -193,11 +193,12 @@ class Rollout:
         if fault is not None:
             raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
         if isinstance(plan, Trajectory):
-            if iteration == 0 and self.setting.controller == "lqr":
-                self.is_short = is_short(plan)
             time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
             plan = Trajectory(time_us, plain(plan.states))
-            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, self._plans[iteration])
+            kept = self._plans[iteration]
+            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, kept)
+            if iteration == 0 and self.setting.controller == "lqr":
+                self.doubt = doubt_of(plan, kept[0], self._ego[row])
         return plan
 
     def log(self) -> SimulationLog:
@@ -242,8 +243,8 @@ def simulate(
     """
     rollout = Rollout(scenario, planner, setting, **changes)
     log = drive(rollout)
-    if rollout.is_short:
-        warnings.warn(f"{type(planner).__name__}: {SHORT}", stacklevel=2)
+    if rollout.doubt:
+        warnings.warn(f"{type(planner).__name__}: {rollout.doubt}", stacklevel=2)
     return log
 
 

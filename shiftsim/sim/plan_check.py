@@ -11,6 +11,7 @@ from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
 MIN_SPAN_US = 200_000  # us, three poses at 0.1 s: the tracker cannot be built with fewer
 LOOK_AHEAD_US = 1_000_000  # us, what the tracker reads of a plan
 MAX_SPAN_US = 3_600_000_000  # us; the tracker samples all of a plan
+FAR = 20.0  # m between the ego and the start of a plan: nobody means that
 LARGEST = 1e9  # m, rad, m/s, … of either sign; more is a mistake, and squares of it overflow
 SHORT = (
     "plans reach less than 1 s ahead: the tracker looks 1 s ahead, and takes the end for the rest"
@@ -70,6 +71,17 @@ def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
 def is_short(plan: object) -> bool:
     """Whether a plan that can be executed ends before what the tracker reads does."""
     return isinstance(plan, Trajectory) and bool(plan.time_us[-1] - plan.time_us[0] < LOOK_AHEAD_US)
+
+
+def doubt_of(plan: Trajectory, start: FloatArray, ego: FloatArray) -> str:
+    """Why a plan that can be executed is most likely not what was meant; empty where it may be.
+
+    `start` is where it is now, and `ego` where the ego is: x [m], y [m] and more.
+    """
+    away = float(np.hypot(start[0] - ego[0], start[1] - ego[1]))
+    if away > FAR:
+        return f"the first plan begins {away:.0f} m away from the ego: poses are in the map frame"
+    return SHORT if is_short(plan) else ""
 
 
 def _command_fault(command: Command) -> Fault | None:

@@ -10,13 +10,14 @@ import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
-from shiftsim.metrics import SHORT_NAMES
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.report.words import REASONS
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
 from shiftsim.view.scene import Shown
 
+_FACTORS = [SHORT_NAMES[name] for name in MULTIPLIERS]
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -152,6 +153,7 @@ class Gallery:
             "seed": task.seed,
             "cls": score.get("cls"),
             "violated": firsts,
+            "at": _moment(firsts),
             "index": index,
             "page": f"replay/{page_name(task.token)}",
         }
@@ -209,15 +211,28 @@ def write_site(
     return len(found)
 
 
+def _moment(violated: Mapping[str, float | None]) -> float | None:
+    """Where a replay opens: the first violation that multiplies the score, else the first."""
+    known = {short: time for short, time in violated.items() if time is not None}
+    return min(
+        (known[s] for s in _FACTORS if s in known), default=min(known.values(), default=None)
+    )
+
+
 def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
-    """HTML: the rows with the lowest scores, what went wrong in words, and links to that moment."""
-    below = sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=_lowest_first)[:count]
+    """HTML: the scenarios with the lowest scores, each by its worst rollout, and what went wrong.
+
+    In words, with links to that moment.
+    """
+    by_page: dict[str, Mapping[str, Any]] = {}
+    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=_lowest_first):
+        by_page.setdefault(row["page"], row)
+    below = list(by_page.values())[:count]
     if not below:
         return ""
     lines = []
     for row in below:
-        times = [time for time in row["violated"].values() if time is not None]
-        at = f"t={min(times):.2f}&amp;" if times else ""
+        at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
         link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{_safe(row["token"])}</a>'
         score = "–" if row["cls"] is None else f"{100.0 * row['cls']:.2f}"
         noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
@@ -226,10 +241,10 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
         lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
     names = ("scenario", "type", "planner", "noise", "what went wrong, first time")
     heads = "".join(f"<th>{name}</th>" for name in names)
-    title = f"The worst {len(lines)} of {len(rows)} rollouts"
+    title = f"The worst {len(lines)} of {len({row['page'] for row in rows})} scenarios"
     return f"""<section id="worst"><h2>{title}</h2>
 <div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
-<thead><tr><th class="number">CLS</th>{heads}</tr></thead>
+<thead><tr><th class="number" title="closed-loop score (CLS)">score</th>{heads}</tr></thead>
 <tbody>{"".join(lines)}</tbody></table></div></section>"""
 
 
@@ -240,7 +255,7 @@ def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def _what(violated: Mapping[str, float | None]) -> str:
     """First violations in words, in the order of the metrics."""
     known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
-    return ", ".join(w if time is None else f"{w} {time:.1f} s" for w, time in known)
+    return ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in known)
 
 
 def _safe(text: str) -> str:

@@ -24,6 +24,7 @@ _LAYERS = {  # what is drawn first lies below
     "route": "#b9d2be",
     "crosswalk": "#f7f4ea",
 }
+BURST = (8, 1, 0)  # where something went wrong: no planner has this mark
 _EVERY = 50  # samples from mark to mark
 _EDGE = "#30363c"
 # where a label may stand: which way from its mark, and what part of it lies left of and below that
@@ -108,33 +109,35 @@ class Mark(NamedTuple):
     """A violation that is marked."""
 
     time: float  # when it began [s from the start]
-    cross: Any  # the mark
+    burst: Any  # the mark
     label: Any  # its words
 
 
-def draw_violation(axes: Any, item: Shown, style: Style, words: str = "words") -> Mark | None:
-    """A cross where the gravest violation began, and what it was: `words`, or `short`."""
+def draw_violation(axes: Any, item: Shown, style: Style, *, in_short: bool = False) -> Mark | None:
+    """A burst where the gravest violation began, and what it was; `in_short` without numbers."""
     found = gravest(item)
     if found is None:
         return None
     time_us = item.log.time_us
     row = int(np.searchsorted(time_us, time_us[0] + found["t"] * 1e6 - 1.0))
     place = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
-    look = {"linestyle": "none", "marker": "x", "markersize": 8, "markeredgewidth": 2.2}
-    (cross,) = axes.plot(*place[:, None], color=ALARM, zorder=9, **look)
+    look = {"linestyle": "none", "marker": BURST, "markersize": 11, "markeredgecolor": "white"}
+    (burst,) = axes.plot(*place[:, None], color=ALARM, zorder=9, **look)
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": style.colour, "lw": 0.9}
     leader = {"arrowstyle": "-", "color": style.colour, "lw": 0.8, "shrinkA": 0, "shrinkB": 4}
+    is_right = place[0] > sum(axes.get_xlim()) / 2.0
     label = axes.annotate(
-        found[words],
+        found["words"].partition(",")[0] if in_short else found["words"],
         place,
-        xytext=(6, 6),
+        xytext=(-6 if in_short and is_right else 6, 12 if in_short else 6),
+        ha="right" if in_short and is_right else "left",
         textcoords="offset points",
         fontsize=SMALL - 1,
         bbox=box,
         arrowprops=leader,
         zorder=10,
     )
-    return Mark(found["t"], cross, label)
+    return Mark(found["t"], burst, label)
 
 
 def draw_boxes(
@@ -193,7 +196,7 @@ def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
     renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
     unit = figure.dpi / 72.0  # pixels per point
     paths = axes.transData.transform(np.concatenate([line.get_xydata() for line in axes.lines]))
-    taken = [mark.cross.get_window_extent(renderer).padded(6.0 * unit) for mark in marks]
+    taken = [mark.burst.get_window_extent(renderer).padded(6.0 * unit) for mark in marks]
 
     def cost(spot: Any) -> float:
         inside = Bbox.intersection(spot, frame)

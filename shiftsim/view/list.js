@@ -1,5 +1,5 @@
 "use strict";
-// The list of scenarios: sorted, filtered, each row a link into its replay at the first violation.
+// The list of scenarios: sorted, filtered, each row a link into its replay at the violation that counts most.
 
 const byId = (id) => document.getElementById(id);
 const rows = JSON.parse(byId("data-rows").textContent);
@@ -8,10 +8,7 @@ const PAGE = 200;
 let sorting = { key: "cls", up: true };
 let room = PAGE;
 
-for (const row of rows) {
-  const times = Object.values(row.violated).filter((t) => t !== null);
-  row.first = times.length ? Math.min(...times) : Infinity;
-}
+for (const row of rows) row.first = row.at ?? Infinity;
 
 function options(id, values, words = {}) {
   for (const value of values) {
@@ -45,7 +42,10 @@ function compare(a, b) {
 function violatedText(row) {
   // by time; what has none in the order of the metrics, as it stands there
   const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
-  return parts.map(([name, t]) => (t === null ? name : `${name} ${t.toFixed(1)} s`)).join(" · ");
+  return parts
+    .map(([name, t]) => [metrics[name] || name, t])
+    .map(([words, t]) => (t === null ? words : `${words} ${t.toFixed(1)}\u00a0s`))
+    .join(" · ");
 }
 
 function linkOf(row) {

@@ -5,7 +5,6 @@ a thread answers the page, which asks twice a second. Nothing is read from disk 
 opened, and nothing is added to what the workers do.
 """
 
-import heapq
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -86,8 +85,8 @@ class LiveRun:
         self._progress = Progress(0, total, 0)
         self._first: int | None = None  # tasks that were done before
         self._sums: dict[_Group, _Sums] = defaultdict(_Sums)
-        # the lowest scores: a heap of (-score, -number of the result, the result)
-        self._worst: list[tuple[float, int, TaskResult]] = []
+        # the lowest scores by scenario: the score, the number of the result, the result
+        self._worst: dict[str, tuple[float, int, TaskResult]] = {}
         self._number = 0
         self._failures: list[TaskResult] = []
         self._num_failures: Counter[tuple[str, str]] = Counter()  # by planner and noise
@@ -111,10 +110,11 @@ class LiveRun:
         score = float(result.scores["cls"])
         group = _Group(result.task.planner, result.task.noise, result.scores["traffic"])
         self._sums[group].add(result.scores["log_name"], score)
-        if score < 1.0:
-            heapq.heappush(self._worst, (-score, -self._number, result))
+        known = self._worst.get(result.task.token)
+        if score < (known[0] if known else 1.0):
+            self._worst[result.task.token] = (score, self._number, result)
             if len(self._worst) > _WORST:
-                heapq.heappop(self._worst)
+                del self._worst[max(self._worst, key=lambda token: self._worst[token][:2])]
 
     def end(self, state: str) -> None:
         """Say how the run ended: `finished`, `interrupted` or `stopped`."""
@@ -149,9 +149,9 @@ class LiveRun:
                         "score": 100.0 * float(result.scores["cls"]),
                         "why": _words(violated := _violated(result)),
                         "at": next(iter(violated.values()), None),
-                        "replay": -number if result.rollout else None,
+                        "replay": number if result.rollout else None,
                     }
-                    for _, number, result in sorted(self._worst, reverse=True)
+                    for _, number, result in sorted(self._worst.values(), key=lambda one: one[:2])
                 ],
                 "failures": [
                     {**r.task._asdict(), "status": r.status, "error": r.error, "hint": r.hint}
@@ -167,7 +167,7 @@ class LiveRun:
             ShiftsimError: Its scenario cannot be read.
         """
         with self._lock:
-            found = [result for _, n, result in self._worst if -n == number and result.rollout]
+            found = [r for _, n, r in self._worst.values() if n == number and r.rollout]
         if not found:
             return None
         (result,) = found

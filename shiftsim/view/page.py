@@ -11,7 +11,7 @@ from shiftsim.files import write_text
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import pack
 from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
-from shiftsim.world.scenario import Scenario
+from shiftsim.world.scenario import Scenario, require_scenario
 
 _HERE = Path(__file__).parent
 MAX_ROLLOUTS = 6
@@ -47,6 +47,7 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
         logs: One to six rollouts by name; underscores stand for hyphens.
 
     Raises:
+        ConfigError: There is no scenario.
         ValueError: There are no rollouts, or more than six.
 
     Example:
@@ -56,6 +57,7 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
         shiftsim.show(scenario, **logs).save("replay.html")
         ```
     """
+    require_scenario("show", scenario)
     shown = [
         Shown(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)
         for name, log in logs.items()

@@ -8,6 +8,7 @@ const CLEAN = [];
 const NOISY = [7, 5];
 const EXPERT = "#1f1f1f";
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
+const LENGTH_CLEAR = 4.2; // m that no ego reaches from its rear axle
 const TOLD = 2; // s that the words of a violation stay
 const FADE = 500; // ms in which whole plans appear once a moment is chosen
 
@@ -28,6 +29,7 @@ const state = {
   centre: null,
   told: [], // the words of violations on the canvas
 };
+let zoomed = false; // whether the link said how near
 let planned = 0; // how much of the plans beyond their first second is seen, 0 to 1
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
 let scene, map, times, strips, panels, highlighted = -1;
@@ -134,11 +136,14 @@ function highlight(violation) {
   highlighted = violation.partner ? names.indexOf(violation.partner) : -1;
 }
 
-// what a link that opens at a violation means: its partner
+// what a link that opens at a violation means: its partner, and a view of it
 function highlightNow() {
-  const now = violations().filter((item) => item.partner && Math.abs(item.t - state.t) < 0.05);
-  const found = now.find((item) => item.index === state.focus) || now[0];
-  if (found) highlight(found);
+  const weight = (item) => 2 * (item.index === state.focus) + Boolean(item.partner);
+  const now = violations().filter((item) => Math.abs(item.t - state.t) < 0.05);
+  const [found] = now.sort((a, b) => weight(b) - weight(a));
+  if (!found) return;
+  highlight(found);
+  if (!zoomed) state.scale = Math.max(state.scale, CLOSE);
 }
 
 // ---- what is shown ----
@@ -255,39 +260,68 @@ function drawPanel(panel, members, leading, at) {
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
     drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour, isNoisy(rollout));
   }
-  let line = 0;
-  for (const index of order.reverse()) line = tellViolations(panel, index, line);
+  const told = order.reverse().flatMap((index) => violatedNow(panel, index));
+  // what words may not cover: [left, top, right, bottom]
+  const taken = told.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10]);
+  for (const one of told) tellViolation(panel, one, taken);
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
 }
 
-// the words of what has just been violated, below each other, with a line to where it was
-function tellViolations(panel, index, line) {
-  const { violations: all, colour } = meta.rollouts[index];
-  const now = all.filter((item) => state.t >= item.t - 1e-6 && state.t < item.t + TOLD);
-  for (const item of now) {
-    const [x, y] = panel.toScreen(...egoPose(index, sampleAt(item.t)).slice(0, 2));
-    const [left, top] = [panel.left + 10, panel.top + (state.side ? 34 : 10) + 24 * line];
-    context.font = "600 13px system-ui, sans-serif";
-    const width = context.measureText(item.words).width;
-    context.strokeStyle = colour;
-    context.lineWidth = 1.2;
-    context.beginPath();
-    context.moveTo(left + width + 16, top + 10);
-    context.lineTo(x, y);
-    context.moveTo(x - 7, y - 7);
-    context.lineTo(x + 7, y + 7);
-    context.moveTo(x - 7, y + 7);
-    context.lineTo(x + 7, y - 7);
-    context.stroke();
-    context.fillStyle = "rgba(255, 255, 255, 0.92)";
-    context.fillRect(left, top, width + 16, 20);
-    context.strokeRect(left, top, width + 16, 20);
-    context.fillStyle = "#8c0018";
-    context.fillText(item.words, left + 8, top + 15);
-    state.told.push(item.words);
-    line++;
-  }
-  return line;
+// what a rollout has just violated, and where on the screen
+function violatedNow(panel, index) {
+  return meta.rollouts[index].violations
+    .filter((item) => state.t >= item.t - 1e-6 && state.t < item.t + TOLD)
+    .map((item) => {
+      const [x, y] = panel.toScreen(...egoPose(index, sampleAt(item.t)).slice(0, 2));
+      return { item, index, x, y };
+    });
+}
+
+// the mark of a violation, and its words beside it in a place of their own
+function tellViolation(panel, { item, index, x, y }, taken) {
+  context.font = "600 13px system-ui, sans-serif";
+  const width = context.measureText(item.words).width + 16;
+  const [left, top] = placeWords(panel, x, y, width, partnerSide(panel, index, item, x), taken);
+  taken.push([left, top, left + width, top + 24]);
+  context.strokeStyle = meta.rollouts[index].colour;
+  context.lineWidth = 1.2;
+  context.beginPath();
+  context.moveTo(left > x ? left : left + width, top + 10);
+  context.lineTo(x, y);
+  context.stroke();
+  drawMarker(context, "burst", x, y, 9, ALARM);
+  context.strokeStyle = meta.rollouts[index].colour;
+  context.fillStyle = "rgba(255, 255, 255, 0.92)";
+  context.fillRect(left, top, width, 20);
+  context.strokeRect(left, top, width, 20);
+  context.fillStyle = "#8c0018";
+  context.fillText(item.words, left + 8, top + 15);
+  state.told.push(item.words);
+}
+
+// -1 where the partner of a violation is left of it, 1 where it is right or there is none
+function partnerSide(panel, index, item, x) {
+  const { fields, names } = tracksOf(index);
+  const partner = names.indexOf(item.partner);
+  if (partner < 0) return -1;
+  const pose = poseAt(fields, "tracks", names.length, partner, sampleAt(item.t));
+  return panel.toScreen(pose[0], pose[1])[0] < x ? -1 : 1;
+}
+
+// left and top of words of a width, on the side away from the partner, clear of the ego's box and
+// of other words, within the panel
+function placeWords(panel, x, y, width, side, taken) {
+  const clear = Math.max(LENGTH_CLEAR * state.scale, 24);
+  const wanted = side < 0 ? x + clear : x - clear - width;
+  const most = panel.left + panel.width - width - 8;
+  const left = Math.max(Math.min(wanted, most), panel.left + 8);
+  const [least, lowest] = [panel.top + (state.side ? 34 : 10), panel.top + panel.height - 34];
+  const away = left === wanted ? 46 : clear + 22; // where it does not fit beside, above or below
+  const steps = [...Array(10).keys()].map((k) => away + 24 * k);
+  const places = [...steps.map((step) => y - step), ...steps.map((step) => y + step - 22)];
+  const inside = places.map((top) => Math.max(Math.min(top, lowest), least));
+  const free = (top) => taken.every((t) => t[1] >= top + 24 || t[3] <= top || t[0] >= left + width || t[2] <= left);
+  return [left, inside.find(free) ?? least];
 }
 
 function captionPanel(panel, rollout, fields, at) {
@@ -344,8 +378,9 @@ function marksOf(index, row) {
   const hollow = isNoisy(meta.rollouts[index]);
   const moments = [...new Set(all.map((item) => item.t))];
   return moments.map((t) => {
-    const names = all.filter((item) => item.t === t).map((item) => item.short);
-    return { t, row, text: names.join(" "), colour, marker, hollow };
+    const here = all.filter((item) => item.t === t);
+    const [text, words] = [here.map((item) => item.short).join(" "), here.map((item) => item.words).join("; ")];
+    return { t, row, text, words, colour, marker, hollow };
   });
 }
 
@@ -365,7 +400,7 @@ function listRollouts() {
     check.addEventListener("change", () => show(index, check.checked));
     const label = document.createElement("span");
     label.className = "label";
-    label.textContent = rollout.planner;
+    for (const part of rollout.planner.split(/(?<=[:/._-])/)) label.append(part, document.createElement("wbr"));
     label.title = labelOf(rollout);
     const cls = document.createElement("span");
     cls.className = "cls";
@@ -604,7 +639,10 @@ function connect() {
     scrub(e);
     byId("curves").setPointerCapture(e.pointerId);
   });
-  byId("curves").addEventListener("pointermove", (e) => e.buttons && scrub(e));
+  byId("curves").addEventListener("pointermove", (e) => {
+    byId("curves").title = strips.wordsAt(e.offsetX, e.offsetY);
+    if (e.buttons) scrub(e);
+  });
   window.addEventListener("keydown", onKey);
   window.addEventListener("resize", () => {
     showCurves();
@@ -613,9 +651,8 @@ function connect() {
   window.addEventListener("hashchange", async () => {
     if (location.hash.slice(1) !== written) {
       await loadState();
-      changed();
       highlightNow();
-      draw();
+      changed();
     }
   });
 }
@@ -648,6 +685,7 @@ async function loadState() {
   if (known.some(Boolean)) state.shown = known;
   const focus = number("focus", 1) - 1;
   state.focus = state.shown[focus] ? focus : state.shown.indexOf(true);
+  zoomed = given.has("zoom");
   state.scale = Math.min(Math.max(number("zoom", state.scale), MIN_SCALE), MAX_SCALE);
   state.side = given.get("side") === "1";
   const at = (given.get("at") || "").split(",").map(Number.parseFloat);
@@ -682,8 +720,8 @@ async function start() {
   connect();
   syncOptions();
   byId("time").value = state.t;
-  changed();
   highlightNow();
+  changed();
   fadePlans();
   window.firstFrame = performance.now(); // ms since the page was opened
   document.documentElement.dataset.ready = "1";

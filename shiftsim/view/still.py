@@ -1,6 +1,8 @@
 """Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
 
+import re
 from collections.abc import Sequence
+from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from textwrap import wrap
@@ -34,6 +36,7 @@ STILLS = (".pdf", ".png", ".svg")
 FILMS = (".mp4", ".gif")
 _PAD = 12.0  # m around the driven paths
 _FPS = 10
+_KEY = "dotted: the recorded driver; red mark: where most of the score was lost"
 _FILM_DPI = 100
 _LARGEST = 6.0  # inches, of a single scene
 _WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
@@ -116,11 +119,12 @@ def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> 
             draw_map(axes, scenario.map, scenario.route, extent)
             draw_paths(axes, [item], styles)
             draw_boxes(axes, [item], row, styles)
-            draw_violation(axes, item, styles[item.planner], "short")
+            draw_violation(axes, item, styles[item.planner], in_short=True)
             if item is shown[0]:
                 axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
-        line[0].set_ylabel("\n".join(wrap(caption(item), per_line)), fontsize=SMALL - 1)
+        line[0].set_ylabel(_wrapped(caption(item), per_line), fontsize=SMALL - 1)
     draw_scale(panels_of[-1][0], extent)
+    figure.supxlabel(_KEY, fontsize=SMALL - 1)
     figure.suptitle(_words(scenario), fontsize=SMALL + 1)
     return figure
 
@@ -213,7 +217,7 @@ def add_legend(figure: Any, axes: Any) -> None:
     look: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handlelength": 3.0}
     handles, labels = axes.get_legend_handles_labels()
     length = 38 if is_tall else 85  # characters
-    labels = ["\n".join(wrap(label, length, subsequent_indent="  ")) for label in labels]
+    labels = [_wrapped(label, length, subsequent_indent="  ") for label in labels]
     legend = figure.legend(handles, labels, loc=place, **look)
     box = legend.get_window_extent(figure.canvas.get_renderer())
     own_width, own_height = box.width / figure.dpi + 0.1, box.height / figure.dpi + 0.1
@@ -222,6 +226,11 @@ def add_legend(figure: Any, axes: Any) -> None:
     else:
         figure.set_size_inches(max(width, own_width), height + own_height)
     figure.draw_without_rendering()  # the layout settles in two steps
+
+
+def _wrapped(text: str, length: int, **settings: Any) -> str:
+    """A text in lines; a number stays with its unit."""
+    return "\n".join(wrap(re.sub(r"(\d) (m|s|rad)\b", "\\1\u00a0\\2", text), length, **settings))
 
 
 def _words(scenario: Scenario) -> str:
@@ -240,8 +249,11 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
 
     writer: Any = PillowWriter(fps=_FPS)
     if path.suffix.lower() == ".mp4":
-        if not FFMpegWriter.isAvailable():
-            raise MissingExtraError("mp4 needs ffmpeg", hint="install ffmpeg, or write a .gif")
+        if not _has_ffmpeg(FFMpegWriter):
+            raise MissingExtraError(
+                "mp4 needs ffmpeg",
+                hint="install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
+            )
         writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
     styles = planner_styles(item.planner for item in shown)
     times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
@@ -250,9 +262,19 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
         for row, time in enumerate(times.tolist()):
             drawn = draw_boxes(axes, shown, row, styles)
             for mark in marks:
-                for artist in (mark.cross, mark.label):
+                for artist in (mark.burst, mark.label):
                     artist.set_visible(mark.time <= time + 1e-6)
             _heading(axes, scenario, time)
             writer.grab_frame()
             for artist in drawn:
                 artist.remove()
+
+
+def _has_ffmpeg(writer: Any) -> bool:
+    """Whether there is ffmpeg, the system's or that of the package imageio-ffmpeg."""
+    if not writer.isAvailable() and find_spec("imageio_ffmpeg"):
+        from imageio_ffmpeg import get_ffmpeg_exe
+        from matplotlib import rcParams
+
+        rcParams["animation.ffmpeg_path"] = get_ffmpeg_exe()
+    return bool(writer.isAvailable())

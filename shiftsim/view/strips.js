@@ -2,7 +2,8 @@
 // Curves over time below the scene: speed, acceleration, noise, and the first violations.
 // They are painted once; moving in time only moves the cursor.
 
-const STRIP_HEIGHT = 64;
+const STRIP_HEIGHT = 70;
+const STRIP_HEAD = 16; // of it, for the words
 const STRIP_LEFT = 46;
 const STRIP_RIGHT = 10;
 const VIOLATION_ROW = 13;
@@ -60,7 +61,7 @@ class Strips {
     const values = curve.lines.flatMap((line) => Array.from(line.values).filter(Number.isFinite));
     const low = Math.min(0, ...values);
     const high = Math.max(curve.least, ...values);
-    const y = (value) => top + STRIP_HEIGHT - 6 - ((STRIP_HEIGHT - 14) * (value - low)) / (high - low);
+    const y = (value) => top + STRIP_HEIGHT - 6 - ((STRIP_HEIGHT - STRIP_HEAD - 6) * (value - low)) / (high - low);
     context.strokeStyle = "#e4e4e0";
     context.lineWidth = 1;
     context.beginPath();
@@ -69,7 +70,7 @@ class Strips {
     context.stroke();
     context.fillStyle = "#4c4c4c";
     context.textAlign = "right";
-    context.fillText(high.toFixed(high < 10 ? 1 : 0), STRIP_LEFT - 5, top + 12);
+    context.fillText(high.toFixed(high < 10 ? 1 : 0), STRIP_LEFT - 5, top + STRIP_HEAD + 4);
     context.fillText(low < 0 ? low.toFixed(1) : "0", STRIP_LEFT - 5, top + STRIP_HEIGHT - 3);
     context.textAlign = "left";
     for (const line of curve.lines) {
@@ -84,11 +85,16 @@ class Strips {
       context.stroke();
     }
     context.setLineDash([]);
-    const label = `${curve.label} [${curve.unit}]`;
-    context.fillStyle = "rgba(255, 255, 255, 0.85)";
-    context.fillRect(STRIP_LEFT + 2, top, context.measureText(label).width + 5, 14);
     context.fillStyle = "#4c4c4c";
-    context.fillText(label, STRIP_LEFT + 4, top + 11);
+    context.fillText(`${curve.label} [${curve.unit}]`, STRIP_LEFT + 4, top + 11);
+  }
+
+  // what the mark at a place on the canvas says in words
+  wordsAt(px, py) {
+    const top = this.curves.length * STRIP_HEIGHT + 8;
+    const near = (mark) =>
+      Math.hypot(this.x(mark.t) - px, top + mark.row * VIOLATION_ROW - py) < VIOLATION_ROW / 2 + 2;
+    return this.marks.filter(near).map((mark) => mark.words).join("; ");
   }
 
   paintMarks(context, top) {

@@ -14,6 +14,7 @@ const MAP_COLOURS = {
 };
 const AGENT_COLOURS = ["#8797a8", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
 const EDITED = "#7b2fbf"; // what an edit made or moved
+const ALARM = "#b00020"; // violations
 const AGENT_EDGE = "#3d4650";
 const KIND_NAMES = ["vehicle", "pedestrian", "bicycle", "cone", "barrier", "sign", "object"];
 const LIGHT_COLOURS = [null, "#1f9d4d", "#d9a400", "#d02a1e", null]; // absent, green, yellow, red, unknown
@@ -307,6 +308,7 @@ const MARKERS = {
   P: (c, r) => polygon(c, cross(r, 0)),
   X: (c, r) => polygon(c, cross(r, Math.PI / 4)),
   "*": (c, r) => polygon(c, star(r)),
+  burst: (c, r) => polygon(c, star(r, 8)), // where something went wrong; of no planner
 };
 
 function polygon(context, points) {
@@ -323,10 +325,10 @@ function cross(r, angle) {
   return [0, 1, 2, 3].flatMap((k) => quarter.map((p) => turn(p, angle + (k * Math.PI) / 2)));
 }
 
-function star(r) {
-  return [...Array(10).keys()].map((k) => {
+function star(r, points = 5) {
+  return [...Array(2 * points).keys()].map((k) => {
     const reach = k % 2 ? r * 0.45 : r;
-    return [reach * Math.sin((k * Math.PI) / 5), -reach * Math.cos((k * Math.PI) / 5)];
+    return [reach * Math.sin((k * Math.PI) / points), -reach * Math.cos((k * Math.PI) / points)];
   });
 }
 

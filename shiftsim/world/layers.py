@@ -43,6 +43,9 @@ class Lists(NamedTuple):
         """List number `index`."""
         return self.items[self.ptr[index] : self.ptr[index + 1]]
 
+    def __repr__(self) -> str:
+        return f"<Lists: {len(self.ptr) - 1} lists of {len(self.items)} numbers>"
+
 
 class Polylines(NamedTuple):
     """Many polylines: line i has the vertices `xy[ptr[i] : ptr[i + 1]]`."""
@@ -58,6 +61,9 @@ class Polylines(NamedTuple):
     def length(self, index: int) -> float:
         """Length of line `index` [m]."""
         return float(self.arc[self.ptr[index + 1] - 1])
+
+    def __repr__(self) -> str:
+        return f"<Polylines: {len(self.ptr) - 1} lines of {len(self.xy)} vertices>"
 
 
 class Polygons(NamedTuple):

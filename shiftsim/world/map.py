@@ -35,42 +35,85 @@ LAYERS = (
 
 @dataclass(frozen=True)
 class VectorMap:
-    """A semantic map. E edges, B blocks."""
+    """A semantic map. E edges, B blocks; objects are numbered, and `Layer.index` has their ids.
 
-    name: str  # map (city) name
-    epsg: int  # code of the metric coordinate system; 0 for a local frame
-    edges: Layer  # lanes, then lane connectors: ids and polygons
-    num_lanes: int  # how many of the edges are lanes
-    baselines: Polylines  # E centre lines in the direction of travel
-    left_boundaries: Polylines  # E lines; empty where unknown
-    right_boundaries: Polylines  # E lines; empty where unknown
-    boundary_ids: tuple[tuple[str, str], ...]  # E pairs of boundary ids, left and right
-    speed_limits: FloatArray  # (E,) [m/s], NaN where the map has none
-    lane_index: IntArray  # (E,) position in the roadblock, 0 leftmost, NONE for connectors
-    left_lane: IntArray  # (E,) neighbour lane on the left, or NONE
-    right_lane: IntArray  # (E,) neighbour lane on the right, or NONE
-    incoming: Lists  # edges that lead into an edge
-    outgoing: Lists  # edges an edge leads to
-    block_of: IntArray  # (E,) block of an edge, NONE where the source names an unknown one
-    has_traffic_lights: BoolArray  # (E,) whether lights govern the edge
-    stop_lines: Lists  # stop polygons of an edge
-    intersection_of: IntArray  # (E,) intersection of a connector, or NONE
-    turn_type: IntArray  # (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown
-    is_bike: BoolArray  # (E,) whether the edge is a bicycle lane
-    blocks: Layer  # roadblocks, then roadblock connectors: ids and polygons
-    num_roadblocks: int  # how many of the blocks are roadblocks
-    block_edges: Lists  # edges of a block, in the order of the edges
-    block_incoming: Lists  # blocks that lead into a block
-    block_outgoing: Lists  # blocks a block leads to
+    Attributes:
+        name: Map (city) name.
+        epsg: Code of the metric coordinate system; 0 for a local frame.
+        edges: Lanes, then lane connectors: ids and polygons.
+        num_lanes: How many of the edges are lanes.
+        baselines: E centre lines in the direction of travel.
+        left_boundaries: E lines; empty where unknown.
+        right_boundaries: E lines; empty where unknown.
+        boundary_ids: E pairs of boundary ids, left and right.
+        speed_limits: (E,) [m/s], NaN where the map has none.
+        lane_index: (E,) position in the roadblock, 0 leftmost, NONE for connectors.
+        left_lane: (E,) neighbour lane on the left, or NONE.
+        right_lane: (E,) neighbour lane on the right, or NONE.
+        incoming: Edges that lead into an edge.
+        outgoing: Edges an edge leads to.
+        block_of: (E,) block of an edge, NONE where the source names an unknown one.
+        has_traffic_lights: (E,) whether lights govern the edge.
+        stop_lines: Stop polygons of an edge.
+        intersection_of: (E,) intersection of a connector, or NONE.
+        turn_type: (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown.
+        is_bike: (E,) whether the edge is a bicycle lane.
+        blocks: Roadblocks, then roadblock connectors: ids and polygons.
+        num_roadblocks: How many of the blocks are roadblocks.
+        block_edges: Edges of a block, in the order of the edges.
+        block_incoming: Blocks that lead into a block.
+        block_outgoing: Blocks a block leads to.
+        intersections: Ids and polygons.
+        intersection_kinds: Type number of each intersection.
+        stop_polygons: Ids and polygons.
+        stop_kinds: Type number of each stop polygon.
+        crosswalks: Ids and polygons.
+        walkways: Ids and polygons.
+        car_parks: Ids and polygons.
+        drivable_areas: Road segments, intersections, generic drivable areas, car parks.
+        flaws: Count by kind of what the source got wrong and nuPlan tolerates.
+
+    Example:
+        ```python
+        road = shiftsim.open_store("demo")["03b23c"].map
+        for edge in road.block_edges.at(0):  # the lanes of the first roadblock
+            print(road.baselines.at(edge)[:, :2], road.speed_limits[edge], road.outgoing.at(edge))
+        ```
+    """
+
+    name: str
+    epsg: int
+    edges: Layer
+    num_lanes: int
+    baselines: Polylines
+    left_boundaries: Polylines
+    right_boundaries: Polylines
+    boundary_ids: tuple[tuple[str, str], ...]
+    speed_limits: FloatArray
+    lane_index: IntArray
+    left_lane: IntArray
+    right_lane: IntArray
+    incoming: Lists
+    outgoing: Lists
+    block_of: IntArray
+    has_traffic_lights: BoolArray
+    stop_lines: Lists
+    intersection_of: IntArray
+    turn_type: IntArray
+    is_bike: BoolArray
+    blocks: Layer
+    num_roadblocks: int
+    block_edges: Lists
+    block_incoming: Lists
+    block_outgoing: Lists
     intersections: Layer
-    intersection_kinds: IntArray  # type number of each intersection
+    intersection_kinds: IntArray
     stop_polygons: Layer
-    stop_kinds: IntArray  # type number of each stop polygon
+    stop_kinds: IntArray
     crosswalks: Layer
     walkways: Layer
     car_parks: Layer
-    drivable_areas: Layer  # road segments, intersections, generic drivable areas, car parks
-    # count by kind of what the source got wrong and nuPlan tolerates
+    drivable_areas: Layer
     flaws: dict[str, int] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, sealed
+from shiftsim.errors import ConfigError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.script import Script
 from shiftsim.world.state import Tracks, TrafficLights
@@ -129,3 +130,16 @@ class Scenario:
         from shiftsim.world.edits.apply import edit_scenario
 
         return edit_scenario(self, name, **tables)
+
+
+def require_scenario(what: str, given: object) -> None:
+    """Refuse what is no scenario, with how to get one.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if not isinstance(given, Scenario):
+        raise ConfigError(
+            f"{what}() needs a scenario first, not {type(given).__name__}",
+            hint=f'scenario = shiftsim.open_store("demo")[TOKEN]; shiftsim.{what}(scenario, …)',
+        )

@@ -1,3 +1,5 @@
+import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -183,6 +185,47 @@ def test_a_link_to_a_violation_marks_its_partner(page, folder):
 
     page.wait("document.documentElement.dataset.ready")
     assert page.run("tracksOf(state.focus).names[highlighted]") == first["partner"]
+    assert page.run("state.scale") >= 14
+    page.open(f"{address(folder)}#t={first['t']:.2f}&focus={first['index'] + 1}&zoom=3.00")
+    assert page.run("state.scale") == 3
+
+
+# boxes of words and of marks that are drawn on the canvas: [left, top, right, bottom]
+DRAWN = """(() => {
+  const words = [], marks = [], strokeRect = context.strokeRect, mark = drawMarker;
+  context.strokeRect = (x, y, w, h) => words.push([x, y, x + w, y + h]);
+  window.drawMarker = (_, name, x, y) =>
+    name === "burst" && marks.push([x - 6, y - 6, x + 6, y + 6]);
+  draw();
+  context.strokeRect = strokeRect;
+  window.drawMarker = mark;
+  return [words, marks, [canvas.clientWidth, canvas.clientHeight]];
+})()"""
+
+
+def meet(a, b):
+    """Whether two boxes share a point."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_words_of_violations_lie_within_the_canvas_and_on_nothing_that_matters(page, folder, size):
+    page.open(address(folder), size)
+    for violation in page.run("violations()"):
+        page.run(f"jumpTo({json.dumps(violation)})")
+        words, marks, (width, height) = page.run(DRAWN)
+        assert len(words) == len(marks) >= 1
+        assert all(0 <= w[0] and 0 <= w[1] and w[2] <= width and w[3] <= height for w in words)
+        assert not any(meet(a, b) for i, a in enumerate(words) for b in (*words[:i], *marks))
+
+
+def test_marks_on_the_timeline_say_their_words_on_hover(replay):
+    mark = replay.run("strips.marks[0]")
+    place = replay.run("[strips.x(strips.marks[0].t), strips.curves.length * STRIP_HEIGHT + 8]")
+
+    assert mark["words"] == replay.run(f"strips.wordsAt({place[0]}, {place[1]})")
+    assert len(mark["words"]) > len(mark["text"])
+    assert replay.run("strips.wordsAt(1, 1)") == ""
 
 
 def test_abbreviations_are_explained_and_the_keys_are_listed(replay):
@@ -348,6 +391,9 @@ class TestList:
         )
 
         assert set(self.column(listing, 4)) == {"log-future"}
+        said = " ".join(self.column(listing, 8))
+        assert "drivable area" in said or "collision" in said
+        assert not re.search(r"\b(NCR|DAC|EMP|DDC|PER|TTC|SLC|EIC)\b", said)
         assert listing.text("count") == "4 of 8 rollouts"
 
     def test_a_row_links_into_its_replay_at_the_violation(self, listing):

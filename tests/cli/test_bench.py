@@ -72,8 +72,8 @@ def test_the_same_command_again_keeps_what_is_there(place):
 def test_the_folder_of_a_benchmark_is_shown_explained_plotted_and_compared(place):
     worst = call(place, "explain", "runs/b")
     assert worst.returncode == 0, worst.stderr
-    assert "worst of own-nonreactive" in worst.stdout
-    assert "worst of own-reactive" in worst.stdout
+    assert "worst scenarios of own-nonreactive" in worst.stdout
+    assert "worst scenarios of own-reactive" in worst.stdout
     token = shiftsim.open_run(place / "runs/b/own-reactive").worst(1)[0]["token"]
     why = call(place, "explain", "runs/b", token, "--noise", "none")
     assert why.stdout.count(f"{token}  free  constant-velocity none") == 2

@@ -2,7 +2,11 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -98,3 +102,40 @@ def test_a_training_goes_on_with_resume(toy, tmp_path, capsys, monkeypatch):
 
     assert code == 130
     assert lines[-1].endswith(f"--store {toy} --resume")
+
+
+EARLY = """
+import os, signal, sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
+
+
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+sys.meta_path.insert(0, Interrupts())
+sys.argv = ["shiftsim", "planners", "list"]
+from shiftsim.__main__ import main
+
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["shiftsim.cli", "typer", "shiftsim.cli.planners"])
+def test_an_interrupt_while_it_imports_ends_in_one_line(module):
+    done = subprocess.run(
+        [sys.executable, "-c", EARLY.format(module=module)], capture_output=True, text=True
+    )
+
+    assert done.returncode in (130, -signal.SIGINT)
+    assert done.stderr.splitlines()[0] == "error: interrupted"
+    assert "Traceback" not in done.stderr
+
+
+def test_the_installed_command_is_the_module_that_hears_interrupts_first():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+
+    assert project["project"]["scripts"] == {"shiftsim": "shiftsim.__main__:main"}

@@ -3,6 +3,7 @@
 import re
 import time
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -160,6 +161,41 @@ class BadCommand(Straight):
         return Command(float("inf"), 0.0)
 
 
+class Leaves(Straight):
+    def plan(self, observation):
+        raise SystemExit("no weights")
+
+
+class InThirtyTwoBits(Straight):
+    def poses(self, x, y, heading, speed):
+        plan = super().poses(x, y, heading, speed)
+        plan.states[:, :2] = plan.states[:, :2].astype(np.float32)
+        return plan
+
+
+class SteersInDegrees(Straight):
+    def plan(self, observation):
+        return Command(0.0, 30.0)
+
+
+class KeepsInTheClass(Straight):
+    seen: ClassVar = []
+
+    def reset(self, scene):
+        KeepsInTheClass.seen.append(scene.token)
+        self.works = scene.token == "other" or "other" not in self.seen
+
+    def poses(self, x, y, heading, speed):
+        return super().poses(x if self.works else np.nan, y, heading, speed)
+
+
+class Hangs(Straight):
+    def plan(self, observation):
+        if observation.iteration == 3:
+            raise KeyboardInterrupt  # as from the terminal, while this does not end
+        return super().plan(observation)
+
+
 class Choosy(Straight):
     def reset(self, scene):
         self.works = scene.token != "other"
@@ -198,6 +234,9 @@ BROKEN = [
     (Short, "warning", "length", "less than 1 s ahead"),
     (HoldsALambda, "error", "pickles", "cannot be sent to a worker"),
     (BadCommand, "error", "finite", "acceleration inf"),
+    (Leaves, "error", "runs", r"plan\(\) at iteration 0 failed: SystemExit: no weights"),
+    (SteersInDegrees, "warning", "units", "steering_rate 30: no car does more than 10"),
+    (Hangs, "error", "ends", r"plan\(\) at iteration 3 had not ended .*test_contract.py:\d+"),
 ]
 
 
@@ -221,6 +260,21 @@ def test_a_planner_that_fails_on_another_scenario_only_is_named_with_it():
     other = replace(cruise_scenario(), token="other")
     found = [f for f in check_planner(Choosy, cruise_scenario(), other) if f.check == "finite"]
     assert found[0].message.startswith("scenario other, iteration 0")
+
+
+def test_state_that_makes_a_scenario_fail_after_another_is_named():
+    other = replace(cruise_scenario(), token="other")
+    found, *_ = check_planner(KeepsInTheClass, cruise_scenario(), other)
+    assert found.check == "company"
+    assert found.message.startswith("after scenario other, iteration 0: x of state 0 is nan")
+
+
+@pytest.mark.parametrize(("east", "step"), [(5_650_000.0, "0.5 m"), (400.0, None)])
+def test_positions_of_thirty_two_bits_are_warned_of_where_that_is_coarse(east, step):
+    found = check_planner(InThirtyTwoBits, cruise_scenario(start=(east, 0.0, 0.0)))
+    coarse = [f.message for f in found if f.check == "precision"]
+    assert len(coarse) == (1 if step else 0)
+    assert step is None or f"{step} apart" in coarse[0]
 
 
 def test_slow_plans_are_told_with_their_share():

@@ -88,9 +88,16 @@ def test_an_unknown_format_or_column_is_refused(clean_run):
         scores(read_groups([clean_run]), by="colour")
 
 
-def test_the_worst_rollouts_come_with_a_reason(clean_run):
-    worst = worst_rollouts(clean_run, 3)
-    assert [row["cls"] for row in worst] == sorted(clean_run.scores["cls"].to_pylist())[:3]
+def test_the_worst_scenarios_come_each_by_its_worst_rollout_and_with_a_reason(clean_run):
+    lowest = {}
+    for row in clean_run.scores.to_pylist():
+        lowest[row["token"]] = min(row["cls"], lowest.get(row["token"], 1.0))
+
+    worst = worst_rollouts(clean_run, 5)
+
+    assert len({row["token"] for row in worst}) == len(worst) == len(lowest)
+    assert [row["cls"] for row in worst] == sorted(lowest.values())[:5]
+    assert all(row["cls"] == lowest[row["token"]] for row in worst)
     assert all(row["reason"] for row in worst if row["cls"] < 1.0)
 
 

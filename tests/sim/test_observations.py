@@ -249,6 +249,23 @@ def test_a_short_plan_runs_and_is_warned_of_once(scenario):
         simulate(scenario, Short(11))
 
 
+def test_a_first_plan_that_begins_elsewhere_is_warned_of(scenario):
+    def in_the_frame_of_the_ego(plan):
+        plan.states[:, :2] += 30.0
+        return plan
+
+    with pytest.warns(UserWarning, match="42 m away from the ego: poses are in the map frame"):
+        simulate(scenario, Altered(in_the_frame_of_the_ego))
+
+
+class Altered(ConstantVelocity):
+    def __init__(self, alter):
+        self.alter = alter
+
+    def plan(self, observation):
+        return self.alter(super().plan(observation))
+
+
 class Mirrors(ConstantVelocity):
     """Returns what it was shown, read-only as it is."""
 

@@ -67,7 +67,8 @@ def test_the_worst_are_kept_in_order_with_the_reason():
     late = {"metric": "no_ego_at_fault_collisions", "score": 0.0, "first_violation_s": 9.0}
     comfort = {"metric": "ego_is_comfortable", "score": 0.0, "first_violation_s": 1.0}
     bad = ended(99, 0.0, metrics=[late, comfort, violated])
-    run = run_of(*[ended(i, i / 40) for i in range(1, 41)], bad)
+    better = ended(99, 0.01)  # of the same scenario
+    run = run_of(better, *[ended(i, i / 40) for i in range(1, 41)], bad, better)
 
     worst = run.values()["worst"]
 

@@ -104,16 +104,22 @@ def test_the_list_escapes_what_it_shows():
 
 def test_the_worst_are_ten_in_words_and_without_markup_of_theirs():
     row = {"token": HOSTILE, "type": HOSTILE, "planner": HOSTILE, "noise": "ou-low", "seed": 3}
-    row |= {"violated": {"NCR": 4.3, "PER": None}, "page": page_name(HOSTILE), "index": 1}
-    rows = [{**row, "cls": 1.0 - number / 100.0} for number in range(12)]
+    row |= {"violated": {"NCR": 4.3, "PER": None}, "at": 4.3, "index": 1}
+    rows = [
+        {**row, "cls": 1.0 - number / 100.0, "page": page_name(f"{HOSTILE}{number}")}
+        for number in range(12)
+    ]
+    rows += [{**rows[3], "cls": 0.975, "noise": "none"}]  # the better one of the same scenario
 
     table = worst_table(rows)
 
     assert "<script" not in table
     assert table.count("<tr>") == 11
     assert table.index(">89.00<") < table.index(">98.00<")
-    assert "at-fault collision 4.3 s, little progress" in table
-    assert f'href="{page_name(HOSTILE)}#t=4.30&amp;focus=2"' in table
+    assert "at-fault collision 4.3\u00a0s, little progress" in table
+    assert f'href="{page_name(HOSTILE + "11")}#t=4.30&amp;focus=2"' in table
+    assert ">97.50<" not in table
+    assert "The worst 10 of 12 scenarios" in table
     assert worst_table(rows[:1]) == ""
 
 

@@ -1,6 +1,8 @@
 """Stills, grids and films: what is marked, what is said, and that it can be read."""
 
+import shutil
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -122,3 +124,20 @@ def test_a_film_marks_a_violation_from_its_first_moment_on(scenario, shown, tmp_
     monkeypatch.setattr(PillowWriter, "finish", lambda writer: None)
     save_figure(tmp_path / "film.gif", scenario, shown)
     assert seen == [[False] * 6] * 20 + [[True] * 6] * (len(shown[0].log.time_us) - 20)
+
+
+@pytest.mark.skipif(
+    not (shutil.which("ffmpeg") or find_spec("imageio_ffmpeg")), reason="NOT COVERED: no ffmpeg"
+)
+def test_an_mp4_is_a_film_that_players_know(scenario, shown, tmp_path):
+    save_figure(tmp_path / "film.mp4", scenario, shown[:1])
+    content = (tmp_path / "film.mp4").read_bytes()
+    assert content[4:8] == b"ftyp"
+    assert b"avc1" in content  # H.264
+
+
+def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scenario, shown):
+    words = [text for text, _ in written(grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]))]
+    assert words.count("at-fault collision") == 3
+    assert "NCR" not in words
+    assert any("dotted: the recorded driver" in text for text in words)
