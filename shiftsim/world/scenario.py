@@ -25,8 +25,10 @@ def duration_class(time_us: IntArray) -> str:
     Scores of different classes do not compare: `15 s`, or the whole seconds of another one.
     """
     seconds = float(time_us[-1] - time_us[0]) * 1e-6
-    is_full = _FULL_S - 0.05 <= seconds < _LONGER_S
-    return FULL_DURATION if is_full else f"{np.floor(seconds + 0.15):.0f} s"
+    if seconds < _FULL_S - 0.05:
+        return f"{np.floor(seconds + 0.05):.0f} s"
+    # as with 15 s, the last iteration may be missing
+    return FULL_DURATION if seconds < _LONGER_S else f"{np.floor(seconds + 0.15):.0f} s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,7 +151,7 @@ def test_the_track_of_edits_drives_recorded_and_edited_scenarios(place):
 
 def test_edits_of_the_track_are_drawn_and_kept(place):
     words = ("-p", "constant-velocity", "--workers", "1", "--quiet", "--limit", "3")
-    done = call(place, "bench", "edits", *words, "--traffic", "nr", "--out", "runs/drawn")
+    done = call(place, "bench", "edits", *words, "--traffic", "nonreactive", "--out", "runs/drawn")
     assert done.returncode == 0, done.stderr
     text = (place / "runs/drawn/edits.toml").read_text()
     assert text.count("[[edit]]") == 180

@@ -239,3 +239,15 @@ def test_statistics_and_the_comparison_of_benchmarks_are_of_the_edited_scenarios
     assert table.header[-1] == f"{label} (own, edited)"
     last = {row[0]: row[-1] for row in table.rows}
     assert (last["semantic shift"], last["scenario count"]) == ("scenario", "3")
+
+
+def test_check_names_edits_that_nobody_can_avoid(toy, tmp_path):
+    path = tmp_path / "close.toml"
+    path.write_text(
+        '[[edit]]\nname = "close"\ntokens = ["0000"]\n'
+        'spawn = [{at = {ahead_m = 8.5}, behavior = "stopped"}]\n'
+    )
+    assert call(tmp_path, "edits", "check", path, "--store", toy).returncode == 0
+    done = call(tmp_path, "edits", "check", path, "--store", toy, "--avoidable")
+    assert done.returncode == 1
+    assert "'0000cafe-close': neither braking at 4 m/s^2 nor PDM-Closed" in done.stdout
