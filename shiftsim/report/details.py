@@ -150,7 +150,8 @@ def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> E
 
 
 def _driven_as(group: Group) -> tuple[str, ...]:
-    return (group.traffic, group.planner, group.noise, *group.data.traits[:3])
+    data = group.data
+    return (group.traffic, group.planner, group.noise, data.windows, *data.traits[:3])
 
 
 def planning_times(groups: Sequence[Group]) -> Table:

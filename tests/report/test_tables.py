@@ -405,6 +405,7 @@ def test_edits_are_rows_of_kinds_and_columns_of_difficulty(tmp_path):
 def test_recorded_scores_of_other_rules_do_not_stand_beside_edits(tmp_path):
     score = random_scores(1)
     others = [{"thresholds": "deepplan"}, {"traffic": "reactive"}, {"planners": ("beta",)}]
+    others.append({"durations": ["30 s"] * 4})
     others.append({"tokens": ("t0", "t2", "t3", "t4")})
     for number, settings in enumerate(others):
         own = write_run(tmp_path / f"own{number}", score=score, **settings)

@@ -10,13 +10,15 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.metrics.collision import classify, first_contacts, flat_ego, flat_tracks
 from shiftsim.planners.pdm.planner import PdmClosed
-from shiftsim.sim.loop import simulate
+from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.world.edits.sampling import GRADES, HARDEST
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, PACIFICA, AgentKind, Trajectory, speeds
 
 _REACTION_US = 500_000  # before the ego brakes
+_LOOKS = 10  # iterations between looks for contacts
 _MOVES = 0.1  # m/s, from which a pedestrian has set off
 _BEYOND = 200.0  # m, how far the path goes on straight behind the recording
 _AHEAD: IntArray = np.arange(0, 2_100_000, 100_000)  # us, times of a plan
@@ -32,10 +34,11 @@ def grade(scenario: Scenario) -> str:
     made = set(scenario.script.tokens if scenario.script else ())
     if not hits(scenario, Braking(scenario, 0.0)) & made:
         return ""
-    found = (name for name, most in GRADES.items() if not hits(scenario, Braking(scenario, most)))
-    if name := next(found, ""):
-        return name
-    return "" if hits(scenario, PdmClosed()) else list(GRADES)[-1]
+    *easier, hardest = GRADES
+    if hits(scenario, Braking(scenario, HARDEST)):
+        return "" if hits(scenario, PdmClosed()) else hardest
+    enough = (name for name in easier if not hits(scenario, Braking(scenario, GRADES[name])))
+    return next(enough, hardest)
 
 
 def is_avoidable(scenario: Scenario) -> bool:
@@ -46,13 +49,24 @@ def is_avoidable(scenario: Scenario) -> bool:
 def hits(scenario: Scenario, planner: Planner) -> set[str]:
     """Tokens of the tracks that a planner touches at fault beside replayed traffic.
 
-    A contact at the side counts as at fault, whatever the lane.
+    A contact at the side counts as at fault, whatever the lane. It drives on for less than a second
+    after the first one.
     """
-    log = simulate(scenario, planner)
-    contacts = first_contacts(flat_ego(log.ego, PACIFICA), flat_tracks(log.tracks))
-    never_common = np.zeros(len(log.ego), np.bool_)
-    found = classify(contacts, log.time_us, log.tracks, never_common)
-    return {hit.token for hit in found if hit.at_fault}
+    rollout, found = Rollout(scenario, planner), set[str]()
+    while not rollout.done and not found:
+        rollout.advance(planner.plan(rollout.observe()))
+        if rollout.iteration % _LOOKS == 0 or rollout.done:
+            found = _at_fault(rollout.log(), rollout.iteration)
+    return found
+
+
+def _at_fault(log: SimulationLog, count: int) -> set[str]:
+    """Tokens of the tracks that are touched at fault in the first samples."""
+    ego, tracks = log.ego[:count], log.tracks.rows(slice(0, count))
+    contacts = first_contacts(flat_ego(ego, PACIFICA), flat_tracks(tracks))
+    never_common = np.zeros(count, np.bool_)
+    hits = classify(contacts, log.time_us[:count], tracks, never_common)
+    return {hit.token for hit in hits if hit.at_fault}
 
 
 class Braking:
