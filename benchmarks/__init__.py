@@ -14,8 +14,18 @@ from shiftsim.errors import one_of
 from shiftsim.report.groups import KnownSet
 from shiftsim.report.published import Published
 
-TRACKS = ("semantic-shift", "state-drift")
+TRACKS = ("semantic-shift", "state-drift", "edits")
+INTERPLAN_THRESHOLDS = "nuplan"  # of its edits, whatever the track's own
 _HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """The edits of a track, drawn over the scenarios that are driven."""
+
+    kinds: tuple[str, ...]  # of `sampling.KINDS`
+    count: int  # of each kind, as many of each grade
+    seed: int  # of all draws
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +38,10 @@ class Track:
     traffic: tuple[str, ...]  # traffic modes, one run each
     noise: tuple[str, ...]  # noise models
     seeds: tuple[int, ...]  # seeds of the noise
-    reference: KnownSet  # the published list that is driven besides one's own scenarios
+    reference: KnownSet | None  # the published list that is driven besides one's own scenarios
     own_thresholds: str  # threshold profile of one's own scenarios
     own_note: str  # what scores on one's own scenarios are, and are not
+    drawn: Drawn | None  # what is drawn over one's own scenarios and driven, too
 
     @property
     def rollouts_per_scenario(self) -> int:
@@ -47,14 +58,16 @@ def load_track(name: str) -> Track:
     """
     one_of("track", name, TRACKS)
     table = _read(name.replace("-", "_"))
-    sets = table["sets"]
+    sets, drawn = table["sets"], table.get("drawn")
+    known = {one.name: one for one in known_sets()}
     return Track(
         name=name,
         title=table["title"],
         **{one: tuple(table[one]) for one in ("planners", "traffic", "noise", "seeds")},
-        reference={one.name: one for one in known_sets()}[sets["reference"]],
+        reference=known[sets["reference"]] if "reference" in sets else None,
         own_thresholds=sets["own_thresholds"],
         own_note=sets["own_note"],
+        drawn=Drawn(**drawn | {"kinds": tuple(drawn["kinds"])}) if drawn else None,
     )
 
 

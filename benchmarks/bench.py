@@ -8,22 +8,30 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from shiftsim.benchmarks import Track, load_track
+from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
 from shiftsim.benchmarks.coverage import coverage
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file
+from shiftsim.files import whole_file, write_text
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.config import DEFAULT_STORE, make_config
+from shiftsim.runs.edits.avoidable import grade
+from shiftsim.runs.edits.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, Prepared, prepare
 from shiftsim.runs.results import Run, open_run, stored_results
+from shiftsim.runs.scenarios import open_edits, open_named_store
+from shiftsim.sim.traffic import traffic_name
+from shiftsim.world.edits.sampling import sample_edits
 
 MANIFEST = "bench.json"
+EDITS = "edits.toml"  # what was edited, in the folder of the benchmark
+OWN, EDITED = "own", "edited"  # beginnings of names of runs
 DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said
 _FORMAT = 1
 
@@ -37,7 +45,8 @@ class Plan:
     track: Track  # the track
     folder: Path  # where everything goes
     runs: Mapping[str, Prepared]  # the runs, by the name of their folder
-    own: KnownSet  # one's own list of scenarios as a whole
+    own: tuple[KnownSet, ...]  # one's own lists of scenarios as a whole: recorded, then edited
+    edits: str = ""  # what was drawn for it, as a file
 
     @property
     def num_tasks(self) -> int:
@@ -63,31 +72,88 @@ def plan_bench(
     if "store" not in values and "split" not in values:
         values |= {"store": DEFAULT_STORE, "split": DEFAULT_SPLIT}
     values = {"noise": list(track.noise), "seeds": list(track.seeds)} | values
-    sets = {"own": {"thresholds": track.own_thresholds} | values}
-    if reference:
+    edits_of = str(values.pop("edits", ""))
+    sets = {OWN: {"thresholds": track.own_thresholds} | values}
+    if reference and track.reference is None:
+        raise ConfigError(f"the track {track.name} has no published list", hint="leave --val14 out")
+    if reference and track.reference is not None:
         store, _, split = reference.partition(":")
         rules = {"store": store, "split": split, "thresholds": track.reference.thresholds}
         sets[track.reference.name] = values | rules
-    folder = Path(out) if out else RUNS / _name(track, sets)
+    folder = Path(out) if out else RUNS / _name(track, sets, edits_of)
     if resumes and not (folder / MANIFEST).is_file():
         raise ConfigError(
             f"there is no benchmark to go on with at {str(folder)!r}",
             hint="name its folder with --out, or begin without --resume",
         )
     _check_folder(folder, track)
+    if edits_of and track.drawn is None:
+        raise ConfigError(
+            f"the track {track.name} drives recorded scenarios",
+            hint="`shiftsim bench edits --edits FILE` drives edited ones",
+        )
+    runs = _prepared(track, sets, modes, folder)
+    whole = _whole(next(iter(runs.values())))
+    if track.drawn is None:
+        return Plan(track, folder, runs, (_list_of(whole),))
+    edits, text = _edits(track.drawn, whole, edits_of, folder)
+    rules = {"thresholds": INTERPLAN_THRESHOLDS} if edits.profile == "interplan" else {}
+    changed = {EDITED: sets[OWN] | {"edits": edits_of or str(folder / EDITS)} | rules}
+    # where no mode can drive them, the reason is said when the first one is checked
+    drivable = [mode for mode in modes if _drives(edits, mode)] or modes[:1]
+    edited = _prepared(track, changed, drivable, folder, edits)
+    lists = (_list_of(whole), _list_of(_whole(next(iter(edited.values())))))
+    return Plan(track, folder, runs | edited, lists, text)
+
+
+def _prepared(
+    track: Track,
+    sets: Mapping[str, Mapping[str, Any]],
+    modes: Sequence[str],
+    folder: Path,
+    edits: EditSet | None = None,
+) -> dict[str, Prepared]:
+    """The runs of some sets of scenarios, by the name of their folder."""
     runs = {}
     for name, traffic in product(sets, modes):
-        out_run = folder / f"{name}-{traffic}"  # the run goes on with what its folder holds
-        given = {"traffic": traffic, "out": str(out_run), "resume": out_run.exists()}
-        config = make_config(sets[name] | given, where=f"bench {track.name}")
-        runs[out_run.name] = prepare(config)
-    return Plan(track, folder, runs, _own_list(next(iter(runs.values()))))
+        out = folder / f"{name}-{traffic}"  # the run goes on with what its folder holds
+        given = {"traffic": traffic, "out": str(out), "resume": out.exists()}
+        config = make_config({**sets[name], **given}, where=f"bench {track.name}")
+        runs[out.name] = prepare(config, edits=edits)
+    return runs
 
 
-def _name(track: Track, sets: Mapping[str, Mapping[str, Any]]) -> str:
-    text = json.dumps([track.name, sets], sort_keys=True, default=str)
+def _edits(drawn: Drawn, own: Prepared, given: str, folder: Path) -> tuple[EditSet, str]:
+    """The edits that are given, else those of the folder, else those that the track draws.
+
+    The text is that of a file of those that were drawn.
+    """
+    store = open_named_store(own.store)
+    if given or (folder / EDITS).is_file():
+        return open_edits(given or str(folder / EDITS), store), ""
+    read = lru_cache(maxsize=256)(store.read)
+    found = [
+        sample_edits(kind, drawn.count, drawn.seed, own.tokens, read, grade, even=True)
+        for kind in drawn.kinds
+    ]
+    # all kinds in turn, so that a part of the list has all of them
+    table = {"format": 1, "edit": [edit for edits in zip(*found, strict=True) for edit in edits]}
+    return make_edits(table, Path(EDITS).stem), edits_text(table)
+
+
+def _drives(edits: EditSet, traffic: str) -> bool:
+    """Whether a traffic mode can drive edits."""
+    try:
+        edits.require_traffic(traffic_name(traffic))
+    except ConfigError:
+        return False
+    return True
+
+
+def _name(track: Track, sets: Mapping[str, Mapping[str, Any]], edits: str) -> str:
+    text = json.dumps([track.name, sets, *([edits] if edits else [])], sort_keys=True, default=str)
     digest = hashlib.blake2b(text.encode(), digest_size=2).hexdigest()
-    own = sets["own"]
+    own = sets[OWN]
     split = Path(str(own.get("split") or own.get("store") or DEFAULT_STORE)).stem
     return f"{track.name}_{split}_{digest}"
 
@@ -103,15 +169,20 @@ def _check_folder(folder: Path, track: Track) -> None:
         )
 
 
-def _own_list(prepared: Prepared) -> KnownSet:
-    """The whole list that a run is on, which may be limited to its first scenarios."""
-    whole = prepared
-    if prepared.config.limit:
-        out = str(prepared.folder / "whole")
-        whole = prepare(replace(prepared.config, limit=0, out=out, resume=False))
-    tokens = {task.token for task in (*whole.tasks, *whole.missing)}
+def _whole(prepared: Prepared) -> Prepared:
+    """The run on the whole list, where it is limited to its first scenarios."""
+    if not prepared.config.limit:
+        return prepared
+    out = str(prepared.folder / "whole")
+    config = replace(prepared.config, limit=0, out=out, resume=False)
+    return prepare(config, edits=prepared.edits)
+
+
+def _list_of(prepared: Prepared) -> KnownSet:
+    """The scenarios of a run as a list."""
+    tokens = {task.token for task in (*prepared.tasks, *prepared.missing)}
     rules = prepared.config.thresholds
-    return KnownSet(whole.split, whole.split, rules, len(tokens), token_digest(tokens))
+    return KnownSet(prepared.split, prepared.split, rules, len(tokens), token_digest(tokens))
 
 
 def run_bench(
@@ -126,14 +197,18 @@ def run_bench(
     is for the manifests.
     """
     plan.folder.mkdir(parents=True, exist_ok=True)
-    own = plan.own
+    columns = ("name", "count", "sha256")
+    own, *edited = ({name: getattr(one, name) for name in columns} for one in plan.own)
     manifest = {
         "format": _FORMAT,
         "track": plan.track.name,
         "runs": list(plan.runs),
-        "own": {"name": own.name, "count": own.count, "sha256": own.sha256},
+        "own": own,
+        "edited": edited,
         "argv": list(argv),
     }
+    if plan.edits:
+        write_text(plan.folder / EDITS, plan.edits)
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
     with whole_file(plan.folder / MANIFEST) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
@@ -181,7 +256,8 @@ def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra
             runs.append(open_run(folder))
             continue
         runs += [open_run(folder / name) for name in found["runs"]]
-        own.append(KnownSet(label=found["own"]["name"], thresholds="", **found["own"]))
+        for one in (found["own"], *found.get("edited", ())):
+            own.append(KnownSet(label=one["name"], thresholds="", **one))
         tracks.append(load_track(found["track"]))
 
     def extra(groups: Sequence[Group]) -> list[Table]:

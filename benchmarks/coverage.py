@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shiftsim.benchmarks import Track
+from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Track
 from shiftsim.report.groups import TRAFFIC, Group, distinct_sets
 from shiftsim.report.tables import Cell, Number, Table
 
@@ -16,21 +16,27 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
     """
     inside = [group for group in groups if _belongs(group, track)]
     sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
-    sets.setdefault(track.reference.name, (track.reference.label, track.reference.count))
+    if listed := track.reference:
+        sets.setdefault(listed.name, (listed.label, listed.count))
     rows: list[tuple[Cell, ...]] = []
     for name, (label, whole) in sets.items():
         for planner in dict.fromkeys(group.planner for group in inside):
             mine = [g for g in inside if (g.data.name, g.planner) == (name, planner)]
             done = sum(_finished(group, track) for group in mine)
             expected = whole * track.rollouts_per_scenario
+            if any(group.data.is_interplan for group in mine):  # for reactive traffic only
+                expected //= len(track.traffic)
             verdict = "complete" if done == expected else f"partial ({done}/{expected})"
             counts = (Number(done, 0), Number(expected, 0))
             rows.append((label, planner, *counts, verdict if done else "not run"))
     missing = [name for name in track.planners if name not in {g.planner for g in inside}]
+    rules = [f"own scenarios under thresholds {track.own_thresholds}"]
+    rules += [f"{listed.label} under {listed.thresholds}"] if listed else []
+    if drawn := track.drawn:
+        rules.append(f"recorded, and with {drawn.count} edits of each of {', '.join(drawn.kinds)}")
     notes = [
         f"contract: traffic {', '.join(track.traffic)} × noise {', '.join(track.noise)} × seeds "
-        f"{', '.join(map(str, track.seeds))} on all scenarios; own scenarios under thresholds "
-        f"{track.own_thresholds}, {track.reference.label} under {track.reference.thresholds}",
+        f"{', '.join(map(str, track.seeds))} on all scenarios; {', '.join(rules)}",
         f"scores that are not complete are not the benchmark's; own scenarios: {track.own_note}",
     ]
     notes += [f"planners of the paper that are not here: {', '.join(missing)}"] if missing else []
@@ -41,8 +47,11 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
 
 def _belongs(group: Group, track: Track) -> bool:
     """Whether a group is part of the contract."""
-    reference = group.data.known == track.reference.name
-    rules = track.reference.thresholds if reference else track.own_thresholds
+    listed, rules = track.reference, track.own_thresholds
+    if listed and group.data.known == listed.name:
+        rules = listed.thresholds
+    elif group.data.is_interplan:
+        rules = INTERPLAN_THRESHOLDS
     modes = [TRAFFIC[name] for name in track.traffic]
     return (
         group.traffic in modes

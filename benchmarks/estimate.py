@@ -52,7 +52,8 @@ def total(costs: list[Cost]) -> Cost:
 
 def _costs(name: str, prepared: Prepared, shards: int) -> Iterator[Cost]:
     config = prepared.config
-    make = TaskRunner(config, prepared.store, prepared.planners, prepared.noises)
+    given = (config, prepared.store, prepared.planners, prepared.noises)
+    make = TaskRunner(*given, prepared.traffic, prepared.edits)
     with closing(make) as do:
         for planner in prepared.planners:
             own = [batch for batch in prepared.batches if batch.planner == planner]

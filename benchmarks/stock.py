@@ -54,7 +54,7 @@ class Row(TypedDict):
 
     track: str
     planner: str
-    reference: str  # the set that is the track's published list, or empty
+    reference: str  # the set that is the track's published list, empty, or "–" where it has none
     own: list[str]  # sets that may be driven as one's own scenarios
     missing: list[Missing]
 
@@ -108,18 +108,19 @@ def _sets(store: ScenarioStore) -> Iterator[Set]:
 def _rows(track: str, stores: list[Store]) -> Iterator[Row]:
     wanted = load_track(track)
     sets = [one for store in stores for one in store["sets"]]
-    reference = [one["name"] for one in sets if one["known"] == wanted.reference.name]
+    listed = wanted.reference
+    reference = [one["name"] for one in sets if listed and one["known"] == listed.name]
     own = [one["name"] for one in sets if not one["known"]]
     for planner in wanted.planners:
         missing = []
-        if not reference:
-            label = f"{wanted.reference.label} ({wanted.reference.count} scenarios)"
-            missing.append(Missing(what=label, get=_REMEDIES[wanted.reference.name], page=_PAGE))
+        if listed and not reference:
+            label = f"{listed.label} ({listed.count} scenarios)"
+            missing.append(Missing(what=label, get=_REMEDIES[listed.name], page=_PAGE))
         if not own:
             missing.append(Missing(what=OWN, get=_REMEDIES[OWN], page=_PAGE))
         entry, page = PLANNERS[planner], "docs/learned_planners.md"
         if (lack := readiness(entry)) and (file := entry.checkpoint):
             get = f"{lack}; it is {file.file} of the project {file.project}"
             missing.append(Missing(what=f"planner {planner}", get=get, page=page))
-        first = reference[0] if reference else ""
+        first = reference[0] if reference else "" if listed else "–"
         yield Row(track=track, planner=planner, reference=first, own=own, missing=missing)

@@ -18,7 +18,10 @@ from shiftsim.planners.routes.corridor import (
     Survey,
     find_lead,
     find_sides,
+    is_tied,
+    lead_speed,
     make_survey,
+    settle_tie,
     start_survey,
 )
 from shiftsim.planners.routes.graph import (
@@ -50,6 +53,7 @@ STEP_US = 500_000
 HORIZON = STEPS * STEP  # s
 RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
 _EGO_TOKEN = "ego_token"
+_DONE, _TIED = -1, -2  # instead of an object to decide
 
 
 def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
@@ -218,11 +222,16 @@ class Idm:
             step, lead = _roll_on(
                 step, path.driven, objects, policy, centers, motion, survey, sides
             )
-            if lead < 0:
+            if lead == _DONE:
                 break
             line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
             footprint = boxes_to_corners(centers[step], np.array(policy[:2]))
-            sides[step, lead] = exact_side(line, 0.5 * policy.width, footprint, objects, lead)
+            unsure = np.flatnonzero(sides[step] == OPEN).tolist() if lead == _TIED else [lead]
+            for index in unsure:
+                side = exact_side(line, 0.5 * policy.width, footprint, objects, index)
+                sides[step, index] = side
+            if lead == _TIED:
+                settle_tie(footprint, objects, sides[step])
         centers[0] = _pose(path.driven, start)
         return centers, motion[:, 1]
 
@@ -297,10 +306,10 @@ def _roll_on(
     survey: Survey,
     sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
 ) -> tuple[int, int]:
-    """Fill the rows behind `first` until the end, or until an OPEN object would be the lead.
+    """Fill the rows behind `first` until the end, or until it is open what the lead is.
 
     Returns:
-        The row and the object to decide, or -1 for the object at the end.
+        The row, and the OPEN object to decide, _TIED where several are touched, or _DONE.
     """
     length, width, target, min_gap, headway, accel_max, decel_max = policy
     footprint, ends = np.empty((4, 2)), np.empty((4, 2))
@@ -314,19 +323,20 @@ def _roll_on(
         find_sides(path, low, high, footprint, objects, survey, ends, sides[step])
         # nuPlan rule 158: all objects stand still during the roll-out; their speeds count only here
         lead, gap = find_lead(footprint, objects, survey.bounds, sides[step])
-        lead_speed = 0.0
+        speed_ahead = 0.0
         if lead < 0:
             gap = path.progress[-1] - progress - 0.5 * length
         elif sides[step, lead] == OPEN:
             return step, lead
+        elif gap == 0.0 and is_tied(footprint, heading, objects, sides[step], lead):
+            return step, _TIED
         else:
-            turn = wrap_angle(objects.headings[lead] - heading)
-            lead_speed = objects.speeds[lead] * np.cos(turn)
+            speed_ahead = lead_speed(objects, lead, heading)
         accel = idm_acceleration(
-            speed, gap, lead_speed, target, min_gap, headway, accel_max, decel_max
+            speed, gap, speed_ahead, target, min_gap, headway, accel_max, decel_max
         )
         motion[step + 1, 0] = progress + STEP * speed
         motion[step + 1, 1] = max(0.0, speed + STEP * min(max(accel, -decel_max), accel_max))
         x, y, heading = _pose(path, motion[step + 1, 0])
         centers[step + 1, 0], centers[step + 1, 1], centers[step + 1, 2] = x, y, heading
-    return STEPS, -1
+    return STEPS, _DONE

@@ -78,6 +78,7 @@ def _manifest(planners, noise, seeds, expected, done, settings):
         "ended": "2026-01-02T03:04:05+00:00",
         "versions": {"shiftsim": "9.8.7", "numpy": "1.2", "numba": "0.3"},
         "git": "abc",
+        "edits": settings.get("edits"),
         "config": {**config, "limit": settings.get("limit", 0)},
         "counts": {"expected": expected, "ok": done, "failed": expected - done, "missing": 0},
         "determining": {

@@ -150,7 +150,8 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     def drive_edited() -> None:
         # agents that look where the ego will be: one of them is beside it, another one far ahead
         places = [{"pose": [x, y, 0.0]} for x, y in ((230.0, 3.5), (190.0, 3.5), (260.0, 0.0))]
-        edited = scenario.edited(agents="mixed", spawn=[*places])
+        van = {"at": {"ahead_m": 60.0, "left_m": 3.5}, "behavior": "stopped"}
+        edited = scenario.edited(agents="mixed", spawn=[*places, van])
         simulate(edited, load("idm"), traffic="reactive")
 
     # a scripted planner needs a file, and has no kernels

@@ -100,15 +100,13 @@ def store_stats(
         DataError: The store is damaged.
     """
     chosen = store.tokens if tokens is None else tuple(tokens)
-    table = store.summary()
-    listed = table["token"].to_pylist()
-    cities = dict(zip(listed, table["city"].to_pylist(), strict=True))
-    types = dict(zip(listed, table["type"].to_pylist(), strict=True))
-    rows = {}
+    rows, cities, types = dict[str, ScenarioStats](), dict[str, str](), dict[str, str]()
     for done, token in enumerate(chosen, 1):
-        rows[token] = scenario_stats(store.read(token))
+        scenario = store.read(token)
+        rows[token] = scenario_stats(scenario)
+        cities[token], types[token] = scenario.city, scenario.scenario_type
         progress(done, len(chosen), token)
-    return StoreStats(rows, {t: cities[t] for t in chosen}, {t: types[t] for t in chosen})
+    return StoreStats(rows, cities, types)
 
 
 def scenario_stats(scenario: Scenario) -> ScenarioStats:

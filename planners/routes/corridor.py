@@ -8,8 +8,10 @@ a stretch adds its two ends, which may lie within a segment.
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import (
     BAND,
     CLEAR,
@@ -226,6 +228,41 @@ def find_lead(
             if distance < best:
                 found, best, best_gap = index, distance, gap
     return found, best_gap
+
+
+@lean_kernel
+def lead_speed(objects: Objects, index: int, heading: float) -> float:
+    """Speed of an object along a heading [m/s]."""
+    return objects.speeds[index] * np.cos(wrap_angle(objects.headings[index] - heading))
+
+
+@lean_kernel
+def is_tied(
+    footprint: FloatArray, heading: float, objects: Objects, sides: IntArray, lead: int
+) -> bool:
+    """Whether the footprint (4, 2) touches a lead, and also an object of another speed."""
+    speed = lead_speed(objects, lead, heading)
+    for index in range(len(sides)):
+        if sides[index] != CLEAR and index != lead:
+            ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
+            if rings_touch(footprint, ring) and lead_speed(objects, index, heading) != speed:
+                return True
+    return False
+
+
+def settle_tie(footprint: FloatArray, objects: Objects, sides: IntArray) -> None:
+    """Keep one of the objects that touch the footprint (4, 2); the others become CLEAR.
+
+    No object may be OPEN.
+    """
+    # nuPlan rule 159: the index of what is in the corridor answers with the first that it finds
+    found = np.flatnonzero(sides == HIT)
+    rings = [objects.xy[objects.ptr[i] : objects.ptr[i + 1]] for i in found.tolist()]
+    polygons = np.array([shapely.Polygon(ring) for ring in rings])
+    box = shapely.Polygon(footprint)
+    nearest = found[shapely.STRtree(polygons).nearest(box)]
+    touching = found[shapely.intersects(polygons, box)]
+    sides[touching[touching != nearest]] = CLEAR
 
 
 @lean_kernel

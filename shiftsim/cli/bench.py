@@ -17,12 +17,16 @@ if TYPE_CHECKING:
     from shiftsim.report.groups import Group
 
 _UNFINISHED = 3
-_MAIN_TABLE = {"semantic-shift": "semantic-shift", "state-drift": "noise-robustness"}
+_MAIN_TABLE = {
+    "semantic-shift": "semantic-shift",
+    "state-drift": "noise-robustness",
+    "edits": "edits",
+}
 
 
-_SETTINGS = """planners store split checkpoints planner_args seeds noise traffic controller limit
-device batch_size strict workers timeout executor scheduler resume retry_failed out save_rollouts
-allow_partial""".split()
+_SETTINGS = """planners store split edits checkpoints planner_args seeds noise traffic controller
+limit device batch_size strict workers timeout executor scheduler resume retry_failed out
+save_rollouts allow_partial""".split()
 
 
 @cli.with_settings(
@@ -32,6 +36,7 @@ allow_partial""".split()
     seeds="Only these, such as 0,1; the result is partial.",
     noise="Only these; the result is partial.",
     traffic="Only this mode; the result is partial.",
+    edits="For the track edits: a .toml file of edits, in place of those that it draws.",
     resume="Only go on with what is there, as the same command does anyway.",
     retry_failed="Do again what failed before.",
 )
@@ -39,8 +44,8 @@ def bench(
     track: Annotated[
         str,
         typer.Argument(
-            help="semantic-shift or state-drift.",
-            autocompletion=completion.among("semantic-shift", "state-drift"),
+            help="semantic-shift, state-drift or edits.",
+            autocompletion=completion.among(*_MAIN_TABLE),
         ),
     ],
     settings: cli.Settings,
@@ -123,7 +128,7 @@ def _official(settings: cli.Settings) -> list[str]:
 
 def _announce(plan: "Plan") -> None:
     """What will be run."""
-    track, own = plan.track, plan.own
+    track = plan.track
     first = next(iter(plan.runs.values()))
     config = first.config
     say(f"track       {track.name}   planners {' '.join(config.planners)}")
@@ -135,7 +140,8 @@ def _announce(plan: "Plan") -> None:
         )
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
     if config.limit:
-        say(f"partial     the first {config.limit} of {own.count} scenarios")
+        whole = ", ".join(f"{own.count} of {own.name}" for own in plan.own)
+        say(f"partial     the first {config.limit} scenarios of {whole}")
     say(f"tasks       {plan.num_tasks}   workers {first.workers}   → {plan.folder}")
     say()
 

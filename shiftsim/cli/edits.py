@@ -20,11 +20,16 @@ def check(
     traffic: Annotated[
         str, typer.Option(help="Also whether this traffic can drive it: nr or r.")
     ] = "",
+    avoidable: Annotated[
+        bool,
+        typer.Option("--avoidable", help="Also whether braking or PDM-Closed avoids it."),
+    ] = False,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
     from shiftsim.errors import ConfigError, ShiftsimError
+    from shiftsim.runs.edits.avoidable import is_avoidable
     from shiftsim.runs.edits.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.sim.traffic import traffic_name
@@ -36,7 +41,11 @@ def check(
     edited, refused = EditedStore(opened, edits), list[dict[str, str]]()
     for token in edited.tokens:
         try:
-            edited.read(token)
+            scenario = edited.read(token)
+            if avoidable and not is_avoidable(scenario):
+                raise ConfigError(
+                    f"{token!r}: neither braking at 4 m/s^2 nor PDM-Closed avoids a collision"
+                )
         except ShiftsimError as error:
             refused.append({"token": token, "error": error.message, "hint": error.hint})
     count = len(edited.tokens)
@@ -121,15 +130,19 @@ def sample(
     seed: Annotated[int, typer.Option(min=0, help="Of all draws.")] = 0,
     store: Store = "demo",
     split: Annotated[str, typer.Option(help="Only scenarios of a split. [whole store]")] = "",
+    even: Annotated[
+        bool, typer.Option("--even", help="As many easy, medium and hard ones.")
+    ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file. [KIND.toml]")] = Path(),
     debug: Debug = False,
 ) -> None:
-    """Draw plausible edits over a store: free of overlaps, and avoidable by braking at 4 m/s^2."""
+    """Draw edits over a store: in the way, and avoided by braking at 4 m/s^2 or by PDM-Closed."""
     from collections import Counter
     from functools import lru_cache
 
     from shiftsim.errors import one_of
     from shiftsim.files import write_text
+    from shiftsim.runs.edits.avoidable import grade
     from shiftsim.runs.edits.edited import edits_text
     from shiftsim.runs.scenarios import find_split, open_named_store
     from shiftsim.world.edits.sampling import KINDS, sample_edits
@@ -138,9 +151,9 @@ def sample(
     opened = open_named_store(store)
     tokens = find_split(split, Path(opened.path), opened.tokens).tokens
     read = lru_cache(maxsize=256)(opened.read)
-    edits = list(sample_edits(kind, count, seed, tokens, read))
+    edits = list(sample_edits(kind, count, seed, tokens, read, grade, even=even))
     path = out if out.suffix else Path(f"{kind}.toml")
     write_text(path, edits_text({"format": 1, "edit": edits}))
-    for grade, number in sorted(Counter(edit["type"] for edit in edits).items()):
-        say(f"{grade:20} {number}")
+    for name, number in sorted(Counter(edit["type"] for edit in edits).items()):
+        say(f"{name:20} {number}")
     say(f"written: {path}")

@@ -184,7 +184,8 @@ def _announce(prepared: "Prepared") -> None:
     )
     if config.metrics:
         say(f"metrics     {' '.join(config.metrics)}")
-    if any(entry.in_batches for entry in prepared.planners.values()):
+    is_learned = any(entry.in_batches for entry in prepared.planners.values())
+    if is_learned or prepared.determining["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
         say(f"networks    batch size {config.batch_size}{strict}")
     where = f"workers {prepared.workers} x 1 thread"

@@ -23,6 +23,7 @@ from shiftsim.runs.results import Run
 TABLES = (
     "semantic-shift",
     "noise-robustness",
+    "edits",
     "planner-comparison",
     "planner-comparison-noise",
     "scenario-types",
@@ -71,12 +72,14 @@ def make_tables(
         raise ConfigError(f"nothing to show beside published figures: {stand_ins}", hint=_ASK)
     beside = published if chosen.beside else None
     statistics = cache(lambda: data_tables.own_statistics(groups))
+    edited = {group.data.label for group in groups if group.data.edits}
     runs = list({group.run.path: group.run for group in groups}.values())
     makers: dict[str, Callable[[], Sequence[Table | None]]] = {
         "semantic-shift": lambda: paper.semantic_shift(
             groups, published, beside=chosen.beside, allow_partial=partial
         ),
         "noise-robustness": lambda: [paper.noise_robustness(groups, beside, allow_partial=partial)],
+        "edits": lambda: details.edited_scores(groups, allow_partial=partial),
         "planner-comparison": lambda: [details.planner_comparison(groups)],
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
         "scenario-types": lambda: details.scenario_types(groups, allow_partial=partial),
@@ -84,7 +87,7 @@ def make_tables(
         "planning-time": lambda: [details.planning_times(groups)],
         "data-statistics": lambda: [data_tables.data_statistics(statistics())],
         "benchmark-comparison": lambda: (
-            [data_tables.benchmark_comparison(published, statistics())] if published else []
+            [data_tables.benchmark_comparison(published, statistics(), edited)] if published else []
         ),
         "runs": lambda: [runs_table(runs)],
     }

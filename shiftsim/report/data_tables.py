@@ -1,6 +1,6 @@
 """What the scenarios are like: own data described, and beside the published sets."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from shiftsim.data.store.statistics import ALL, StoreStats, store_stats
 from shiftsim.errors import DataError
@@ -58,25 +58,38 @@ def data_statistics(found: Mapping[str, StoreStats | str]) -> Table | None:
     return Table("data-statistics", "The scenarios", header, tuple(rows), 2, tuple(notes))
 
 
-def benchmark_comparison(published: Published, found: Mapping[str, StoreStats | str]) -> Table:
-    """The paper's comparison of benchmarks, with own sets beside."""
+def benchmark_comparison(
+    published: Published, found: Mapping[str, StoreStats | str], edited: Collection[str] = ()
+) -> Table:
+    """The paper's comparison of benchmarks, with own sets beside; `edited` are those of edits."""
     own = {label: stats for label, stats in found.items() if isinstance(stats, StoreStats)}
     rows: list[tuple[Cell, ...]] = [
-        (name, *values, *(_property(name, stats) for stats in own.values()))
+        (name, *values, *(_property(name, stats, k in edited) for k, stats in own.items()))
         for name, values in published.comparison.items()
     ]
     notes = (
         f"nuPlan, interPlan, DeepPlan: {published.source}",
         "own sets: measured from the store; interaction density: mean number of agents near "
         "the ego's path within 3 s",
+        *(["edited: made of recorded scenarios, as interPlan's are"] if edited else []),
     )
-    header = ("property", *published.sets, *(f"{label} (own)" for label in own))
+    header = (
+        "property",
+        *published.sets,
+        *(f"{label} ({_kind(label in edited)})" for label in own),
+    )
     title = "Benchmarks compared"
     return Table("benchmark-comparison", title, header, tuple(rows), len(header), notes)
 
 
-def _property(name: str, stats: StoreStats) -> str:
+def _kind(is_edited: bool) -> str:
+    return "own, edited" if is_edited else "own"
+
+
+def _property(name: str, stats: StoreStats, is_edited: bool) -> str:
     groups = stats.groups("city")
+    if name == "semantic shift" and is_edited:
+        return "scenario"
     if name == "scenario count":
         return f"{groups[ALL]['scenarios']:.0f}"
     if name == "geographic coverage":

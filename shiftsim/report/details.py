@@ -1,4 +1,4 @@
-"""Tables beyond the paper's: planners compared, scenario types, planning times."""
+"""Tables beyond the paper's: planners compared, scenario types, edits, planning times."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -6,12 +6,15 @@ from itertools import combinations
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.report.groups import Group, distinct_sets
 from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
-from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.report.tables import Cell, Estimate, Number, Table
 from shiftsim.runs.results import Run
+from shiftsim.world.edits.sampling import GRADES, graded
+
+ALL_KINDS = "all"
 
 
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:
@@ -80,6 +83,75 @@ def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> l
         name = f"scenario-types_{data.name}"
         out.append(Table(name, title, header, tuple(rows), 1, (data.rules,)))
     return out
+
+
+def edited_scores(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Table]:
+    """Clean scores of edited scenarios by kind and difficulty; one table per set that was edited.
+
+    Beside them stand those of the same recorded scenarios without the edit, each as often as it was
+    edited. Scenarios of interPlan's codes have interPlan's score, and no such column.
+    """
+    clean = [group for group in groups if group.noise == "none"]
+    out = []
+    for data in distinct_sets(group for group in clean if group.data.edits):
+        mine = [group for group in clean if group.data.key == data.key]
+        kinds = [graded(name) for name in data.types]
+        is_graded = any(grade for _, grade in kinds)
+        grades = [*GRADES] if is_graded else []
+        rows: list[tuple[Cell, ...]] = []
+        names = sorted({kind for kind, _ in kinds})
+        for group in (g for mode in traffics(mine) for g in mine if g.traffic == mode):
+            for name in [*names, ALL_KINDS] if len(names) > 1 else names:
+                of_kind = [name in (kind, ALL_KINDS) for kind, _ in kinds]
+                cells = [recorded_score(group, np.array(of_kind), clean)]
+                for grade in [*grades, ""]:
+                    pairs = zip(of_kind, kinds, strict=True)
+                    where = np.array([own and g in (grade or g,) for own, (_, g) in pairs])
+                    cells.append(group.estimate("cls", where, allow_partial=allow_partial))
+                count = Number(sum(of_kind), 0)
+                labels = (group.traffic, group.planner, name or "unknown", count)
+                rows.append((*labels, *cells[data.is_interplan :]))
+        last = "interPlan score" if data.is_interplan else "all"
+        header = ["traffic", "planner", "kind", "scenarios", "recorded", *grades, last]
+        notes = [data.rules]
+        if data.is_interplan:
+            header.remove("recorded")
+            notes.append("interPlan score: its metrics and weights, mean over the scenarios")
+        else:
+            notes.append("recorded: the same scenarios without the edit")
+        if is_graded:
+            each = ", ".join(f"{name} {most:g}" for name, most in GRADES.items())
+            notes.append(
+                f"difficulty: braking that avoids it [m/s²], up to {each}; hard also where only "
+                "PDM-Closed avoids it"
+            )
+        title = f"Edited scenarios: {data.label}, closed-loop score x 100"
+        name = f"edits_{data.name}"
+        out.append(Table(name, title, tuple(header), tuple(rows), 3, tuple(notes)))
+    return out
+
+
+def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> Estimate | None:
+    """The score of recorded scenarios that some (N,) scenarios of a group were made of.
+
+    None where no other group has all of them under the same rules.
+    """
+    made = group.run.manifest["edits"]["made"]
+    chosen = np.flatnonzero(where).tolist()
+    bases = [str(made[group.data.tokens[i]]["base"]) for i in chosen]
+    wanted = _driven_as(group)
+    for other in others:
+        place = {token: i for i, token in enumerate(other.data.tokens)}
+        if not other.data.edits and _driven_as(other) == wanted and set(bases) <= set(place):
+            values = other.column()[[place[token] for token in bases]]
+            if len(values) and np.isfinite(values).all():
+                return Estimate(100.0 * float(values.mean()), None, len(values), len(values))
+    return None
+
+
+def _driven_as(group: Group) -> tuple[str, ...]:
+    data = group.data
+    return (group.traffic, group.planner, group.noise, data.windows, *data.traits[:3])
 
 
 def planning_times(groups: Sequence[Group]) -> Table:

@@ -12,13 +12,17 @@ from textwrap import wrap
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from shiftsim.arrays import BoolArray
+from shiftsim.report.details import recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
 from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
 from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate
 from shiftsim.report.words import LONG
+from shiftsim.world.edits.sampling import GRADES, graded
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
@@ -66,6 +70,8 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
         shown = [g for g in mine if _estimate(g, allow_partial) is not None]
         clean = [group for group in shown if group.noise == "none"]
         out += _robustness(data, shown, styles, allow_partial)
+        if any(grade for _, grade in map(graded, data.types)):
+            out.append(_difficulty(data, clean, groups, styles, allow_partial))
         cities = sorted({city for city in data.cities if city})
         places = [_Place(f"all\n({len(data.tokens)})")]
         for city in cities:
@@ -132,6 +138,47 @@ def _robustness(
     note = "error bars: standard deviation over seeds; thin line: the clean score"
     _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
     return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
+
+
+def _difficulty(
+    data: DataSet,
+    clean: Sequence[Group],
+    groups: Sequence[Group],
+    styles: dict[str, Style],
+    allow_partial: bool,
+) -> Figure:
+    """Scores by difficulty, a panel for each kind of edit."""
+    found = [graded(name) for name in data.types]
+    kinds, modes = sorted({kind for kind, grade in found if grade}), traffics(clean)
+    figure, panels = _panels(len(modes), len(kinds), (3.4, 3.1))
+    planners = list(dict.fromkeys(group.planner for group in clean))
+    for row, traffic in enumerate(modes):
+        for column, kind in enumerate(kinds):
+            axes = panels[row][column]
+            for group in (group for group in clean if group.traffic == traffic):
+                shift = 0.06 * (planners.index(group.planner) - (len(planners) - 1) / 2)
+                cells = [recorded_score(group, np.array([k == kind for k, _ in found]), groups)]
+                parts = [np.array([pair == (kind, grade) for pair in found]) for grade in GRADES]
+                cells += [_estimate(group, allow_partial, "cls", where) for where in parts]
+                points = {i: cell.mean for i, cell in enumerate(cells) if cell is not None}
+                style = styles[group.planner]
+                look = {**style.marks("none"), "linestyle": dashes("none"), "linewidth": 1.3}
+                label = f"{group.planner}{'' if group.is_complete else ' (partial)'}"
+                axes.plot([x + shift for x in points], [*points.values()], label=label, **look)
+                for x, where in enumerate(parts, 1):
+                    if interval := score_interval(group, "cls", where):
+                        axes.vlines(x + shift, interval.low, interval.high, color=style.colour)
+            axes.set_xticks(range(1 + len(GRADES)), ["recorded", *GRADES])
+            axes.set_xlim(-0.35, len(GRADES) + 0.35)
+            axes.set_xlabel("difficulty of the edit", fontsize=8)
+            axes.set_title(f"{kind}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
+            _score_axis(axes)
+    note = (
+        "recorded: the same scenarios without the edit; bars: 95 % bootstrap interval over "
+        "recordings"
+    )
+    _finish(figure, data, "Edits", note)
+    return Figure(f"edits_{data.name}", f"Scores by difficulty of the edits: {data.label}", figure)
 
 
 def _curve(

@@ -55,6 +55,7 @@ class DataSet:
     recordings: tuple[str, ...]  # (N,) recording of each
     types: tuple[str, ...]  # (N,) type of each
     durations: tuple[str, ...]  # (N,) class of duration of each
+    edits: str = ""  # profile of the edits that made the scenarios; empty where they are recorded
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -72,9 +73,21 @@ class DataSet:
         """What stands beside every printed score."""
         thresholds, controller, version, listed = self.traits
         return (
-            f"{self.label}: {len(self.tokens)} scenarios of {self.num_recordings} recordings · "
-            f"thresholds {thresholds} · {version} · controller {controller} · {listed}"
+            f"{self.label}: {len(self.tokens)} scenarios of {self.num_recordings} recordings"
+            f"{self.windows} · thresholds {thresholds} · {version} · controller {controller} · "
+            f"{listed}"
         )
+
+    @property
+    def windows(self) -> str:
+        """How long the scenarios are, in words; empty where it is not known."""
+        classes = sorted(set(self.durations) - {""}, key=lambda name: (len(name), name))
+        return f" · windows of {', '.join(classes)}" if classes else ""
+
+    @property
+    def is_interplan(self) -> bool:
+        """Whether codes of interPlan made the scenarios: their score is interPlan's."""
+        return self.edits == "interplan"
 
     @property
     def num_recordings(self) -> int:
@@ -319,6 +332,7 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
         durations=_of_tokens(run.scores, "duration_class", tokens),
         recordings=_of_tokens(run.scores, "log_name", tokens),
         types=_of_tokens(run.tasks, "scenario_type", tokens),
+        edits=str((manifest.get("edits") or {}).get("profile", "")),
     )
 
 

@@ -123,7 +123,7 @@ class RunConfig:
         (), "PATH, official or shiftsim; or PLANNER=…; repeatable.", "--checkpoint"
     )
     device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
-    batch_size: int = _setting(1, "Scenarios per forward pass of a learned planner. [1]", least=1)
+    batch_size: int = _setting(1, "Scenarios per forward pass of a network. [1]", least=1)
     isolate: bool = _setting(False, "Every planner in a process of its own.")
     planner_python: str = _setting("", "Interpreter for isolated planners of your own.")
     strict: bool = _setting(False, "Fail where a planner falls back.")

@@ -31,7 +31,7 @@ from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, to
 from shiftsim.runs.task import Batch
 from shiftsim.runs.verdicts import Verdicts, read_verdicts
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
-from shiftsim.sim.traffic import PLANNER, make_traffic, traffic_name
+from shiftsim.sim.traffic import PLANNER, BatchTraffic, make_traffic, traffic_name
 
 if TYPE_CHECKING:
     from shiftsim.planners.isolated import Isolated
@@ -84,11 +84,16 @@ class Chosen(NamedTuple):
 
 
 def prepare(
-    config: RunConfig, *, planners: Sequence[Any] = (), noises: Sequence[NoiseModel] = ()
+    config: RunConfig,
+    *,
+    planners: Sequence[Any] = (),
+    noises: Sequence[NoiseModel] = (),
+    edits: "EditSet | None" = None,
 ) -> Prepared:
     """Resolve every name and check everything that a run needs.
 
-    Classes or instances of planners, and noise models, take the place of the names in the settings.
+    Classes or instances of planners, noise models, and edits take the place of the names in the
+    settings.
 
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.
@@ -102,19 +107,22 @@ def prepare(
     config = replace(
         config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
     )
-    traffic, made_of = _traffic(config)
+    traffic, made_of, in_batches = _traffic(config)
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:
         load_metric(metric)
     entries = _entries(config, planners or config.planners)
     store = open_named_store(config.store)
-    chosen = _scenarios(config, store)
+    chosen = _scenarios(config, store, edits)
+    together = in_batches or any(entry.in_batches for entry in entries)
+    made_of["batch_size"] = config.batch_size if together else 1
     determining = chosen.determining | _determining(config, entries, models, thresholds) | made_of
     folder = Path(config.out) if config.out else RUNS / run_name(config, chosen.split, determining)
     before = _check_folder(config, folder, determining)
     tasks = list(_tasks(entries, models, config.seeds, chosen.present))
     missing = [Batch((task,)) for task in _tasks(entries, models, config.seeds, chosen.missing)]
-    batches = _of_shard(config.shard, _batches(entries, tasks, config.batch_size))
+    grouped = {entry.name for entry in entries if entry.in_batches or in_batches}
+    batches = _of_shard(config.shard, _batches(grouped, tasks, config.batch_size))
     if before == "new":
         count = sum(len(batch.tasks) for batch in batches)
         check_space(folder, count, with_rollouts=config.save_rollouts == "all")
@@ -139,24 +147,28 @@ def prepare(
     )
 
 
-def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any]]:
-    """The planner that drives other vehicles, if one does, and what identifies the traffic."""
+def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool]:
+    """The planner that drives other vehicles, if one does, and what identifies the traffic.
+
+    Last, whether a network of it moves several rollouts at once.
+    """
     name = config.traffic.removeprefix(PLANNER)
     if name != config.traffic:
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
         if takes_argument(name, "device"):
             arguments.setdefault("device", config.device)
         planner = run_planner(name, arguments)
-        return planner, {"traffic_made_of": dict(planner.fingerprint)}
+        return planner, {"traffic_made_of": dict(planner.fingerprint)}, False
     try:
-        model = make_traffic(config.traffic)
+        model = make_traffic(config.traffic, config.device)
     except (ImportError, AttributeError, TypeError) as error:
         raise ConfigError(
             f"traffic {config.traffic!r} is not available: {error}",
             hint="use --traffic nonreactive",
         ) from error
     made_of = getattr(model, "fingerprint", None)
-    return None, {"traffic_made_of": dict(made_of)} if made_of else {}
+    in_batches = isinstance(model, BatchTraffic) and config.batch_size > 1
+    return None, {"traffic_made_of": dict(made_of)} if made_of else {}, in_batches
 
 
 def _entries(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
@@ -220,7 +232,7 @@ def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
     return out
 
 
-def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
+def _scenarios(config: RunConfig, store: ScenarioStore, given: "EditSet | None") -> Chosen:
     known = tuple(store.tokens)
     whole = config.split in ("", store.path.name)
     verdicts, usable = None, known
@@ -232,8 +244,9 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
             usable = store.reviews.usable(known, usable)
     split = find_split(config.split, Path(store.path), usable)
     name, tokens, store_tokens = split.name, split.tokens, set(known)
-    edits, made = _edits(config, store), {}
+    edits, made = given or _edits(config, store), {}
     if edits is not None:
+        edits.require_traffic(config.traffic)
         made = edits.describe(store, tokens)
         name, tokens, store_tokens = f"{name}+{edits.name}", tuple(made), set(made)
     tokens = tokens[: config.limit] if config.limit else tokens
@@ -261,12 +274,8 @@ def _scenarios(config: RunConfig, store: ScenarioStore) -> Chosen:
 
 
 def _edits(config: RunConfig, store: ScenarioStore) -> "EditSet | None":
-    """The edits of a run, which its traffic can drive."""
-    if not config.edits:
-        return None
-    edits = open_edits(config.edits, store)
-    edits.require_traffic(config.traffic)
-    return edits
+    """The edits of a run."""
+    return open_edits(config.edits, store) if config.edits else None
 
 
 def _verdicts(config: RunConfig, store: ScenarioStore) -> Verdicts | None:
@@ -327,13 +336,12 @@ def _tasks(
     return (Task(*run, token) for token in tokens for run in runs)
 
 
-def _batches(entries: Iterable[RunPlanner], tasks: list[Task], size: int) -> list[Batch]:
-    """The tasks, those of a planner that answers in batches grouped.
+def _batches(grouped: set[str], tasks: list[Task], size: int) -> list[Batch]:
+    """The tasks, those of planners whose scenarios are driven in lock step grouped.
 
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
     first is a single task: other workers wait until it has compiled the planner's kernels.
     """
-    grouped = {entry.name for entry in entries if entry.in_batches}
     batches = [Batch((task,)) for task in tasks if task.planner not in grouped]
     for name in sorted(grouped):
         own = tuple(task for task in tasks if task.planner == name)
@@ -388,7 +396,6 @@ def _determining(
         "thresholds": thresholds,
         "metrics": sorted(config.metrics),
         "strict": config.strict,
-        "batch_size": config.batch_size if any(entry.in_batches for entry in entries) else 1,
     }
     plain: dict[str, Any] = json.loads(json.dumps(fields, sort_keys=True, default=str))
     return plain

@@ -30,7 +30,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
 from shiftsim.sim.noise import NoiseModel, is_standard
 from shiftsim.sim.planner import Planner
-from shiftsim.sim.traffic import Traffic
+from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -108,6 +108,7 @@ class TaskRunner:
 
     def __post_init__(self) -> None:
         self._scenarios = Scenarios(self.store, self.edits)
+        self._network: BatchTraffic | None = None
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """One result per task."""
@@ -145,6 +146,10 @@ class TaskRunner:
         except (Exception, SystemExit):
             # the shared pass itself failed: too little memory for all of them?
             return [self._alone(task) for task in batch.tasks]
+        finally:
+            for task, rollout in rollouts.items():
+                if rollout.planner is not None:
+                    self._originals[task.planner].release(rollout.planner)
         share = (perf_counter() - began) / max(1, len(logs))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
             watches[task].seconds["simulate_seconds"] = share
@@ -187,7 +192,7 @@ class TaskRunner:
         return Setting(
             noise=self.noises[task.noise],
             seed=task.seed,
-            traffic=self._driven(self.traffic) if self.traffic else self.config.traffic,
+            traffic=self._driven(self.traffic) if self.traffic else self._modelled(),
             controller=self.config.controller,
             strict=self.config.strict,
         )
@@ -197,6 +202,16 @@ class TaskRunner:
         if self.config.controller == "log-playback":
             return None
         return self._original(task.planner, self.planners[task.planner]).copy()
+
+    def _modelled(self) -> Traffic:
+        """Traffic that no planner drives, for one rollout; a network is loaded once."""
+        if self._network is not None:
+            return self._network.fork()
+        model = make_traffic(self.config.traffic, self.config.device)
+        if not isinstance(model, BatchTraffic):
+            return model
+        self._network = model
+        return model.fork()
 
     def _driven(self, planner: RunPlanner) -> Traffic:
         """Traffic whose vehicles a planner drives, for one rollout."""

@@ -6,10 +6,11 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -28,11 +29,12 @@ from shiftsim.sim.planner import (
     rollout_rows,
     scene_info,
 )
-from shiftsim.sim.traffic import Traffic, make_traffic
+from shiftsim.sim.traffic import BatchTraffic, Move, Traffic, make_traffic
 from shiftsim.sim.traffic.scripted import Scripted
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
+T = TypeVar("T")
 MIN_ITERATIONS = 3
 CONTROLLERS = ("lqr", "perfect", "log-playback")
 
@@ -131,16 +133,27 @@ class Rollout:
 
         The plan took `seconds`; it is None only under log playback without a planner.
         """
+        move = self._follow(plan, seconds)
+        if move is not None:
+            self._traffic.step(*move)
+        self._go_on()
+
+    def _follow(self, plan: Trajectory | Command | None, seconds: float) -> Move | None:
+        """Store this sample and move the ego; what the traffic is to do, None after the last."""
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
         if self.planner is not None:
             plan = self._checked(plan)
-        if iteration + 1 < self.num_samples:
-            # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
-            self._move_ego(plan)
-            self._traffic.step(iteration, self._ego[row], self._tracks, row + 1)
+        if iteration + 1 >= self.num_samples:
+            return None
+        # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
+        self._move_ego(plan)
+        return Move(iteration, self._ego[row], self._tracks, row + 1)
+
+    def _go_on(self) -> None:
+        """Go to the next sample, which may be the last one."""
         self.iteration += 1
-        if not self.done and self._is_finished(row + 1):
+        if not self.done and self._is_finished(self._start + self.iteration):
             # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
             self.num_samples = self.iteration + 1
 
@@ -265,7 +278,8 @@ def drive(rollout: Rollout) -> SimulationLog:
 def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
     """Drive several scenarios in lock step, so that their planners share one forward pass.
 
-    The rollouts are fresh, and their planners forks of one `BatchPlanner`.
+    The rollouts are fresh. Planners that are forks of one `BatchPlanner` are asked together, and so
+    is traffic that is forks of one `BatchTraffic`; others one by one.
 
     Returns:
         Per rollout its log, or the error that ended it; the others go on.
@@ -273,26 +287,57 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
     ended: dict[int, SimulationLog | Exception] = {}
     while len(ended) < len(rollouts):
         active = [i for i in range(len(rollouts)) if i not in ended]
-        planners = [cast(BatchPlanner, rollouts[i].planner) for i in active]
-        observations = [rollouts[i].observe() for i in active]
-        began = perf_counter()
-        plans = planners[0].plan_batch(planners, observations)
-        share = (perf_counter() - began) / len(active)
-        for index, plan in zip(active, plans, strict=True):
-            outcome = _advanced(rollouts[index], plan, share)
-            if outcome is not None:
-                ended[index] = outcome
+        plans, seconds = _plans([rollouts[i] for i in active])
+        moves: dict[int, Move] = {}
+        for index, plan, share in zip(active, plans, seconds, strict=True):
+            move = _attempt(partial(_follow, rollouts[index], plan, share))
+            if isinstance(move, Exception):
+                ended[index] = move
+            elif move is not None:
+                moves[index] = move
+        batch = [i for i in moves if isinstance(rollouts[i]._traffic, BatchTraffic)]
+        if batch:
+            models = [cast(BatchTraffic, rollouts[i]._traffic) for i in batch]
+            models[0].step_batch(models, [moves.pop(i) for i in batch])
+        for index, move in moves.items():
+            error = _attempt(partial(rollouts[index]._traffic.step, *move))
+            if error is not None:
+                ended[index] = error
+        for index in (i for i in active if i not in ended):
+            rollouts[index]._go_on()
+            if rollouts[index].done:
+                ended[index] = rollouts[index].log()
     return [ended[i] for i in range(len(rollouts))]
 
 
-def _advanced(
-    rollout: Rollout, plan: Trajectory | Command | Exception, seconds: float
-) -> SimulationLog | Exception | None:
-    """How a rollout ended with this step; None while it goes on."""
+Plan: TypeAlias = Trajectory | Command | None
+
+
+def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:
+    """The next plan of each, or the error in its place, and how long each took [s]."""
+    planners = [cast(BatchPlanner, rollout.planner) for rollout in rollouts]
+    observe = [rollout.observe for rollout in rollouts]
+    began = perf_counter()
+    if isinstance(planners[0], BatchPlanner):
+        plans = planners[0].plan_batch(planners, [one() for one in observe])
+        return [*plans], [(perf_counter() - began) / len(plans)] * len(plans)
+    out, seconds = list[Plan | Exception](), list[float]()
+    for planner, one in zip(planners, observe, strict=True):
+        seen, began = one(), perf_counter()
+        out.append(_attempt(partial(planner.plan, seen)) if planner is not None else None)
+        seconds.append(perf_counter() - began)
+    return out, seconds
+
+
+def _follow(rollout: Rollout, plan: Plan | Exception, seconds: float) -> Move | None:
     if isinstance(plan, Exception):
-        return plan
+        raise plan
+    return rollout._follow(plan, seconds)
+
+
+def _attempt(work: Callable[[], T]) -> T | Exception:
+    """What it returns, or the error: one scenario fails, its neighbours in the batch do not."""
     try:
-        rollout.advance(plan, seconds)
-    except Exception as error:  # one scenario fails, its neighbours in the batch do not
+        return work()
+    except Exception as error:
         return error
-    return rollout.log() if rollout.done else None

@@ -54,31 +54,38 @@ def start_on(map: VectorMap, edge: int, x: float, y: float) -> Start:
 
 def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, FloatArray]:
     """Arc length of the projection of a point on a line [m], and the pose (3,) there."""
-    progress = float(shapely.line_locate_point(line, shapely.Point(x, y)))
-    here = _point(line, progress)
-    ahead = _point(line, progress + _HEADING_SPACING)
-    if here == ahead:  # at the very end of the line
-        here_to_ahead = (_point(line, progress - _HEADING_SPACING), here)
-    else:
-        here_to_ahead = (here, ahead)
-    (ax, ay), (bx, by) = here_to_ahead
-    return progress, np.array([*here, np.arctan2(by - ay, bx - ax)])
+    progress = shapely.line_locate_point(line, [shapely.Point(x, y)])
+    return float(progress[0]), _poses_at(line, progress)[0]
 
 
 def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
     """As `pose_on_line`, the poses (N, 3) of N shapely points."""
-    progress = shapely.line_locate_point(line, points)
-    here, ahead, behind = (
-        shapely.get_coordinates(shapely.line_interpolate_point(line, progress + offset))
-        for offset in (0.0, _HEADING_SPACING, -_HEADING_SPACING)
-    )
-    step = np.where((here == ahead).all(axis=1)[:, None], here - behind, ahead - here)
+    return _poses_at(line, shapely.line_locate_point(line, points))
+
+
+def _poses_at(line: shapely.LineString, progress: FloatArray) -> FloatArray:
+    """(N, 3) poses at arc lengths (N,) of a line; the heading is that to a point ahead."""
+    both = np.concatenate([progress, progress + _HEADING_SPACING])
+    points = shapely.get_coordinates(shapely.line_interpolate_point(line, both))
+    here, ahead = points[: len(progress)], points[len(progress) :]
+    step = ahead - here
+    ends = (here == ahead).all(axis=1)
+    if ends.any():  # at the very end of the line: from a point behind
+        behind = shapely.line_interpolate_point(line, progress[ends] - _HEADING_SPACING)
+        step[ends] = here[ends] - shapely.get_coordinates(behind)
     return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
 
 
-def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
-    point = shapely.line_interpolate_point(line, progress)
-    return float(point.x), float(point.y)
+def poses_on_edge(map: VectorMap, edge: int, progress: FloatArray) -> FloatArray:
+    """(N, 3) poses at arc lengths (N,) of the baseline of an edge, as `pose_on_line` has them."""
+    span = slice(map.baselines.ptr[edge], map.baselines.ptr[edge + 1])
+    xy, arc = map.baselines.xy[span], map.baselines.arc[span]
+    both = np.clip(progress, 0.0, arc[-1]) + np.array([[0.0], [_HEADING_SPACING]])
+    # at the very end the heading is that from a point behind
+    both[1] = np.where(both[0] < arc[-1], both[1], both[0] - _HEADING_SPACING)
+    here, other = np.stack([np.interp(both, arc, xy[:, column]) for column in (0, 1)], axis=-1)
+    step = np.where((both[1] > both[0])[:, None], other - here, here - other)
+    return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
 
 
 @lean_kernel

@@ -17,16 +17,19 @@ from shiftsim.world.state import Tracks, TrafficLights
 
 FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks
 _FULL_S = 14.9  # s; 150 iterations
+_LONGER_S = 15.85  # s, from which it is another class, such as the 30 s of interPlan
 
 
 def duration_class(time_us: IntArray) -> str:
     """Class of a scenario whose iterations are at these times (T,) [us], such as `8 s`.
 
-    Scores of different classes do not compare: `15 s` and longer, or the whole seconds of a shorter
-    one.
+    Scores of different classes do not compare: `15 s`, or the whole seconds of another one.
     """
     seconds = float(time_us[-1] - time_us[0]) * 1e-6
-    return FULL_DURATION if seconds >= _FULL_S - 0.05 else f"{np.floor(seconds + 0.05):.0f} s"
+    if seconds < _FULL_S - 0.05:
+        return f"{np.floor(seconds + 0.05):.0f} s"
+    # as with 15 s, the last iteration may be missing
+    return FULL_DURATION if seconds < _LONGER_S else f"{np.floor(seconds + 0.15):.0f} s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from shiftsim.metrics import PROFILES
 from shiftsim.report.groups import token_digest
 from shiftsim.sim.noise import NOISE_NAMES, SIGMA_BY_LEVEL, parse_noise
 from shiftsim.sim.traffic import traffic_name
+from shiftsim.world.edits.sampling import GRADES, KINDS
 
 
 @pytest.mark.parametrize("name", TRACKS)
@@ -21,7 +22,10 @@ def test_a_track_names_only_what_exists(name):
     track = load_track(name)
     assert [parse_noise(noise).name for noise in track.noise] == list(track.noise)
     assert [traffic_name(mode) for mode in track.traffic] == list(track.traffic)
-    assert {track.own_thresholds, track.reference.thresholds} <= set(PROFILES)
+    assert {track.own_thresholds, *(one.thresholds for one in [track.reference] if one)} <= set(
+        PROFILES
+    )
+    assert set(track.drawn.kinds if track.drawn else ()) <= set(KINDS)
 
 
 def test_state_drift_is_the_papers_seven_settings_and_three_seeds():
@@ -30,6 +34,13 @@ def test_state_drift_is_the_papers_seven_settings_and_three_seeds():
     assert track.seeds == (0, 1, 2)
     assert track.rollouts_per_scenario == 2 * (1 + 6 * 3)
     assert load_track("semantic-shift").rollouts_per_scenario == 2
+
+
+def test_the_track_of_edits_draws_as_many_of_every_kind_and_difficulty():
+    track = load_track("edits")
+    assert track.reference is None
+    assert set(track.drawn.kinds) == set(KINDS)
+    assert track.drawn.count % len(GRADES) == 0
 
 
 def test_the_levels_of_the_track_are_those_of_the_noise():

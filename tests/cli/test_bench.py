@@ -113,12 +113,62 @@ def test_a_dry_run_checks_and_writes_nothing(place):
     assert not (place / "runs/dry").exists()
 
 
+EDITS = """
+[[edit]]
+name = "van"
+type = "parked_easy"
+spawn = [{at = {ahead_m = 14, left_m = -1.2}, behavior = "stopped"}]
+"""
+
+
+def test_the_track_of_edits_drives_recorded_and_edited_scenarios(place):
+    (place / "van.toml").write_text(EDITS)
+    words = ("--edits", "van.toml", "--out", "runs/edits")
+    estimated = call(place, "bench", "edits", *TINY, *words, "--estimate", "--json")
+    assert estimated.returncode == 0, estimated.stderr
+    runs = [cost["run"] for cost in json.loads(estimated.stdout)["costs"]]
+    assert runs[2:4] == ["edited-nonreactive", "edited-reactive"]
+    done = call(place, "bench", "edits", *TINY, *words)
+    assert done.returncode == 0, done.stderr
+    assert "toy+van" in done.stdout
+    assert "recorded" in done.stdout
+    run = shiftsim.open_run(place / "runs/edits/edited-reactive")
+    assert set(run.scores["scenario_type"].to_pylist()) == {"parked_easy"}
+    with next((place / "runs/edits/report").glob("edits_*.csv")).open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["traffic"], row["kind"], row["scenarios"]) for row in rows] == [
+        ("NR", "parked", "4"),
+        ("R", "parked", "4"),
+    ]
+    own = shiftsim.open_run(place / "runs/edits/own-nonreactive").scores["cls"].to_numpy()
+    assert float(rows[0]["recorded"]) == pytest.approx(100.0 * own.mean())
+    compared = (place / "runs/edits/report/benchmark-comparison.csv").read_text()
+    assert "(own, edited)" in compared
+    stamp = (place / "runs/edits/edited-reactive/scores.parquet").stat().st_mtime_ns
+    assert call(place, "bench", "edits", *TINY, *words, "--resume").returncode == 0
+    assert (place / "runs/edits/edited-reactive/scores.parquet").stat().st_mtime_ns == stamp
+
+
+def test_edits_of_the_track_are_drawn_and_kept(place):
+    words = ("-p", "constant-velocity", "--workers", "1", "--quiet", "--limit", "3")
+    done = call(place, "bench", "edits", *words, "--traffic", "nonreactive", "--out", "runs/drawn")
+    assert done.returncode == 0, done.stderr
+    text = (place / "runs/drawn/edits.toml").read_text()
+    assert text.count("[[edit]]") == 180
+    run = shiftsim.open_run(place / "runs/drawn/edited-nonreactive")
+    kinds = {kind.rpartition("_")[0] for kind in run.scores["scenario_type"].to_pylist()}
+    assert kinds == {"jaywalker", "parked", "works"}
+    assert "(3/180)" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "fact"),
     [
         (("bench", "drift", *TINY), "track 'drift' unknown"),
         (("bench", "state-drift", "-s", "toy"), "no planner"),
         (("bench", "state-drift", *TINY, "--val14", "absent"), "no store 'absent'"),
+        (("bench", "edits", *TINY, "--val14", "toy"), "has no published list"),
+        (("bench", "state-drift", *TINY, "--edits", "van.toml"), "drives recorded scenarios"),
         (("bench", "state-drift", *TINY, "--noise", "loud"), "noise 'loud' unknown"),
         (("report", "runs/b", "-f", "pdf"), "format 'pdf' unknown"),
         (("report", "runs/b", "-t", "score"), "table 'score' unknown"),

@@ -13,7 +13,12 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.report.about import CITED, runs_table
 from shiftsim.report.build import TABLES, Options, make_tables, write_report
-from shiftsim.report.details import planner_comparison, planning_times, scenario_types
+from shiftsim.report.details import (
+    edited_scores,
+    planner_comparison,
+    planning_times,
+    scenario_types,
+)
 from shiftsim.report.groups import KnownSet, read_groups, token_digest
 from shiftsim.report.paper import noise_robustness, published_semantic, semantic_shift
 from shiftsim.report.scores import score_table, scores, summary
@@ -364,6 +369,67 @@ def test_metrics_stand_in_one_order_with_their_words(tmp_path):
     first = next(iter(published().semantic_shift["NR"].items()))
     row = cells(theirs, "NR", f"{first[0]} (published)")
     assert row["NCR"] == f"{first[1][list(published().columns).index('NCR')]:.2f}"
+
+
+# --- edits
+
+
+KINDS = ["parked_easy", "parked_hard", "walk_easy", "walk_easy"]
+NAMES = ("t0-a", "t1-a", "t1-b", "t0-c")
+
+
+def edited_run(folder, score, profile="shiftsim", types=KINDS, **settings):
+    made = {name: {"base": name[:2], "edit": name[-1], "digest": "0"} for name in NAMES}
+    edits = {"name": "e", "profile": profile, "edit": [], "made": made}
+    settings = {"split": "made-up+e", "edits": edits, **settings}
+    return write_run(folder, tokens=NAMES, types=types, score=score, **settings)
+
+
+def test_edits_are_rows_of_kinds_and_columns_of_difficulty(tmp_path):
+    score, recorded = random_scores(1), random_scores(2)
+    runs = [write_run(tmp_path / "own", score=recorded), edited_run(tmp_path / "e", score)]
+    [table] = edited_scores(read_groups(runs))
+    own = [100.0 * recorded("alpha", "none", 0, number) for number in range(4)]
+    new = [100.0 * score("alpha", "none", 0, number) for number in range(4)]
+    parked = cells(table, "NR", "alpha", "parked")
+    assert parked["recorded"] == f"{np.mean(own[:2]):.2f}"
+    assert (parked["easy"], parked["hard"]) == (f"{new[0]:.2f}", f"{new[1]:.2f}")
+    assert (parked["medium"], parked["all"]) == ("", f"{np.mean(new[:2]):.2f}")
+    whole = cells(table, "NR", "alpha", "all")
+    assert whole["scenarios"] == "4"
+    assert whole["easy"] == f"{np.mean([new[0], new[2], new[3]]):.2f}"
+    assert whole["recorded"] == f"{np.mean([own[0], own[1], own[1], own[0]]):.2f}"
+    assert "windows of 15 s" in table.notes[0]
+
+
+def test_recorded_scores_of_other_rules_do_not_stand_beside_edits(tmp_path):
+    score = random_scores(1)
+    others = [{"thresholds": "deepplan"}, {"traffic": "reactive"}, {"planners": ("beta",)}]
+    others.append({"durations": ["30 s"] * 4})
+    others.append({"tokens": ("t0", "t2", "t3", "t4")})
+    for number, settings in enumerate(others):
+        own = write_run(tmp_path / f"own{number}", score=score, **settings)
+        edited = edited_run(tmp_path / f"e{number}", score)
+        [table] = edited_scores(read_groups([own, edited]))
+        assert cells(table, "NR", "alpha", "all")["recorded"] == ""
+
+
+def test_scenarios_of_interplan_have_its_score_and_their_window(tmp_path):
+    score = random_scores(1)
+    kinds = ["overtake", "overtake", "low_traffic_density", "low_traffic_density"]
+    options = {"types": kinds, "durations": ["30 s"] * 4, "traffic": "reactive"}
+    [table] = edited_scores(
+        read_groups([edited_run(tmp_path / "e", score, profile="interplan", **options)])
+    )
+    new = [100.0 * score("alpha", "none", 0, number) for number in range(4)]
+    assert table.header == ("traffic", "planner", "kind", "scenarios", "interPlan score")
+    assert cells(table, "R", "alpha", "overtake")["interPlan score"] == f"{np.mean(new[:2]):.2f}"
+    assert cells(table, "R", "alpha", "all")["interPlan score"] == f"{np.mean(new):.2f}"
+    assert "30 s" in table.title
+
+
+def test_runs_without_edits_have_no_such_table(tmp_path):
+    assert edited_scores(read_groups([write_run(tmp_path / "a")])) == []
 
 
 # --- durations

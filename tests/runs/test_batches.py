@@ -92,3 +92,13 @@ def test_fallback_steps_are_counted_or_fail_a_strict_run(toy, tmp_path, size):
     failed = [row for row in strict.tasks.to_pylist() if row["status"] == "failed"]
     assert [row["token"] for row in failed] == [BAD] * 3
     assert "lost" in failed[0]["error"]
+
+
+def test_a_traffic_network_moves_the_scenarios_of_a_batch_together(toy, tmp_path):
+    values = {"planners": ["constant-velocity"], "planner_args": {}, "noise": ["none"]}
+    values |= {"traffic": "learned", "batch_size": 2}
+    one, two = (run(toy, tmp_path / str(workers), workers=workers, **values) for workers in (1, 2))
+    assert one.manifest["determining"]["batch_size"] == 2
+    assert content(one) == content(two)
+    alone = run(toy, tmp_path / "alone", **values | {"batch_size": 1})
+    assert one.scores["cls"].to_pylist() == pytest.approx(alone.scores["cls"].to_pylist())

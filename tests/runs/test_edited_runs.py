@@ -6,7 +6,10 @@ import pytest
 from commands import call
 
 import shiftsim
+from shiftsim.benchmarks import published
 from shiftsim.errors import ConfigError
+from shiftsim.report.data_tables import benchmark_comparison, own_statistics
+from shiftsim.report.groups import read_groups
 from shiftsim.runs.edits.edited import EditedStore, edits_text, make_edits
 from shiftsim.runs.edits.interplan.codes import import_names
 from shiftsim.runs.scenarios import open_run_store
@@ -223,3 +226,28 @@ def test_an_edited_store_reads_what_it_lists(toy, edits):
     assert "0000cafe-e" in found
     assert "0000cafe" not in found
     assert found.read("0000cafe-e").tracks.num_tracks == 0
+
+
+def test_statistics_and_the_comparison_of_benchmarks_are_of_the_edited_scenarios(edited):
+    groups = read_groups([edited])
+    found = own_statistics(groups)
+    [(label, stats)] = found.items()
+    assert set(stats.rows) == {"0000cafe-parked", "0001cafe-walk", "0002cafe-parked"}
+    assert stats.types["0000cafe-parked"] == "nudge"
+    assert stats.rows["0001cafe-walk"].pedestrians == 1
+    table = benchmark_comparison(published(), found, {label})
+    assert table.header[-1] == f"{label} (own, edited)"
+    last = {row[0]: row[-1] for row in table.rows}
+    assert (last["semantic shift"], last["scenario count"]) == ("scenario", "3")
+
+
+def test_check_names_edits_that_nobody_can_avoid(toy, tmp_path):
+    path = tmp_path / "close.toml"
+    path.write_text(
+        '[[edit]]\nname = "close"\ntokens = ["0000"]\n'
+        'spawn = [{at = {ahead_m = 8.5}, behavior = "stopped"}]\n'
+    )
+    assert call(tmp_path, "edits", "check", path, "--store", toy).returncode == 0
+    done = call(tmp_path, "edits", "check", path, "--store", toy, "--avoidable")
+    assert done.returncode == 1
+    assert "'0000cafe-close': neither braking at 4 m/s^2 nor PDM-Closed" in done.stdout

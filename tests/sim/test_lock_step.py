@@ -9,9 +9,12 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import DataError, InvalidTrajectoryError, PlannerError
+from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
+from shiftsim.sim.traffic import LogReplay
+from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.world.state import AgentKind, Command, Trajectory
 
 TIMES = np.arange(41) * 0.1
@@ -216,3 +219,55 @@ def test_forks_are_independent_of_the_planner_they_are_made_from():
 def test_too_short_a_scenario_is_refused_before_the_batch_starts():
     with pytest.raises(DataError, match="at least 3 are needed"):
         together([scene(0, 2)], forks_of(Weaver(), 1))
+
+
+class Counting(LearnedTraffic):
+    """Learned traffic that notes how many rollouts a forward pass is for."""
+
+    def __init__(self):
+        super().__init__()
+        self.batches = []  # shared by all forks
+
+    def step_batch(self, models, moves):
+        self.batches.append(len(moves))
+        super().step_batch(models, moves)
+
+
+def test_traffic_networks_move_several_rollouts_with_one_pass():
+    scenes = [scene(2 * number, iterations=12 + 2 * number) for number in range(3)]
+    alone = [simulate(one, ConstantVelocity(), traffic=LearnedTraffic()) for one in scenes]
+    original = Counting()
+    rollouts = [Rollout(one, ConstantVelocity(), traffic=original.fork()) for one in scenes]
+    logs = simulate_together(rollouts)
+    # 11, 13 and 15 samples; the last answer is never executed
+    assert original.batches == [3] * 10 + [2] * 2 + [1] * 2
+    for log, expected in zip(logs, alone, strict=True):
+        assert np.abs(log.tracks.poses - expected.tracks.poses).max() < 1e-5
+        assert log.ego.tobytes() == expected.ego.tobytes()
+
+
+class Fails(ConstantVelocity):
+    """Fails in the fourth step."""
+
+    def plan(self, observation):
+        if observation.iteration == 3:
+            raise ZeroDivisionError("no plan")
+        return super().plan(observation)
+
+
+class Broken(LogReplay):
+    """Fails in the sixth step."""
+
+    def step(self, iteration, ego, tracks, row):
+        if iteration == 5:
+            raise ZeroDivisionError("no way")
+
+
+def test_planners_without_a_network_and_traffic_that_fails_end_their_own_rollout_only():
+    scenes = [scene(number) for number in range(3)]
+    models = [LogReplay(), Broken(), LogReplay()]
+    planners = [ConstantVelocity(), ConstantVelocity(), Fails()]
+    rollouts = [Rollout(s, p, traffic=t) for s, p, t in zip(scenes, planners, models, strict=True)]
+    first, second, third = simulate_together(rollouts)
+    assert_same(first, simulate(scenes[0], ConstantVelocity()))
+    assert (str(second), str(third)) == ("no way", "no plan")

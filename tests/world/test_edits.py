@@ -12,6 +12,7 @@ from shiftsim.world.edits.apply import apply_edit
 from shiftsim.world.edits.density import safe_speed
 from shiftsim.world.edits.places import ego_path
 from shiftsim.world.edits.spec import At, make_edit
+from shiftsim.world.scenario import duration_class
 from shiftsim.world.script import MIXED, STOPPED
 from shiftsim.world.state import VX, AgentKind, Command, LightStatus, center_poses
 
@@ -182,6 +183,14 @@ def test_a_shorter_window_has_fewer_iterations(scene):
     assert edited.duration_class == "3 s"
     with pytest.raises(ConfigError, match=r"60 s is longer than the 14\.0 s that are recorded"):
         scene.edited(window_s=60.0)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "name"),
+    [(150, "15 s"), (151, "15 s"), (149, "14 s"), (200, "20 s"), (201, "20 s"), (301, "30 s")],
+)
+def test_a_window_that_is_not_15_s_is_a_class_of_its_own(iterations, name):
+    assert duration_class(np.arange(iterations) * 100_000) == name
 
 
 def test_density_leaves_space_and_depends_on_the_seed_alone(scene):

@@ -44,7 +44,7 @@ class EditSet:
             f"edit {edit.name} of {found['base']}: {line}"
             for edit in self.edits
             if edit.digest == found.get("digest")
-            for line in edit.words()
+            for line in edit.words
         ]
 
     def with_splits(self, find: Callable[[str], Sequence[str]]) -> "EditSet":

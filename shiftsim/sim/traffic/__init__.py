@@ -6,7 +6,9 @@ rewrites rows as the rollout proceeds. A model is any object with the two method
 `mixed.Mixed` makes one of several, each for some of the tracks (docs/own_traffic.md).
 """
 
-from typing import Protocol
+import inspect
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, one_of
@@ -47,6 +49,26 @@ class Traffic(Protocol):
         """
 
 
+class Move(NamedTuple):
+    """One call of `Traffic.step`."""
+
+    iteration: int  # the iteration that ends
+    ego: FloatArray  # (11,) ego state at it
+    tracks: Tracks  # the buffer of `start`
+    row: int  # row of the next iteration
+
+
+@runtime_checkable
+class BatchTraffic(Traffic, Protocol):
+    """A traffic model that can move several rollouts with one forward pass."""
+
+    def fork(self) -> "BatchTraffic":
+        """A model for one more rollout that shares the network with this one."""
+
+    def step_batch(self, models: Sequence["BatchTraffic"], moves: Sequence[Move]) -> None:
+        """What `step` does, for forks that are in lock step, one call each."""
+
+
 class LogReplay:
     """Non-reactive traffic: everyone does what the recording did, which the buffer holds."""
 
@@ -70,8 +92,11 @@ def traffic_name(name: str) -> str:
     return full if ":" in full else one_of("traffic", full, [*_MODELS, *others])
 
 
-def make_traffic(name: str) -> Traffic:
-    """A traffic model by name, or by `package.module:Model`, called without arguments.
+def make_traffic(name: str, device: str = "") -> Traffic:
+    """A traffic model by name, or by `package.module:Model`.
+
+    That is called without arguments, or with the `device` where it is given and has a parameter of
+    that name.
 
     Raises:
         ConfigError: The name is unknown, or what it names is not a traffic model.
@@ -83,7 +108,8 @@ def make_traffic(name: str) -> Traffic:
             hint="give traffic=PlannedTraffic(make) of shiftsim.sim.traffic.planned",
         )
     hint = "give package.module:Model of a class on the Python path"
-    model: Traffic = load_attribute("traffic", target, hint)()
+    make = load_attribute("traffic", target, hint)
+    model: Traffic = make(device=device) if device and _takes_device(make) else make()
     for method in ("start", "step"):
         if not callable(getattr(model, method, None)):
             raise ConfigError(
@@ -92,3 +118,10 @@ def make_traffic(name: str) -> Traffic:
                 "step(iteration, ego, tracks, row), see docs/own_traffic.md",
             )
     return model
+
+
+def _takes_device(make: Any) -> bool:
+    try:
+        return "device" in inspect.signature(make).parameters
+    except (TypeError, ValueError):
+        return False

@@ -126,7 +126,7 @@ class _Editor:
             base=self.base.token,
             name=edit.name,
             digest=edit.digest,
-            words=edit.words(),
+            words=edit.words,
             tokens=tuple(token for token in draft.touched if token in places),
             behaviors=draft.behaviors,
             manner=MANNERS.index(edit.agents) if edit.agents else OFF,
@@ -203,8 +203,8 @@ class _Editor:
         pose, size = self.pose(spawn, what), np.array(spawn.size_m or SIZES[spawn.kind])
         is_mover = kind == AgentKind.VEHICLE and spawn.behavior != "stopped"
         if not is_mover:
-            draft.require_free(pose, size, what)
-            draft.add(name, kind, size, draft.still(pose), behavior=STOPPED)
+            draft.require_free(pose[None], size, what)
+            draft.add_standing([name], kind, size, pose[None])
             return
         add_mover(draft, name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
 
@@ -234,12 +234,11 @@ class _Editor:
                     place = self.path.pose(at)
                 else:
                     place = _ahead_of(pose, distance, aside)
-                what = block.kind.replace("_", " ")
-                self.draft.require_free(place, size, f"{what} of a closed lane")
                 places.append(place)
-            for place in places:
-                name, kind = self.name(block.kind), KIND_CODES[block.kind]
-                self.draft.add(name, kind, size, self.draft.still(place), behavior=STOPPED)
+            poses, what = np.array(places), block.kind.replace("_", " ")
+            self.draft.require_free(poses, size, f"{what} of a closed lane")
+            names = [self.name(block.kind) for _ in places]
+            self.draft.add_standing(names, KIND_CODES[block.kind], size, poses)
 
     def _walk(self) -> None:
         draft, size = self.draft, np.array(SIZES["pedestrian"])
@@ -250,7 +249,7 @@ class _Editor:
             if length < 1e-3:
                 raise ConfigError("a pedestrian walks from a place to the same place")
             start[2] = np.arctan2(step[1], step[0])
-            draft.require_free(start, size, "pedestrian")
+            draft.require_free(start[None], size, "pedestrian")
             name, speed = self.name("pedestrian"), max(walk.speed_mps, 1e-3)
             begins = np.inf if walk.start_s is None else walk.start_s
             poses, velocities, valid = stroll(
@@ -317,7 +316,7 @@ def _shift(draft: Draft, track: int, ahead: float, left: float) -> None:
     size = tracks.sizes[now, track].copy()
     by = pose[:2] - tracks.poses[now, track, :2]
     tracks.valid[now, track] = False  # it may be in its own way
-    draft.require_free(pose, size, f"moved track {tracks.tokens[track]!r}")
+    draft.require_free(pose[None], size, f"moved track {tracks.tokens[track]!r}")
     tracks.valid[now, track] = True
     tracks.poses[:, track, :2] += by
     draft.touched.append(tracks.tokens[track])

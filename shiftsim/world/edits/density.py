@@ -17,7 +17,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.world.edits.draft import Draft
 from shiftsim.world.edits.movers import add_mover
 from shiftsim.world.edits.spec import LEVELS, Density
-from shiftsim.world.lanes import find_start, initial_curvature, pose_on_line
+from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
 from shiftsim.world.map import VectorMap
 from shiftsim.world.script import FOLLOW
 from shiftsim.world.state import VX, center_poses
@@ -104,6 +104,7 @@ def draw_slots(
         limit = float(road.speed_limits[lane])
         limit = 0.0 if math.isnan(limit) else limit
         along, speed, is_first = float(line.length), 0.0, True
+        found_at, found_speeds = list[float](), list[float]()
         while along > 0.0:
             distance: float = draws.randrange(int(gap[0]), int(gap[1]))
             along -= distance
@@ -125,8 +126,10 @@ def draw_slots(
             if along - ego_at == 0:
                 ego_speed = speed
             else:
-                point = shapely.line_interpolate_point(line, along)
-                out.append(Slot(pose_on_line(line, point.x, point.y)[1], speed))
+                found_at.append(along)
+                found_speeds.append(speed)
+        points = shapely.line_interpolate_point(line, found_at)
+        out += map(Slot, poses_on_line(line, points), found_speeds)
     return out, ego_speed
 
 

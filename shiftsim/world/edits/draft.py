@@ -1,6 +1,6 @@
 """A scenario while it is edited: its arrays, writable, and what the edit has made so far."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
-from shiftsim.world.script import FOLLOW, Finish, Walker
+from shiftsim.world.script import FOLLOW, STOPPED, Finish, Walker
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -35,7 +35,7 @@ class Draft:
     touched: list[str] = field(default_factory=list)  # tokens of tracks made or changed
     walkers: list[tuple[str, Walker]] = field(default_factory=list)  # with the token of their track
     finish: Finish | None = None
-    waiting: list[tuple[Tracks, int]] = field(default_factory=list)  # new tracks, one each
+    waiting: list[tuple[Tracks, Sequence[int]]] = field(default_factory=list)  # new, as `known`
 
     @property
     def tracks(self) -> Tracks:
@@ -54,18 +54,24 @@ class Draft:
         if not self.waiting:
             return
         parts = [self.joined, *(tracks for tracks, _ in self.waiting)]
-        valid, poses, velocities, sizes = (
-            np.concatenate([getattr(part, name) for part in parts], axis=1)
-            for name in ("valid", "poses", "velocities", "sizes")
-        )
         kinds = np.concatenate([part.kinds for part in parts])
         # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
         order = np.argsort(kinds, kind="stable")
-        tokens = tuple(token for part in parts for token in part.tokens)
-        new = Tracks(valid, poses, velocities, sizes, kinds, tokens)
-        self.joined = new.select(order)
-        behaviors = np.array([behavior for _, behavior in self.waiting], np.int64)
-        self.known = np.concatenate([self.known, behaviors])[order]
+        part_of = np.repeat(np.arange(len(parts)), [part.num_tracks for part in parts])[order]
+        ends = np.flatnonzero((np.diff(order) != 1) | (np.diff(part_of) != 0)) + 1
+        starts = np.cumsum([0, *(part.num_tracks for part in parts)])
+        runs = []  # what stays together is copied at once
+        for run, number in zip(np.split(order, ends), part_of[[0, *ends]].tolist(), strict=True):
+            first = int(run[0] - starts[number])
+            runs.append((parts[number], slice(first, first + len(run))))
+        valid, poses, velocities, sizes = (
+            np.concatenate([getattr(part, name)[:, where] for part, where in runs], axis=1)
+            for name in ("valid", "poses", "velocities", "sizes")
+        )
+        tokens = tuple(token for part, where in runs for token in part.tokens[where])
+        self.joined = Tracks(valid, poses, velocities, sizes, kinds[order], tokens)
+        behaviors = [self.known, *(np.array(known, np.int64) for _, known in self.waiting)]
+        self.known = np.concatenate(behaviors)[order]
         self.waiting = []
 
     @property
@@ -121,52 +127,77 @@ class Draft:
         valid: BoolArray | None = None,
         velocities: FloatArray | None = None,
         behavior: int = FOLLOW,
-        velocity_of: AgentKind = LAST_AGENT_KIND,
     ) -> None:
         """Add a track: poses (R, 3) of its centre, velocities (R, 2), standing where None."""
         rows = len(self.scenario.time_us)
         there = np.ones(rows, np.bool_) if valid is None else valid
         moves = np.zeros((rows, 2)) if velocities is None else velocities
-        if kind > velocity_of:
-            moves = np.full((rows, 2), np.nan)
-        blank = np.where(there, 0.0, np.nan)[:, None]
+        arrays = (poses[:, None], there[:, None], moves[:, None])
+        self.add_all([token], kind, size[None], *arrays, behaviors=[behavior])
+
+    def add_standing(
+        self, tokens: Sequence[str], kind: int, size: FloatArray, poses: FloatArray
+    ) -> None:
+        """Add N tracks of a size (2,) that stand at poses (N, 3) all the time."""
+        shape = (len(self.scenario.time_us), len(tokens))
+        there, places = np.ones(shape, np.bool_), np.broadcast_to(poses, (*shape, 3))
+        sizes, moves = np.broadcast_to(size, (len(tokens), 2)), np.zeros((*shape, 2))
+        behaviors = [STOPPED] * len(tokens)
+        self.add_all(tokens, kind, sizes, places, there, moves, behaviors=behaviors)
+
+    def add_all(
+        self,
+        tokens: Sequence[str],
+        kind: int,
+        sizes: FloatArray,
+        poses: FloatArray,
+        valid: BoolArray,
+        velocities: FloatArray,
+        *,
+        behaviors: Sequence[int],
+    ) -> None:
+        """Add N tracks: sizes (N, 2), poses (R, N, 3), valid (R, N), velocities (R, N, 2)."""
+        blank = np.where(valid, 0.0, np.nan)[..., None]
         new = Tracks(
-            there[:, None],
-            (poses + blank)[:, None],
-            (moves + blank)[:, None],
-            (size + blank)[:, None],
-            np.array([kind], np.int64),
-            (token,),
+            valid,
+            poses + blank,
+            (velocities if kind <= LAST_AGENT_KIND else np.nan) + np.repeat(blank, 2, axis=2),
+            sizes + blank,
+            np.full(len(tokens), kind, np.int64),
+            tuple(tokens),
         )
-        self.waiting.append((new, behavior))
-        self.touched.append(token)
+        self.waiting.append((new, behaviors))
+        self.touched += tokens
 
     def still(self, pose: FloatArray) -> FloatArray:
         """(R, 3) a pose in all rows."""
         return np.tile(pose, (len(self.scenario.time_us), 1))
 
-    def require_free(self, pose: FloatArray, size: FloatArray, what: str) -> None:
-        """Refuse a box that touches the ego or a track at the first iteration.
+    def require_free(self, poses: FloatArray, size: FloatArray, what: str) -> None:
+        """Refuse boxes at poses (N, 3) that touch the ego or a track at the first iteration.
 
         Raises:
-            ConfigError: It does.
+            ConfigError: One does.
         """
-        box = boxes_to_corners(pose, size)
-        ego = center_poses(self.scenario.ego[self.now : self.now + 1, :3])[0]
-        if convex_intersect(box, boxes_to_corners(ego, EGO_SIZE)):
-            raise ConfigError(f"{what} is on the ego", hint="choose a place farther ahead or aside")
-        there = np.flatnonzero(self.tracks.valid[self.now])
-        poses, sizes = self.tracks.poses[self.now, there], self.tracks.sizes[self.now, there]
-        near = np.hypot(*(poses[:, :2] - pose[:2]).T) < np.hypot(*size) + np.hypot(*sizes.T)
-        for track in there[near].tolist():
-            other = boxes_to_corners(
-                self.tracks.poses[self.now, track], self.tracks.sizes[self.now, track]
+        now, tracks = self.now, self.tracks
+        ego = center_poses(self.scenario.ego[now : now + 1, :3])
+        there = np.flatnonzero(tracks.valid[now])
+        others = np.concatenate([ego, tracks.poses[now, there]])
+        sizes = np.concatenate([EGO_SIZE[None], tracks.sizes[now, there]])
+        boxes = boxes_to_corners(poses, np.broadcast_to(size, (len(poses), 2)))
+        reach = np.hypot(*size) + np.hypot(sizes[:, 0], sizes[:, 1])
+        apart = others[:, None, :2] - poses[:, :2]
+        near = np.hypot(apart[..., 0], apart[..., 1]) < reach[:, None]
+        for other, number in np.argwhere(near).tolist():
+            if not convex_intersect(boxes[number], boxes_to_corners(others[other], sizes[other])):
+                continue
+            if other == 0:
+                hint = "choose a place farther ahead or aside"
+                raise ConfigError(f"{what} is on the ego", hint=hint)
+            raise ConfigError(
+                f"{what} is on track {tracks.tokens[there[other - 1]]!r}",
+                hint="choose another place, or remove that track first",
             )
-            if convex_intersect(box, other):
-                raise ConfigError(
-                    f"{what} is on track {self.tracks.tokens[track]!r}",
-                    hint="choose another place, or remove that track first",
-                )
 
 
 def begin(scenario: "Scenario") -> Draft:

@@ -26,7 +26,7 @@ def add_mover(
             hint='put it on a lane, or give behavior = "stopped"',
         )
     edge, along = start.edge, start.progress
-    draft.require_free(start.pose, size, "spawned vehicle")
+    draft.require_free(start.pose[None], size, "spawned vehicle")
     seconds = draft.seconds
     past = seconds <= 0.0
     lanes = [edge]

@@ -1,12 +1,11 @@
 """Places beside the recorded path of the ego, so that one edit fits many scenarios."""
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.world.edits.spec import At
@@ -66,13 +65,17 @@ def ego_path(scenario: "Scenario") -> EgoPath:
 
 def _spaced(xy: FloatArray) -> FloatArray:
     """The first of the points (N, 2), and those that are far enough from the one before."""
-    kept, points = [0], xy.tolist()
-    x, y = points[0]
-    for index, (ahead_x, ahead_y) in enumerate(points):
-        if math.hypot(ahead_x - x, ahead_y - y) >= _SPACING:
-            kept.append(index)
-            x, y = ahead_x, ahead_y
+    kept = np.zeros(len(xy), np.bool_)
+    _mark_spaced(np.ascontiguousarray(xy), kept)
     return xy[kept]
+
+
+@lean_kernel
+def _mark_spaced(xy: FloatArray, kept: BoolArray) -> None:
+    kept[0], last = True, 0
+    for index in range(1, len(xy)):
+        if np.hypot(xy[index, 0] - xy[last, 0], xy[index, 1] - xy[last, 1]) >= _SPACING:
+            kept[index], last = True, index
 
 
 def _lanes_ahead(scenario: "Scenario", path: FloatArray) -> FloatArray:

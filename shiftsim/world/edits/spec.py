@@ -10,6 +10,7 @@ import math
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from shiftsim.errors import ConfigError, nearest, one_of
@@ -166,7 +167,7 @@ class Speed:
     ego_mps: float | None = None  # the ego's at the start
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Edit:
     """Everything that makes one new scenario of each recorded one that it is for."""
 
@@ -193,7 +194,7 @@ class Edit:
     light: tuple[Light, ...] = ()
     speed: Speed | None = None
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """What the new scenario depends on, beside the recorded one."""
         return digest_of(asdict(self))
@@ -203,6 +204,7 @@ class Edit:
         """Whether a rollout ends where the goal is reached."""
         return self.reroute is not None if self.end_at_goal is None else self.end_at_goal
 
+    @cached_property
     def words(self) -> tuple[str, ...]:
         """What is edited, one line each."""
         if self.code:

@@ -16,7 +16,9 @@ from shiftsim.planners.routes.corridor import (
     Objects,
     find_lead,
     find_sides,
+    is_tied,
     make_survey,
+    settle_tie,
     start_survey,
 )
 from shiftsim.planners.routes.graph import sub_path
@@ -108,3 +110,23 @@ def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
     found, gap = find_lead(footprint, objects, bounds, np.where(truth > 3.0, HIT, CLEAR))
     assert found == np.flatnonzero(truth > 3.0)[truth[truth > 3.0].argmin()]
     assert gap == pytest.approx(truth[truth > 3.0].min(), abs=1e-12)
+
+
+def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_order():
+    footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
+    low, high, far = (footprint + shift for shift in ((1.0, -1.0), (-1.0, 1.0), (30.0, -9.0)))
+    for rings, lead in (([high, far, low], 2), ([low, far, high], 0)):
+        objects = objects_of(rings)._replace(speeds=np.array([1.0, 9.0, 3.0]))
+        sides = np.full(3, HIT)
+        assert is_tied(footprint, 0.0, objects, sides, 0)
+        settle_tie(footprint, objects, sides)
+        assert sides.tolist() == [HIT if i in (1, lead) else CLEAR for i in range(3)]
+        assert not is_tied(footprint, 0.0, objects, sides, lead)
+
+
+def test_objects_of_one_speed_are_no_tie():
+    footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
+    objects = objects_of([footprint + 1.0, footprint - 1.0])._replace(headings=np.array([0.0, 2.0]))
+    assert not is_tied(footprint, 0.5, objects, np.full(2, HIT), 0)  # both stand
+    moving = objects._replace(speeds=np.ones(2))
+    assert is_tied(footprint, 0.5, moving, np.full(2, HIT), 0)

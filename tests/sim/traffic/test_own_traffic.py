@@ -1,6 +1,8 @@
 """Traffic models of one's own, and mixtures of policies."""
 
+import sys
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -114,3 +116,19 @@ def test_wrong_names_say_what_there_is() -> None:
     assert "constant-velocity" in str(caught.value.hint)
     with pytest.raises(ConfigError, match="'pathlib:Path' has no method 'start'"):
         make_traffic("pathlib:Path")
+
+
+class OnDevice(LogReplay):
+    """Traffic that says where its network is."""
+
+    def __init__(self, device="nowhere"):
+        self.device = device
+
+
+def test_a_model_with_a_parameter_for_it_is_given_the_device(monkeypatch) -> None:
+    module = ModuleType("my_network")
+    module.OnDevice, module.LogReplay = OnDevice, LogReplay
+    monkeypatch.setitem(sys.modules, "my_network", module)
+    assert make_traffic("my_network:OnDevice", "cuda").device == "cuda"
+    assert make_traffic("my_network:OnDevice").device == "nowhere"
+    assert isinstance(make_traffic("my_network:LogReplay", "cuda"), LogReplay)

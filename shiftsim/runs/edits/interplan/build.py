@@ -8,6 +8,7 @@ numpy's global state.
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from shiftsim.world.edits.apply import edited_id
 from shiftsim.world.edits.density import blocks_at, draw_slots
 from shiftsim.world.edits.draft import EGO_SIZE, Draft, begin
 from shiftsim.world.edits.spec import LEVELS, MANNERS, Edit
-from shiftsim.world.lanes import find_start, nearest_heading, poses_on_line, start_on
+from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.script import CAUTIOUS, FOLLOW, LOGGED, STOPPED, Crossing, Finish, Script
@@ -249,7 +250,8 @@ class _Cast:
         new = Vehicle(token, pose, own_size if size is None else size, velocity, behavior)
         area = self.areas[id(new)] = corridor(new)
         self.held.append(new)  # ids are of objects that live
-        met = [other for other in self.vehicles if area.intersects(self.areas[id(other)])]
+        areas = [self.areas[id(other)] for other in self.vehicles]
+        met = list(compress(self.vehicles, shapely.intersects(area, areas).tolist()))
         if met:
             if behavior == STOPPED:
                 self.vehicles = [
@@ -275,11 +277,11 @@ def corridor(vehicle: Vehicle) -> shapely.Geometry:
 def straight_path(
     pose: FloatArray, length: float, velocity: FloatArray, seconds: float
 ) -> FloatArray:
-    """(K, 2) from the rear of a box to its front after some seconds; velocity in its frame."""
+    """(4, 2) from the rear of a box to its front after some seconds; velocity in its frame."""
     x, y, heading = pose
     cos, sin = np.cos(heading), np.sin(heading)
     vx, vy = velocity[0] * cos - velocity[1] * sin, velocity[0] * sin + velocity[1] * cos
-    times = np.arange(0, seconds + 0.1, 0.1)
+    times = np.array([0.0, seconds])  # interPlan has points between, on the same straight line
     half = length / 2.0
     rear = (x + half * np.cos(heading + np.pi), y + half * np.sin(heading + np.pi))
     front = np.column_stack([x + times * vx + half * cos, y + times * vy + half * sin])
@@ -288,25 +290,28 @@ def straight_path(
 
 def _past(road: VectorMap, vehicles: tuple[Vehicle, ...], draws: random.Random) -> FloatArray:
     """(23, V, 3) where the vehicles were, oldest first, with noise."""
-    starts = [_segment(road, vehicle) for vehicle in vehicles]
+    found = enumerate(_segment(road, vehicle) for vehicle in vehicles)
+    movers = [(number, *start) for number, start in found if start is not None]
     out = np.array([[vehicle.pose for vehicle in vehicles]] * HISTORY).reshape(HISTORY, -1, 3)
-    places: dict[int, list[tuple[int, int, float]]] = {}
-    for sample in range(HISTORY):
-        for number, (vehicle, start) in enumerate(zip(vehicles, starts, strict=True)):
-            if start is None:
-                continue
-            edge, along = start
-            # nuPlan rule 709: with noise, standing ones as well
-            along -= vehicle.velocity[0] * _STEP * (HISTORY - sample) + draws.gauss(0, _JITTER)
-            if along < 0:
-                before = road.incoming.at(edge).tolist()
-                edge, along = (before[0], along) if before else (edge, 0.0)
-                along += road.baselines.length(edge) if before else 0.0
-            places.setdefault(edge, []).append((sample, number, along))
-    for edge, found in places.items():
-        samples, numbers, distances = map(np.array, zip(*found, strict=True))
-        line = shapely.LineString(road.baselines.at(edge))
-        out[samples, numbers] = poses_on_line(line, shapely.line_interpolate_point(line, distances))
+    if not movers:
+        return out
+    numbers, edges, starts = map(np.array, zip(*movers, strict=True))
+    # nuPlan rule 709: with noise, standing ones as well
+    noise = [draws.gauss(0, _JITTER) for _ in range(HISTORY * len(movers))]
+    speeds = np.array([vehicles[number].velocity[0] for number in numbers.tolist()])
+    back = speeds * _STEP * np.arange(HISTORY, 0, -1)[:, None]
+    along = starts - (back + np.array(noise).reshape(HISTORY, -1))
+    edges = np.tile(edges, (HISTORY, 1))
+    for row, column in np.argwhere(along < 0.0).tolist():
+        before = road.incoming.at(int(edges[row, column])).tolist()
+        if before:
+            edges[row, column] = before[0]
+            along[row, column] += road.baselines.length(before[0])
+        else:
+            along[row, column] = 0.0
+    for edge in np.unique(edges).tolist():
+        rows, columns = np.nonzero(edges == edge)
+        out[rows, numbers[columns]] = poses_on_edge(road, edge, along[rows, columns])
     return out
 
 
@@ -320,6 +325,8 @@ def _segment(road: VectorMap, vehicle: Vehicle) -> tuple[int, float] | None:
     for px, py in points:
         edges = road.lanes_at(px, py) if is_lane else road.connectors_at(px, py)
         if edges:
+            if len(edges) == 1:
+                return edges[0], road.progress_on(edges[0], x, y)
             start = nearest_heading(road, edges, vehicle.pose)
             return start.edge, start.progress
     return None
@@ -364,7 +371,7 @@ def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
         base=scenario.token,
         name=edit.name,
         digest=edit.digest,
-        words=edit.words(),
+        words=edit.words,
         tokens=tuple(draft.touched),
         behaviors=draft.behaviors,
         manner=MANNERS.index(_manner(built, edit)),
@@ -391,26 +398,25 @@ def _manner(built: Built, edit: Edit) -> str:
     return letters.get(built.changes.get("observation", ""), edit.agents or MANNERS[0])
 
 
+_NUMBERS = ("size", "velocity")
+
+
 def _add_vehicles(draft: Draft, built: Built) -> None:
     """The vehicles at iteration 0, and before it where they were with noise."""
     scenario, now = draft.scenario, draft.now
     rows = now - scenario.row_step * np.arange(HISTORY, 0, -1)
     known = rows >= 0
-    for number, vehicle in enumerate(built.vehicles):
-        poses = draft.still(vehicle.pose)
-        valid = np.zeros(len(poses), np.bool_)
-        valid[now] = True
-        poses[rows[known]] = built.past[known, number]
-        valid[rows[known]] = True
-        if vehicle.behavior == STOPPED:
-            valid[now:] = True
-        velocities = np.tile(vehicle.velocity, (len(poses), 1))
-        draft.add(
-            vehicle.token,
-            AgentKind.VEHICLE,
-            vehicle.size,
-            poses,
-            valid=valid,
-            velocities=velocities,
-            behavior=vehicle.behavior,
-        )
+    if not built.vehicles:
+        return
+    tokens, behaviors = zip(*((v.token, v.behavior) for v in built.vehicles), strict=True)
+    sizes, velocities = (np.array([getattr(v, n) for v in built.vehicles]) for n in _NUMBERS)
+    shape = (len(scenario.time_us), len(tokens))
+    poses = np.empty((*shape, 3))
+    poses[:] = [vehicle.pose for vehicle in built.vehicles]
+    poses[rows[known]] = built.past[known]
+    valid = np.zeros(shape, np.bool_)
+    valid[now] = True
+    valid[rows[known]] = True
+    valid[now:, np.array(behaviors) == STOPPED] = True
+    moves = np.broadcast_to(velocities, (*shape, 2))
+    draft.add_all(tokens, AgentKind.VEHICLE, sizes, poses, valid, moves, behaviors=behaviors)

@@ -4,6 +4,8 @@ All agents of a step are answered at once. The network imitates recorded agents;
 on is in docs/traffic_weights.md.
 """
 
+from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.sim.traffic import Move
 from shiftsim.sim.traffic.following import NO_LANE, Lanes, lanes_of
 from shiftsim.sim.traffic.learned.features import (
     NUM_FEATURES,
@@ -46,6 +49,10 @@ class LearnedTraffic:
         self.fingerprint = {"weights": digest(self._weights)}  # goes into what identifies a run
         self._lanes: Lanes | None = None
 
+    def fork(self) -> "LearnedTraffic":
+        """Traffic with the same weights, for one more rollout."""
+        return copy(self)
+
     def start(
         self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
     ) -> None:
@@ -77,9 +84,25 @@ class LearnedTraffic:
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move everyone who was there a step ago."""
-        features = self.observe(iteration, ego, tracks, row - 1)
+        self.step_batch([self], [Move(iteration, ego, tracks, row)])
+
+    def step_batch(self, models: "Sequence[LearnedTraffic]", moves: Sequence[Move]) -> None:
+        """The same for forks in several rollouts, with one forward pass."""
+        pairs = list(zip(models, moves, strict=True))
+        features = [
+            model.observe(move.iteration, move.ego, move.tracks, move.row - 1)
+            for model, move in pairs
+        ]
+        speeds = [model._motion.speeds[model.own] for model in models]
+        out = controls(self._weights, np.concatenate(features), np.concatenate(speeds))
+        ends = np.cumsum([len(model.own) for model in models])
+        for (model, move), part in zip(pairs, np.split(out, ends[:-1]), strict=True):
+            model._write(move, part)
+
+    def _write(self, move: Move, out: FloatArray) -> None:
+        """Move the agents by their controls (A, 2)."""
+        iteration, _, tracks, row = move
         motion, own = self._motion, self.own
-        out = controls(self._weights, features, motion.speeds[own])
         move_agents(motion, own, out, self._spans[iteration], self._moved)
         there = motion.present[own]
         who, moved = own[there], self._moved[there]
