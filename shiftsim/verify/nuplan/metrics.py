@@ -47,8 +47,9 @@ def verify_nuplan_metrics(
             continue
         with report.attempt("recorded rollout", " ".join(run)):
             entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
-            seen = (tables["objects"], run) if challenge == "R" else (replayed, (scene, "NR", "*"))
-            log = _rollout(tables["ego"][run], experts[scene, "iteration"], seen[0][seen[1]], road)
+            is_reactive = challenge == "R"
+            objects = tables["objects"][run] if is_reactive else replayed[scene, "NR", "*"]
+            log = _rollout(tables["ego"][run], experts[scene, "iteration"], objects, road)
             times = log.expert_time_us[: len(log.ego)]
             columns = {"iteration": np.arange(len(times)), "time_us": times}
             columns |= {name: worlds.ego_columns(log.ego)[name] for name in RECORDED}
