@@ -98,8 +98,8 @@ def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
         return row
     if row.startswith("= "):
         text = row[2:].format(**names)
-        fits = text.endswith("*") and str(theirs).startswith(text[:-1])
-        return theirs if fits else text
+        is_open = text.endswith("*") and isinstance(theirs, str)
+        return theirs if is_open and theirs.startswith(text[:-1]) else text
     kind, _, path = row.rpartition(" of ")
     value: Any = names
     for name, index in re.findall(r"(\w+)|\[(.*?)\]", path):
