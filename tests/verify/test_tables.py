@@ -40,6 +40,7 @@ def compared(rows, theirs, **names):
         ("tracks of made.lanes[:0]", [], ["t0"]),
         ("= planner {step.best}", "planner 2", "planner 3"),
         ("= planner *", "planner of somebody", "a planner"),
+        ("= *", "anything", 7),
         (41, 41, 42),
         ({"lanes": "made.lanes", "text": "= *"}, {"lanes": [4, 5, 6], "text": "?"}, {"lanes": []}),
     ],

@@ -71,7 +71,7 @@ class Loop:
         report = self.file.report
         report.compare(f"{self.name} {quantity}", self.where, ours, theirs, atol=atol)
 
-    def match(self, table: Table, theirs: Source, called: str = "", **names: Any) -> None:
+    def match(self, table: Table, theirs: Source, called: str = "", /, **names: Any) -> None:
         """Compare by a table, which finds what this object has."""
         names = {**vars(self), **names}
         table.match(theirs, self.where, f"{self.name} {called}".strip(), **names)

@@ -44,7 +44,7 @@ def _compare(call: Source, where: str, scenario: Scenario) -> None:
     end = [path.end, *path.driven.xy[-1].tolist(), heading]
     TABLES["plan"].match(call, where, road=road, planner=planner, end=end)
     rows = np.array(call["trajectory"], np.float64)
-    plan = {"time_us": rows[:, 0].astype(np.int64), "states": rows[:, 1:]}
+    plan = {"plan time": rows[:, 0].astype(np.int64), "plan": rows[:, 1:]}
     ours = {"times": seen.time_us + STEP_US * np.arange(STEPS + 1)}
     ours["states"] = np.column_stack([centers, speeds])
     TABLES["trajectory"].match(Source(call.name, "column", plan, call.report), where, **ours)
