@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numba.core import event
 from numba.core.caching import FunctionCache
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
@@ -117,7 +117,7 @@ class _Kept(FunctionCache):
             if _NEEDS_ALL in content:
                 target_context.refresh()
             else:
-                rtsys.initialize(target_context)  # type: ignore[no-untyped-call]
+                rtsys.initialize(target_context)
             found, compiled = pickle.loads(content)
             return self._impl.rebuild(target_context, compiled) if found == key else None
         except FileNotFoundError:

@@ -99,13 +99,13 @@ class StoredRecording:
         if not 0 <= first < last <= self.num_rows:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
-        time_us = _rows(self.frames, first, last)["time_us"].to_numpy()
-        tracks, lights = self._read_tracks(first, last), self._read_lights(first, last)
-        return Recording(self.log_name, self.city, time_us, tracks, lights)
+        frames = _rows(self.frames, first, last)
+        tracks, lights = self._read_tracks(first, last), self._lights(frames)
+        return Recording(self.log_name, self.city, frames["time_us"].to_numpy(), tracks, lights)
 
-    def _read_lights(self, first: int, last: int) -> TrafficLights:
-        shape = (last - first, len(self.connectors))
-        status = _rows(self.frames, first, last)["light_status"].combine_chunks().flatten()
+    def _lights(self, frames: pa.Table) -> TrafficLights:
+        shape = (len(frames), len(self.connectors))
+        status = frames["light_status"].combine_chunks().flatten()
         if len(status) != shape[0] * shape[1]:
             raise DataError(f"{self.frames.path}: light_status has gaps", hint=REPAIR)
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
