@@ -8,6 +8,7 @@ traceback. Exit codes: 0 all well, 1 usage or settings, 2 data, 3 finished with 
 tasks, 130 interrupted; `verify` has its own.
 """
 
+import gc
 import inspect
 import json
 import os
@@ -249,6 +250,8 @@ def planner_arguments(
 
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
+# imports make many objects that stay; looking through them again and again takes time
+_COLLECTIONS = (20_000, 20, 10)
 # commands that go on with what is finished, and the words that ask for it
 _GOES_ON = {
     **dict.fromkeys(("filter", "dsc3d", "av2", "py123d", "commonroad"), ()),
@@ -342,7 +345,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
-    before = signal.getsignal(signal.SIGINT)
+    collections, before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
+    gc.set_threshold(*_COLLECTIONS)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, _Interrupt())
     try:
@@ -352,6 +356,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _USAGE
     finally:
         signal.signal(signal.SIGINT, before)
+        gc.set_threshold(*collections)
     sys.exit(code)
 
 
