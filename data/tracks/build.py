@@ -228,7 +228,13 @@ def _sizes(
     if sizes is None:
         warnings["tracks without size (that of their kind)"] += len(kinds)
         return usual
-    found = np.column_stack([track_medians(sizes[:, axis], track) for axis in (0, 1)])
+    known = (sizes > 0.0).all(axis=1)
+    if not known.all():  # the rows that have one tell it
+        sizes, track = sizes[known], track[known]
+    found = np.zeros_like(usual)
+    if len(track):
+        medians = [track_medians(sizes[:, axis], track) for axis in (0, 1)]
+        found[: len(medians[0])] = np.column_stack(medians)
     lacking = ~np.all(found > 0.0, axis=1)
     warnings["tracks without size (that of their kind)"] += int(lacking.sum())
     return np.where(np.expand_dims(lacking, 1), usual, found)

@@ -29,6 +29,7 @@ _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
 _LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
+_LONGEST_WALKER = 2.0  # m, median of pedestrians
 _ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving vehicles' rows
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
@@ -317,6 +318,15 @@ def _check_sizes(motion: Motion, out: Doubts) -> None:
         out.say(
             "all lengths and widths are negative",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
+        )
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
+    lengths = sizes[np.array(walks, np.bool_)[motion.table.category], 0]
+    lengths = lengths[lengths > 0.0]
+    if len(lengths) and np.median(lengths) > _LONGEST_WALKER:
+        out.say(
+            f"the median pedestrian is {np.median(lengths):.3g} m long, at most"
+            f" {_LONGEST_WALKER:g} m",
+            "check the column of kinds; or leave sizes that are not known empty",
         )
     if motion.vehicle_size is None:
         return

@@ -269,6 +269,15 @@ def test_the_command_says_why_no_scenario_is_left(town, tmp_path, capsys):
     assert "--window-s" in err
 
 
+def test_the_rows_that_have_a_size_tell_that_of_the_track(town):
+    sizes = {name: town[0][name].copy() for name in ("length_m", "width_m")}
+    sizes["length_m"][::2] = np.nan
+    sizes["width_m"][1::4] = 0.0
+    np.testing.assert_array_equal(_samples(town[0], **sizes).sizes, _samples(town[0]).sizes)
+    sizes["length_m"][:] = np.nan
+    assert set(_samples(town[0], **sizes).sizes[:, 0].tolist()) == {4.6, 1.8, 0.7}
+
+
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_change_between_roads_that_are_not_linked_leaves_no_scenario(beside):
     line = np.array([[0.0, 0.0], [300.0, 0.0]])

@@ -264,18 +264,20 @@ def test_frames_per_second_that_contradict_the_velocities_are_named(town, tmp_pa
 def test_twice_the_speed_is_unusual_where_nothing_else_tells(town, tmp_path):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
-    found = _doubts(path, road, hz=50.0)
+    found = _doubts(path, road, hz=25.0)
     assert found.found == []
     assert "speed limit" in found.notes[0].what
     assert "--hz" in found.notes[0].remedy
 
 
-def test_three_times_the_speed_cannot_be_even_where_nothing_else_tells(town, tmp_path):
+@pytest.mark.parametrize(("hz", "value"), [(37.5, 8.9), (50.0, 15)])
+def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
+    hz, value, town, tmp_path
+):
     columns, road = town
-    time = columns["time_s"] / 3
-    path = write_tracks(tmp_path / "t.csv", columns, time_s=time, frame=None, **NO_SPEEDS)
-    (found,) = _doubts(path, road).found
-    assert "with 8.7 m/s²" in found.what
+    path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
+    (found,) = _doubts(path, road, hz=hz).found
+    assert f"with {value} m/s²" in found.what
     assert "--hz" in found.remedy
 
 
@@ -343,6 +345,13 @@ def test_an_infinite_speed_or_size_is_no_missing_one(name, town, tmp_path):
     table = read_tracks(write_tracks(tmp_path / "t.csv", town[0], **{name: values}))
     kept = table.sizes if name == "length_m" else table.velocities
     assert np.isnan(kept).sum() == 1
+
+
+def test_pedestrians_as_long_as_cars_are_named(town, tmp_path):
+    columns, road = town
+    length = np.maximum(columns["length_m"], 4.5)
+    (found,) = _doubts(write_tracks(tmp_path / "t.csv", columns, length_m=length), road).found
+    assert "the median pedestrian is 4.5 m long" in found.what
 
 
 def test_repeated_rows_are_named(town, tmp_path):
