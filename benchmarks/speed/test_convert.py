@@ -150,8 +150,8 @@ def _plain(columns) -> pa.Schema:
     return pa.schema({**kinds, "class": pa.string()})
 
 
-@pytest.mark.parametrize("ego", ["0", "all"])
-def test_conversion_of_ten_minutes_of_tracks(ego, duration, tmp_path):
+@pytest.mark.parametrize(("ego", "limit"), [("0", 10), ("all", 60)])
+def test_conversion_of_ten_minutes_of_tracks(ego, limit, duration, tmp_path):
     """200 tracks at 25 Hz as a command of its own: seconds and memory of one process."""
     folder = write_table(tmp_path / "crowd", duration)
     words = [sys.executable, "-m", "shiftsim", "convert", "tracks", folder / "crowd.csv"]
@@ -163,5 +163,7 @@ def test_conversion_of_ten_minutes_of_tracks(ego, duration, tmp_path):
     child.returncode = os.waitstatus_to_exitcode(status)
     peak = used.ru_maxrss / 1024**2
     print(f"\n--ego {ego}: {perf_counter() - began:.1f} s", end="")
-    print(f", by CPU time {used.ru_utime + used.ru_stime:.1f} s, peak {peak:.2f} GB", end="")
+    work = used.ru_utime + used.ru_stime
+    print(f", by CPU time {work:.1f} s (limit {limit}), peak {peak:.2f} GB (1.2)", end="")
     assert child.returncode == 0, shown
+    assert peak <= 1.2

@@ -16,6 +16,7 @@ from shiftsim.data.deepplan.route import find_route, nearest_lane
 from shiftsim.data.deepplan.states import ROW_US, ego_trace, resample, sample_runs
 from shiftsim.data.deepplan.windows import (
     EGO,
+    GAP,
     LANE,
     ROUTE,
     ConversionConfig,
@@ -171,14 +172,14 @@ class _Conversion:
         for number, pose in zip(numbers, at_start, strict=True):
             if nearest_lane(self.road, pose, self.config) is None:
                 self.verdicts[LANE] += 1
-            elif (made := self._scenario(run, number, trace)) is None:
-                self.verdicts[ROUTE] += 1
+            elif isinstance(made := self._scenario(run, number, trace), str):
+                self.verdicts[made] += 1
             else:
                 out.append(made)
         return out
 
-    def _scenario(self, run: int, number: int, trace: EgoTrace) -> Window | None:
-        """One scenario, or None where the ego touches no roadblock."""
+    def _scenario(self, run: int, number: int, trace: EgoTrace) -> Window | str:
+        """One scenario, or the rule that its route fails."""
         source, config, road = self.source, self.config, self.road
         span = self.windows[number].span
         start_s = span.start_s
@@ -188,8 +189,8 @@ class _Conversion:
         states = trace.states[start - trace.first_row : end - trace.first_row]
         track = int(self.runs.track[run])
         route = find_route(road, states[:, :3], config)
-        if route is None:
-            return None
+        if route is None or not route.is_linked:
+            return ROUTE if route is None else GAP
         goal = states[-1, :3].copy()
         last = int(np.searchsorted(source.track, track, side="right")) - 1
         if source.time[last] > start_s + span.length_s:

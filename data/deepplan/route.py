@@ -5,6 +5,7 @@ Blocks are indices of `VectorMap.blocks` here, ids only at the end.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,6 +29,7 @@ class Route:
 
     ids: tuple[str, ...]  # roadblock and roadblock connector ids, in order
     num_driven: int  # how many of them the ego drives on; the others were appended
+    is_linked: bool  # whether each of them follows the one before on the map
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> 
         return None
     ahead = _extend(road, driven, poses[-1], config)
     names = road.blocks.ids
-    return Route(tuple(names[block] for block in (*driven, *ahead)), len(driven))
+    is_linked = all(b in road.block_outgoing.at(a) for a, b in pairwise(driven))
+    return Route(tuple(names[block] for block in (*driven, *ahead)), len(driven), is_linked)
 
 
 def follow_blocks(road: VectorMap, points: FloatArray) -> list[int]:

@@ -38,6 +38,14 @@ def sample_runs(recording: TrackSamples, runs: Runs, run: IntArray, time: FloatA
     heading. Callers decide how far that is allowed.
     """
     out = Samples(np.empty((len(time), 3)), np.empty((len(time), 2)), np.empty(len(time)))
+    _write_samples(recording, runs, run, time, np.arange(len(time)), out)
+    return out
+
+
+def _write_samples(
+    recording: TrackSamples, runs: Runs, run: IntArray, time: FloatArray, at: IntArray, out: Samples
+) -> None:
+    """As `sample_runs`, into the rows `at` (G,) of `out`."""
     _sample(
         recording.time,
         recording.centers,
@@ -48,11 +56,11 @@ def sample_runs(recording: TrackSamples, runs: Runs, run: IntArray, time: FloatA
         run,
         time,
         recording.period,
+        at,
         out.poses,
         out.velocities,
         out.heights,
     )
-    return out
 
 
 @kernel
@@ -66,13 +74,14 @@ def _sample(
     runs: IntArray,
     times: FloatArray,
     period: float,
+    at: IntArray,
     out_poses: FloatArray,
     out_velocities: FloatArray,
     out_heights: FloatArray,
 ) -> None:
-    """Write boxes at times (G,) of runs (G,); rows are as in `TrackSamples`."""
-    for index in range(len(times)):
-        run, time = runs[index], times[index]
+    """Write boxes at times (G,) of runs (G,) to rows `at`; the others are as in `TrackSamples`."""
+    for number in range(len(times)):
+        run, time, index = runs[number], times[number], at[number]
         first, last = firsts[run], lasts[run]
         row = first + np.searchsorted(row_time[first : last + 1], time + _EPS, side="right") - 1
         row = min(max(row, first), max(last - 1, first))
@@ -128,27 +137,23 @@ def resample(
     kept = np.flatnonzero(last >= first)
     kept = kept[np.lexsort((kept, first[kept]))]  # tracks in the order of appearance
     kinds = recording.kinds[runs.track[kept]]
-    tracks = Tracks(
-        np.zeros((num_rows, len(kept)), np.bool_),
-        np.full((num_rows, len(kept), 3), np.nan),
-        np.full((num_rows, len(kept), 2), np.nan),
-        np.full((num_rows, len(kept), 2), np.nan),
-        kinds,
-        tuple(run_token(recording, runs, run) for run in kept.tolist()),
-    )
+    shape = num_rows, len(kept)
+    valid = np.zeros(shape, np.bool_)
+    out = Samples(np.full((*shape, 3), np.nan), np.full((*shape, 2), np.nan), np.empty(shape))
+    flat = Samples(out.poses.reshape(-1, 3), out.velocities.reshape(-1, 2), out.heights.ravel())
     for start in range(-padding, num_rows - padding, _BLOCK_ROWS):  # more would need more memory
         low = np.maximum(first[kept], start)
         counts = np.maximum(np.minimum(last[kept] + 1, start + _BLOCK_ROWS) - low, 0)
         column = np.repeat(np.arange(len(kept)), counts)
         row = np.arange(len(column)) + np.repeat(low - np.cumsum(counts) + counts, counts)
-        samples = sample_runs(recording, runs, kept[column], row * ROW_S)
-        samples.poses[:, :2] += offset
-        samples.velocities[kinds[column] > LAST_AGENT_KIND] = np.nan
-        here = row + padding, column
-        tracks.valid[here] = True
-        tracks.poses[here] = samples.poses
-        tracks.velocities[here] = samples.velocities
-        tracks.sizes[here] = recording.sizes[runs.track[kept[column]], :2]
+        at = (row + padding) * len(kept) + column
+        valid.ravel()[at] = True
+        _write_samples(recording, runs, kept[column], row * ROW_S, at, flat)
+    out.poses[..., :2] += offset
+    out.velocities[:, kinds > LAST_AGENT_KIND] = np.nan
+    sizes = np.where(valid[..., None], recording.sizes[runs.track[kept], :2], np.nan)
+    tokens = tuple(run_token(recording, runs, run) for run in kept.tolist())
+    tracks = Tracks(valid, out.poses, out.velocities, sizes, kinds, tokens)
     times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
 

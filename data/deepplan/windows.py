@@ -19,7 +19,7 @@ from shiftsim.world.ranges import SETTINGS
 
 ROW_S = 0.05  # s between rows of a converted recording
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
-LANE, ROUTE = "lane", "route"
+LANE, ROUTE, GAP = "lane", "route", "route with a gap"
 _EPS = 1e-9  # s
 
 

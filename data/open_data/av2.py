@@ -7,6 +7,7 @@ stored velocities are taken, except those of tracks that they contradict through
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.map import build_lane_map
-from shiftsim.data.lanes.pieces import LanePiece, MapSource, clean_line
-from shiftsim.data.open_data.scenes import REPAIR, Scene
-from shiftsim.data.open_data.tables import naming, numbers, read_columns
+from shiftsim.data.lanes.pieces import LanePiece, MapSource
+from shiftsim.data.open_data.scenes import Scene
+from shiftsim.data.open_data.source import Source, find_below, text_or_none
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.errors import ConversionError
-from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind
 
 # by type: what nuPlan calls it, length and width [m]
@@ -70,13 +68,8 @@ class Av2Reader:
 
     def find(self, folder: Path) -> list[Path]:
         """Parquet files of the scenes, sorted."""
-        found = sorted(folder.rglob("scenario_*.parquet"))
-        if not found:
-            raise ConversionError(
-                f"{folder}: no scenario_*.parquet below it",
-                "give a folder of the motion-forecasting data set, such as val/",
-            )
-        return found
+        hint = "give a folder of the motion-forecasting data set, such as val/"
+        return find_below(folder, "scenario_*.parquet", hint)
 
     def files(self, path: Path) -> list[Path]:
         """The tracks and the map."""
@@ -85,12 +78,12 @@ class Av2Reader:
 
     def read(self, path: Path) -> Scene:
         """One scene."""
-        path, map_path = self.files(path)
+        tracks, road = map(Source, self.files(path))
         name = path.stem.removeprefix("scenario_")
-        with naming(path):
-            samples = _read_tracks(path)
-        with naming(map_path):
-            lanes = build_lane_map(read_map(map_path, f"av2-{name}"))
+        with tracks.naming():
+            samples = _read_tracks(tracks)
+        with road.naming():
+            lanes = build_lane_map(_read_map(road, f"av2-{name}"))
         return Scene(
             samples=samples,
             map=lanes,
@@ -100,26 +93,25 @@ class Av2Reader:
         )
 
 
-def _read_tracks(path: Path) -> TrackSamples:
-    table = read_columns(path, _COLUMNS, REPAIR)
+def _read_tracks(source: Source) -> TrackSamples:
+    table = source.columns(_COLUMNS)
     if not len(table):
-        raise ConversionError(f"{path}: no rows", REPAIR)
+        raise source.fault("no rows")
     if pc.all(table["observed"]).as_py():
-        raise ConversionError(
-            f"{path}: holds the observed 5 s only", "convert train or val; test hides the future"
+        raise source.fault(
+            "holds the observed 5 s only", "convert train or val; test hides the future"
         )
-    start_us = round(float(numbers(table, "start_timestamp", "time_ns", path)[0]) / 1000.0)
+    start_us = round(float(source.numbers(table, "start_timestamp", "time_ns")[0]) / 1000.0)
     city = str(table["city"][0].as_py())
     table = table.filter(pc.not_equal(table["object_type"], _LEFT_OUT))
     encoded = pc.dictionary_encode(table["object_type"].combine_chunks())
     types = [str(name) for name in encoded.dictionary.to_pylist()]
-    unknown = sorted(set(types) - set(TYPES))
-    if unknown:
-        what = f"{path}: column 'object_type' holds {unknown[0]!r}"
-        raise ConversionError(what, f"known are: {', '.join(TYPES)}")
+    if unknown := sorted(set(types) - set(TYPES)):
+        what = f"column 'object_type' holds {unknown[0]!r}"
+        raise source.fault(what, f"known are: {', '.join(TYPES)}")
     sizes = np.array([TYPES[name][1:] for name in types])
-    read = {name: numbers(table, name, field, path) for name, field in _MOTION.items()}
-    step = numbers(table, "timestep", "step", path).astype(np.int64)
+    read = {name: source.numbers(table, name, field) for name, field in _MOTION.items()}
+    step = source.numbers(table, "timestep", "step").astype(np.int64)
     category = encoded.indices.to_numpy().astype(np.int64)
     return make_samples(
         city,
@@ -135,70 +127,55 @@ def _read_tracks(path: Path) -> TrackSamples:
     )
 
 
-def read_map(path: Path, name: str) -> MapSource:
-    """The map of a scene: what its `log_map_archive_*.json` says.
-
-    Raises:
-        ConversionError: The file is missing or broken.
-    """
+def _read_map(source: Source, name: str) -> MapSource:
+    """The map of a scene: what its `log_map_archive_*.json` says."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConversionError(f"{path}: more than {_MAX_BYTES} bytes", REPAIR)
-        found = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError as error:
-        raise ConversionError(f"{path} is missing", "copy the map beside the tracks") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConversionError(f"{path}: not readable as JSON ({error})", REPAIR) from error
-    try:
+        found = json.loads(source.content(_MAX_BYTES))
         return MapSource(
             name=name,
             pieces=[
-                _piece(item, f"{path}: lane_segments {key!r}")
+                _piece(source, item, f"lane_segments {key!r}")
                 for key, item in found["lane_segments"].items()
                 if item["lane_type"] != "BIKE"  # they double the connectors of vehicles
             ],
             drivable_areas=[
-                largest_part(shapely.Polygon(_line(item, "area_boundary", f"{path}: {key!r}", 3)))
+                _area(source, f"drivable_areas {key!r}", item["area_boundary"])
                 for key, item in found["drivable_areas"].items()
             ],
             crosswalks=[
-                _crosswalk(item, f"{path}: pedestrian_crossings {key!r}")
+                _area(source, f"crossing {key!r}", [*item["edge1"], *item["edge2"][::-1]])
                 for key, item in found["pedestrian_crossings"].items()
             ],
         )
+    except json.JSONDecodeError as error:
+        raise source.fault(f"not readable as JSON ({error})") from error
     except KeyError as error:
-        raise ConversionError(f"{path}: {error.args[0]!r} is missing", REPAIR) from error
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ConversionError(f"{path}: a value has the wrong type ({error})", REPAIR) from error
+        raise source.fault(f"{error.args[0]!r} is missing") from error
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise source.fault(f"a value has the wrong type ({error})") from error
 
 
-def _piece(item: dict[str, Any], where: str) -> LanePiece:
-    center = item.get("centerline")  # the data set of sensors has none
+def _piece(source: Source, item: dict[str, Any], place: str) -> LanePiece:
+    lines = {
+        key: source.line(_points(item[key]), f"{place}: {key!r}")
+        for key in ("left_lane_boundary", "right_lane_boundary", "centerline")
+        if key != "centerline" or item.get(key) is not None  # the data set of sensors has none
+    }
     return LanePiece(
         id=str(item["id"]),
-        left=_line(item, "left_lane_boundary", where, 2),
-        right=_line(item, "right_lane_boundary", where, 2),
-        center=None if center is None else _line(item, "centerline", where, 2),
+        left=lines["left_lane_boundary"],
+        right=lines["right_lane_boundary"],
+        center=lines.get("centerline"),
         successors=tuple(map(str, item["successors"])),
-        left_neighbor=_name(item.get("left_neighbor_id")),
-        right_neighbor=_name(item.get("right_neighbor_id")),
+        left_neighbor=text_or_none(item.get("left_neighbor_id")),
+        right_neighbor=text_or_none(item.get("right_neighbor_id")),
         is_connector=bool(item["is_intersection"]),
     )
 
 
-def _name(value: Any) -> str | None:
-    return None if value is None else str(value)
+def _area(source: Source, place: str, points: Sequence[Any]) -> shapely.Polygon:
+    return largest_part(shapely.Polygon(source.line(_points(points), place, least=3)))
 
 
-def _crosswalk(item: dict[str, Any], where: str) -> shapely.Polygon:
-    first, second = (_line(item, edge, where, 2) for edge in ("edge1", "edge2"))
-    return largest_part(shapely.Polygon(np.concatenate([first, second[::-1]])))
-
-
-def _line(item: dict[str, Any], key: str, where: str, least: int) -> FloatArray:
-    """(K, 2) a list of points of a map."""
-    points = np.array([(point["x"], point["y"]) for point in item[key]], np.float64)
-    if len(points) < least:
-        raise ConversionError(f"{where}: {key!r} has {len(points)} points", REPAIR)
-    require(OPEN_DATA, "position", points, f"{where}: {key!r} as", error=ConversionError)
-    return clean_line(points)
+def _points(found: Sequence[Any]) -> list[tuple[float, float]]:
+    return [(point["x"], point["y"]) for point in found]

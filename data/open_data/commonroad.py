@@ -16,15 +16,13 @@ from lxml import etree
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.map import build_lane_map
-from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, clean_line
-from shiftsim.data.open_data.scenes import REPAIR, LightStates, Scene
-from shiftsim.data.open_data.tables import naming
+from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea
+from shiftsim.data.open_data.scenes import LightStates, Scene
+from shiftsim.data.open_data.source import Source, find_below
 from shiftsim.data.opendrive.areas import drivable_tiles
 from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.errors import ConversionError
-from shiftsim.world.ranges import OPEN_DATA, require
 from shiftsim.world.state import AgentKind, LightStatus
 
 VERSIONS = ("2018b", "2020a")
@@ -45,73 +43,14 @@ _COLORS |= {"redYellow": LightStatus.RED}
 _LIGHT_STOP, _OTHER_STOP = 2, 5  # types of stop polygons
 _MAX_BYTES = 500_000_000
 _MAX_STEPS = 1_000_000
-
-
-class CommonRoadReader:
-    """CommonRoad; a scene is named by its file."""
-
-    def find(self, folder: Path) -> list[Path]:
-        """XML files, sorted."""
-        found = [folder] if folder.is_file() else sorted(folder.rglob("*.xml"))
-        if not found:
-            what = f"{folder}: no .xml file below it"
-            raise ConversionError(what, "give a folder of CommonRoad scenarios in XML")
-        return found
-
-    def files(self, path: Path) -> list[Path]:
-        """The file itself."""
-        return [path]
-
-    def read(self, path: Path) -> Scene:
-        """One scene."""
-        root = _parse(path)
-        file = _File(path, root)
-        name = root.get("benchmarkID") or path.stem
-        step_s = file.number(root.get("timeStepSize", ""), "step length", "'timeStepSize'")
-        with naming(path):
-            lanes = build_lane_map(file.map(f"commonroad-{name}"))
-            samples = file.tracks(step_s)
-        warnings = {**samples.warnings, **file.warnings}
-        return Scene(
-            samples=replace(samples, warnings=warnings),
-            map=lanes,
-            egos=None,
-            lights=file.lights(step_s, samples.duration),
-            metadata={
-                "source": f"CommonRoad {name}: {root.get('source', 'unknown')}",
-                "licence": "that of the source",
-                "author": root.get("author", ""),
-            },
-        )
-
-
-def _parse(path: Path) -> Any:
-    """The root of a file. Entities and document types are refused."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConversionError(f"{path}: more than {_MAX_BYTES} bytes", "split the scenario")
-        parser = etree.XMLParser(
-            resolve_entities=False,
-            no_network=True,
-            load_dtd=False,
-            huge_tree=False,
-            remove_comments=True,
-            remove_pis=True,
-        )
-        root = etree.fromstring(path.read_bytes(), parser)
-    except OSError as error:
-        raise ConversionError(f"{path}: cannot be read ({error})", REPAIR) from error
-    except (etree.XMLSyntaxError, ValueError) as error:
-        raise ConversionError(f"{path}: not well-formed XML ({error})", REPAIR) from error
-    if root.getroottree().docinfo.doctype:
-        raise ConversionError(f"{path}: has a DOCTYPE", "remove it and its entities")
-    if root.tag != "commonRoad" or root.get("commonRoadVersion") not in VERSIONS:
-        found = f"<{root.tag} commonRoadVersion={root.get('commonRoadVersion')!r}>"
-        raise ConversionError(
-            f"{path}: begins with {found}, need commonRoad of {' or '.join(VERSIONS)}",
-            "write it again with a current commonroad-io, or leave it out",
-        )
-    return root
+_CONNECTORS = [f"intersection/incoming/successors{way}" for way in ("Right", "Straight", "Left")]
+_STATE = {  # field of `OPEN_DATA` by path
+    "time/exact": "step",
+    "position/point/x": "position",
+    "position/point/y": "position",
+    "orientation/exact": "heading",
+}
+_SPEED = "velocity/exact"
 
 
 class _Row(NamedTuple):
@@ -128,38 +67,85 @@ class _Row(NamedTuple):
     width: float
 
 
-class _File:
+class CommonRoadReader:
+    """CommonRoad; a scene is named by its file."""
+
+    def find(self, folder: Path) -> list[Path]:
+        """XML files, sorted."""
+        return find_below(folder, "*.xml", "give a folder of CommonRoad scenarios in XML")
+
+    def files(self, path: Path) -> list[Path]:
+        """The file itself."""
+        return [path]
+
+    def read(self, path: Path) -> Scene:
+        """One scene."""
+        file = _File(path)
+        name = file.root.get("benchmarkID") or path.stem
+        with file.naming():
+            lanes = build_lane_map(file.map(f"commonroad-{name}"))
+            samples = file.tracks()
+        warnings = {**samples.warnings, **file.warnings}
+        return Scene(
+            samples=replace(samples, warnings=warnings),
+            map=lanes,
+            egos=None,
+            lights=file.lights(samples.duration),
+            metadata={
+                "source": f"CommonRoad {name}: {file.root.get('source', 'unknown')}",
+                "licence": "that of the source",
+                "author": file.root.get("author", ""),
+            },
+        )
+
+
+class _File(Source):
     """What one file says."""
 
-    def __init__(self, path: Path, root: Any) -> None:
-        self.path, self.root = path, root
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.root = self._parse()
         self.warnings: Counter[str] = Counter()
+        self.step_s = self.number(
+            self.root.get("timeStepSize", ""), "step length", "'timeStepSize'"
+        )
 
-    def number(self, text: str | None, field: str, place: str) -> float:
-        """A number in the range of its field.
-
-        Raises:
-            ConversionError: It is missing, no number, or beyond.
-        """
+    def _parse(self) -> Any:
+        """The root. Entities and document types are refused."""
+        parser = etree.XMLParser(
+            resolve_entities=False,
+            no_network=True,
+            load_dtd=False,
+            huge_tree=False,
+            remove_comments=True,
+            remove_pis=True,
+        )
         try:
-            value = float(text or "")
-        except ValueError:
-            what = f"{self.path}: {place} is {text!r}, need a number"
-            raise ConversionError(what, REPAIR) from None
-        require(OPEN_DATA, field, value, f"{self.path}: {place} as", error=ConversionError)
-        return value
+            root = etree.fromstring(self.content(_MAX_BYTES), parser)
+        except (etree.XMLSyntaxError, ValueError) as error:
+            raise self.fault(f"not well-formed XML ({error})") from error
+        if root.getroottree().docinfo.doctype:
+            raise self.fault("has a DOCTYPE", "remove it and its entities")
+        if root.tag != "commonRoad" or root.get("commonRoadVersion") not in VERSIONS:
+            found = f"<{root.tag} commonRoadVersion={root.get('commonRoadVersion')!r}>"
+            raise self.fault(
+                f"begins with {found}, need commonRoad of {' or '.join(VERSIONS)}",
+                "write it again with a current commonroad-io, or leave it out",
+            )
+        return root
 
-    def lights(self, step_s: float, duration: float) -> LightStates | None:
+    def _number(self, element: Any, path: str, field: str, place: str) -> float:
+        """The number at a path below an element."""
+        return self.number(element.findtext(path), field, f"{place}: {path!r}")
+
+    def lights(self, duration: float) -> LightStates | None:
         """States of all lights with a cycle, a row per step."""
-        steps = np.arange(min(round(duration / step_s), _MAX_STEPS) + 1)
+        steps = np.arange(min(round(duration / self.step_s), _MAX_STEPS) + 1)
         columns = {}
         for light in self.root.iterfind("trafficLight"):
             place = f"trafficLight {light.get('id')!r}"
             elements = light.findall("cycle/cycleElement")
-            lengths = [
-                self.number(e.findtext("duration"), "step", f"{place}: 'duration'")
-                for e in elements
-            ]
+            lengths = [self._number(e, "duration", "step", place) for e in elements]
             if not lengths or min(lengths) < 0 or not sum(lengths):
                 continue
             colors = [_COLORS.get(e.findtext("color"), LightStatus.UNKNOWN) for e in elements]
@@ -170,51 +156,51 @@ class _File:
             ]
         if not columns:
             return None
-        time_us = np.rint(steps * step_s * 1e6).astype(np.int64)
+        time_us = np.rint(steps * self.step_s * 1e6).astype(np.int64)
         return LightStates(tuple(columns), time_us, np.stack(list(columns.values()), axis=1))
 
     def map(self, name: str) -> MapSource:
         """The lanelets and what belongs to them."""
         limits = self._sign_limits()
-        paths = "successorsRight", "successorsStraight", "successorsLeft"
-        inside = {r for p in paths for r in _refs(self.root, f"intersection/incoming/{p}")}
-        pieces, crosswalks, car_parks, paved = [], [], [], []
+        inside = {ref for path in _CONNECTORS for ref in _refs(self.root, path)}
+        areas: dict[str, list[shapely.Polygon]] = {"crosswalk": [], "parking": [], "paved": []}
+        pieces: list[LanePiece] = []
         stops: list[StopArea] = []
         for lanelet in self.root.iterfind("lanelet"):
-            piece = self._piece(lanelet, inside, limits)
             types = {(e.text or "").strip() for e in lanelet.iterfind("laneletType")}
-            if "crosswalk" in types:
-                crosswalks.append(piece.polygon)
-            if "parking" in types:
-                car_parks.append(piece.polygon)
-            if not types & _UNPAVED:
-                paved.append(piece.polygon)
+            piece = self._piece(lanelet, inside, limits)
+            for kind in (types if types & _UNPAVED else types | {"paved"}) & areas.keys():
+                areas[kind].append(piece.polygon)
             if not types & _NO_LANES:
                 pieces.append(piece)
                 stops += self._stop_areas(lanelet, piece)
-        paved = drivable_tiles(paved)
-        return MapSource(name, pieces, paved, stops, crosswalks, (), car_parks)
+        return MapSource(
+            name=name,
+            pieces=pieces,
+            drivable_areas=drivable_tiles(areas["paved"]),
+            stop_areas=stops,
+            crosswalks=areas["crosswalk"],
+            car_parks=areas["parking"],
+        )
 
     def _sign_limits(self) -> dict[str, float]:
         """Speed limit by traffic sign [m/s]."""
-        out = {}
-        for sign in self.root.iterfind("trafficSign"):
-            for element in sign.iterfind("trafficSignElement"):
-                value = element.findtext("additionalValue")
-                if value and element.findtext("trafficSignID", "").startswith(_SPEED_SIGNS):
-                    place = f"trafficSign {sign.get('id')!r}: 'additionalValue'"
-                    out[sign.get("id", "")] = self.number(value, "speed limit", place)
-        return out
+        return {
+            sign.get("id", ""): self._number(
+                element, "additionalValue", "speed limit", f"trafficSign {sign.get('id')!r}"
+            )
+            for sign in self.root.iterfind("trafficSign")
+            for element in sign.iterfind("trafficSignElement")
+            if element.findtext("additionalValue")
+            and element.findtext("trafficSignID", "").startswith(_SPEED_SIGNS)
+        }
 
     def _piece(self, lanelet: Any, inside: set[str], limits: dict[str, float]) -> LanePiece:
         name = lanelet.get("id", "")
-        neighbors = {
-            side: next(
-                (e.get("ref") for e in lanelet.iterfind(side) if e.get("drivingDir") == "same"),
-                None,
-            )
+        left, right = (
+            next(iter(_refs(lanelet, f"{side}[@drivingDir='same']")), None)
             for side in ("adjacentLeft", "adjacentRight")
-        }
+        )
         own = [
             self.number(e.text, "speed limit", f"lanelet {name!r}: 'speedLimit'")
             for e in lanelet.iterfind("speedLimit")
@@ -222,33 +208,33 @@ class _File:
         own += [limits[ref] for ref in _refs(lanelet, "trafficSignRef") if ref in limits]
         return LanePiece(
             id=name,
-            left=self._line(lanelet, "leftBound", name),
-            right=self._line(lanelet, "rightBound", name),
+            left=self._border(lanelet, "leftBound", name),
+            right=self._border(lanelet, "rightBound", name),
             successors=tuple(_refs(lanelet, "successor")),
-            left_neighbor=neighbors["adjacentLeft"],
-            right_neighbor=neighbors["adjacentRight"],
+            left_neighbor=left,
+            right_neighbor=right,
             is_connector=name in inside
             or any(e.text == "intersection" for e in lanelet.iterfind("laneletType")),
             speed_limit=min(own, default=None),
             light=next(iter(_refs(lanelet, "trafficLightRef")), None),
         )
 
-    def _line(self, element: Any, tag: str, name: str) -> FloatArray:
+    def _border(self, lanelet: Any, tag: str, name: str) -> FloatArray:
         """(K, 2) a line of a lanelet."""
         place = f"lanelet {name!r}: {tag!r}"
         points = [
             [self.number(point.findtext(axis), "position", place) for axis in "xy"]
-            for point in element.iterfind(f"{tag}/point")
+            for point in lanelet.iterfind(f"{tag}/point")
         ]
-        line = clean_line(np.array(points, np.float64).reshape(-1, 2))
+        line = self.line(points, place)
         if len(line) < 2:
-            raise ConversionError(f"{self.path}: {place} has fewer than two points", REPAIR)
+            raise self.fault(f"{place} has no length")
         return line
 
     def _stop_areas(self, lanelet: Any, piece: LanePiece) -> Iterator[StopArea]:
         for line in lanelet.iterfind("stopLine"):
             if len(line.findall("point")) >= 2:
-                ends = self._line(lanelet, "stopLine", piece.id)[:2]
+                ends = self._border(lanelet, "stopLine", piece.id)[:2]
             else:
                 ends = np.stack([piece.left[-1], piece.right[-1]])
             step = piece.middle[-2] - piece.middle[-1]
@@ -258,26 +244,23 @@ class _File:
             if isinstance(polygon, shapely.Polygon) and polygon.area > 0:
                 yield StopArea(polygon, kind, piece.id)
 
-    def tracks(self, step_s: float) -> TrackSamples:
+    def tracks(self) -> TrackSamples:
         """All obstacles whose states are exact; the others are counted."""
-        rows = [row for obstacle in self._obstacles() for row in self._rows(obstacle)]
-        still = {
-            row.id: row for obstacle in self._obstacles("static") for row in self._rows(obstacle)
-        }
+        rows = [row for obstacle in self._obstacles("dynamic") for row in self._rows(obstacle)]
         if not rows:
-            what = f"{self.path}: no dynamic obstacle with a trajectory of exact states"
-            raise ConversionError(what, "leave the file out")
-        steps = range(int(min(r.step for r in rows)), int(max(r.step for r in rows)) + 1)
-        if len(steps) > _MAX_STEPS:
-            raise ConversionError(f"{self.path}: {len(steps)} time steps", "split the scenario")
-        rows += [row._replace(step=step) for row in still.values() for step in steps]
+            raise self.fault("no dynamic obstacle with a trajectory of exact states")
+        every = range(int(min(row.step for row in rows)), int(max(row.step for row in rows)) + 1)
+        if len(every) > _MAX_STEPS:
+            raise self.fault(f"{len(every)} time steps", "split the scenario")
+        still = {row.id: row for one in self._obstacles("static") for row in self._rows(one)}
+        rows += [row._replace(step=step) for row in still.values() for step in every]
         ids, names, *values = zip(*rows, strict=True)
         step, x, y, heading, speed, length, width = np.array(values)
         categories = sorted(set(names))
         along = np.column_stack([np.cos(heading), np.sin(heading)])
         return make_samples(
             "tracks",
-            time_us=np.rint(step * step_s * 1e6).astype(np.int64),
+            time_us=np.rint(step * self.step_s * 1e6).astype(np.int64),
             ids=np.array(ids),
             category=np.array([categories.index(name) for name in names], np.int64),
             categories=categories,
@@ -288,11 +271,9 @@ class _File:
             kind_of={n: _KINDS.get(n, AgentKind.GENERIC_OBJECT) for n in categories},
         )
 
-    def _obstacles(self, role: str = "dynamic") -> Iterator[Any]:
+    def _obstacles(self, role: str) -> Iterator[Any]:
         yield from self.root.iterfind(f"{role}Obstacle")
-        for obstacle in self.root.iterfind("obstacle"):  # 2018b
-            if obstacle.findtext("role") == role:
-                yield obstacle
+        yield from self.root.iterfind(f"obstacle[role='{role}']")  # 2018b
 
     def _rows(self, obstacle: Any) -> Iterator[_Row]:
         name = obstacle.get("id", "")
@@ -301,25 +282,19 @@ class _File:
         if box is None:
             self.warnings["obstacle that is no rectangle, left out"] += 1
             return
-        size = [
-            self.number(box.findtext(n), "size", f"{place}: {n!r}") for n in ("length", "width")
-        ]
+        length, width = (self._number(box, n, "size", place) for n in ("length", "width"))
         category = (obstacle.findtext("type") or "unknown").strip()
         for state in (*obstacle.iterfind("initialState"), *obstacle.iterfind("trajectory/state")):
-            paths = {"position/point/x": "position", "position/point/y": "position"}
-            paths |= {"orientation/exact": "heading", "time/exact": "step"}
-            if any(state.find(path) is None for path in paths):
+            if any(state.find(path) is None for path in _STATE):
                 self.warnings["state that is not exact, left out"] += 1
                 continue
-            x, y, heading, step = (
-                self.number(state.findtext(path), field, f"{place}: {path!r}")
-                for path, field in paths.items()
+            step, x, y, heading = (
+                self._number(state, path, field, place) for path, field in _STATE.items()
             )
-            speed = state.findtext("velocity/exact")
-            speed_mps = np.nan
-            if speed is not None:
-                speed_mps = self.number(speed, "velocity", f"{place}: 'velocity'")
-            yield _Row(name, category, step, x, y, heading, speed_mps, *size)
+            speed = np.nan
+            if state.find(_SPEED) is not None:
+                speed = self._number(state, _SPEED, "velocity", place)
+            yield _Row(name, category, step, x, y, heading, speed, length, width)
 
 
 def _refs(element: Any, path: str) -> list[str]:

@@ -32,7 +32,6 @@ from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import TrafficLights
 
-REPAIR = "get the file again from its source, or leave the scene out"
 _SAVE_EVERY = 1000  # scenes; what is saved is not converted again
 _NOT_LISTED = -1
 # a recording car is an ego whatever it does, also standing

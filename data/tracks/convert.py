@@ -15,6 +15,7 @@ from shiftsim.data.deepplan.parts import alone_in
 from shiftsim.data.deepplan.recording import Converted, RecordingSummary
 from shiftsim.data.deepplan.windows import (
     CATEGORY,
+    GAP,
     LANE,
     OVERLAP,
     PRESENCE,
@@ -48,6 +49,7 @@ _REMEDIES = {
     " file twice",
     LANE: "egos start beside the lanes or against them: look at the picture",
     ROUTE: "egos touch no road of the map: look at the picture",
+    GAP: "egos change between roads that the map does not link: add the links to the map",
 }
 
 

@@ -22,12 +22,15 @@ _MAX_SPEED = 60.0  # m/s, of 95 % of the vehicles' rows
 _LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
 _MOVING = 1.0  # m/s
 _MAX_GAP = 1.0  # s without a row of any object
+_MAX_PAUSE = 3600.0  # s without a row of any object within one recording
 _LEAST_OBJECTS = 5  # that begin at once
 _MAX_SPAN = 1e5  # s from the first row to the last one
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
 _LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
+_LONGEST_WALKER = 2.0  # m, median of pedestrians
+_ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving vehicles' rows
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
 
@@ -77,6 +80,7 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
             f" limit of their lane or faster, usual is less than {_MAX_OVERSPEED:g}",
             "check --hz or the unit of time, unless the limits of the map are wrong",
         )
+    _check_accelerations(motion, out)
     _check_sizes(motion, out)
     check_headings(motion, fit, out)
     check_velocities(motion, fit, out)
@@ -137,7 +141,15 @@ def _check_gaps(table: TrackTable, out: Doubts) -> None:
     stamps, _ = numbered(table.time_us)
     gaps = np.flatnonzero(np.diff(stamps) > _MAX_GAP * 1e6)
     if len(gaps):
-        begin, end = (stamps[gaps[0] : gaps[0] + 2] - stamps[0]) / 1e6
+        first = gaps[np.diff(stamps)[gaps].argmax()]
+        begin, end = (stamps[first : first + 2] - stamps[0]) / 1e6
+        if end - begin > _MAX_PAUSE:
+            out.say(
+                f"no object has a row between {begin:g} s and {end:g} s, at most {_MAX_PAUSE:g} s",
+                "if the clock begins anew at midnight, add a day to the times after it; if two"
+                " recordings were joined, convert each by itself",
+            )
+            return
         out.note(
             f"no object has a row between {begin:g} s and {end:g} s ({len(gaps)} such gaps of more"
             f" than {_MAX_GAP:g} s)",
@@ -227,6 +239,27 @@ def _check_speeds(motion: Motion, out: Doubts) -> bool:
     return True
 
 
+def _check_accelerations(motion: Motion, out: Doubts) -> None:
+    """Along and across, over half a second: three times too fast they are nine times as large."""
+    track, time = motion.table.track, motion.time
+    rows = motion.rows(FAST)
+    after = np.minimum(rows + max(1, round(_ACCELERATION_S / motion.period)), len(time) - 1)
+    used = (track[after] == track[rows]) & (time[after] > time[rows])
+    used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, motion.period)
+    rows, after = rows[used], after[used]
+    if not len(rows):
+        return
+    change = motion.derived[after] - motion.derived[rows]
+    usual = float(np.median(np.hypot(*change.T) / (time[after] - time[rows])))
+    out.figures["acceleration_mps2"] = usual
+    if usual > _MAX_ACCELERATION:
+        out.say(
+            f"moving vehicles accelerate, brake and turn with {usual:.2g} m/s² in the middle of"
+            f" {len(rows)} rows, at most {_MAX_ACCELERATION:g} m/s²",
+            "check --hz or the unit of time; positions that jitter need smoothing",
+        )
+
+
 def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Doubts) -> None:
     if fit.is_good:
         return
@@ -285,6 +318,15 @@ def _check_sizes(motion: Motion, out: Doubts) -> None:
         out.say(
             "all lengths and widths are negative",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
+        )
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
+    lengths = sizes[np.array(walks, np.bool_)[motion.table.category], 0]
+    lengths = lengths[lengths > 0.0]
+    if len(lengths) and np.median(lengths) > _LONGEST_WALKER:
+        out.say(
+            f"the median pedestrian is {np.median(lengths):.3g} m long, at most"
+            f" {_LONGEST_WALKER:g} m",
+            "check the column of kinds; or leave sizes that are not known empty",
         )
     if motion.vehicle_size is None:
         return

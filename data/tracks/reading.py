@@ -22,6 +22,7 @@ from shiftsim.world.ranges import OPEN_DATA, require
 
 _REPAIR = "repair the file, or name other columns with --columns"
 _DELIMITERS = ",;\t|"
+_BLOCK_BYTES = 1 << 22  # that are parsed at once
 _FIELDS = {"x": "position", "y": "position", "heading": "heading"}  # what nothing can make up for
 
 
@@ -134,7 +135,8 @@ def _csv_options(path: Path) -> tuple[pc.ReadOptions, pc.ParseOptions, str]:
         raise ConversionError(f"{path} is empty", "export the tracks again")
     delimiter = max(_DELIMITERS, key=lines[0].count)
     point = "," if delimiter != "," and "," in lines[-1] and "." not in lines[-1] else "."
-    return pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter), point
+    read = pc.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
+    return read, pc.ParseOptions(delimiter=delimiter), point
 
 
 def _names(path: Path, options: Any) -> list[str]:
@@ -191,12 +193,13 @@ def _numbers(table: pa.Table, role: str, columns: Columns, path: Path) -> FloatA
     except (pa.ArrowException, ValueError) as error:
         what = f"{path}: column {column.name!r} is {table[column.name].type}, need numbers"
         raise ConversionError(what, _REPAIR) from error
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad) and role in ("x", "y", "heading"):
+    needed = role in ("x", "y", "heading")
+    bad = np.flatnonzero(~np.isfinite(values) if needed else np.isinf(values))
+    if len(bad):
         raise ConversionError(
-            f"{path}: column {column.name!r} holds {len(bad)} values that are empty or not finite,"
-            f" the first in data row {bad[0] + 1}",
-            "leave these rows out of the file",
+            f"{path}: column {column.name!r} holds {len(bad)} values that are"
+            f" {'empty or ' * needed}not finite, the first in data row {bad[0] + 1}",
+            f"leave these {'rows out of the file' if needed else 'values empty'}",
         )
     values *= column.factor(role)
     if role in _FIELDS:

@@ -347,9 +347,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     debug = "--debug" in words
     # imports make a hundred thousand objects that stay: looking for garbage among them while they
     # are made, and once more at the end, takes a quarter of the time of a short command
+    looks, before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
     gc.set_threshold(_FEW_LOOKS)
     atexit.register(gc.freeze)
-    before = signal.getsignal(signal.SIGINT)
     if callable(before):  # else it is ignored, as in the background of a shell
         signal.signal(signal.SIGINT, _Interrupt())
     sys.unraisablehook = _raised_nowhere
@@ -361,6 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     finally:
         signal.signal(signal.SIGINT, before)
         sys.unraisablehook = sys.__unraisablehook__
+        gc.set_threshold(*looks)
     sys.exit(code)
 
 

@@ -11,6 +11,8 @@ from track_files import export_town, write_tracks
 
 from shiftsim.cli import main
 from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.lanes.map import build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.store.check import check_store
@@ -265,3 +267,34 @@ def test_the_command_says_why_no_scenario_is_left(town, tmp_path, capsys):
     assert "no scenario is left" in err
     assert "presence" in err
     assert "--window-s" in err
+
+
+def test_the_rows_that_have_a_size_tell_that_of_the_track(town):
+    sizes = {name: town[0][name].copy() for name in ("length_m", "width_m")}
+    sizes["length_m"][::2] = np.nan
+    sizes["width_m"][1::4] = 0.0
+    np.testing.assert_array_equal(_samples(town[0], **sizes).sizes, _samples(town[0]).sizes)
+    sizes["length_m"][:] = np.nan
+    assert set(_samples(town[0], **sizes).sizes[:, 0].tolist()) == {4.6, 1.8, 0.7}
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_change_between_roads_that_are_not_linked_leaves_no_scenario(beside):
+    line = np.array([[0.0, 0.0], [300.0, 0.0]])
+    borders = [line + np.array([0.0, y]) for y in (7.0, 3.5, 0.0)]
+    left = LanePiece("left", borders[0], borders[1], right_neighbor="right" if beside else None)
+    right = LanePiece("right", borders[1], borders[2], left_neighbor="left" if beside else None)
+    road = build_lane_map(MapSource("two", [left, right])).road
+    time = np.arange(0, 20.0, 0.05)
+    y = np.clip(1.75 + 0.5 * (time - 10.0), 1.75, 5.25)
+    samples = make_samples(
+        "one",
+        time_us=np.rint(time * 1e6).astype(np.int64),
+        ids=np.full(len(time), 1),
+        category=np.zeros(len(time), np.int64),
+        categories=["car"],
+        xy=np.column_stack([20.0 + 10.0 * time, y]),
+    )
+    made = make_scenarios(samples, road)
+    assert len(made.windows) == beside
+    assert made.summary.rejected == ({} if beside else {"route with a gap": 1})

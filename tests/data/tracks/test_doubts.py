@@ -264,10 +264,21 @@ def test_frames_per_second_that_contradict_the_velocities_are_named(town, tmp_pa
 def test_twice_the_speed_is_unusual_where_nothing_else_tells(town, tmp_path):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
-    found = _doubts(path, road, hz=50.0)
+    found = _doubts(path, road, hz=25.0)
     assert found.found == []
     assert "speed limit" in found.notes[0].what
     assert "--hz" in found.notes[0].remedy
+
+
+@pytest.mark.parametrize(("hz", "value"), [(37.5, 8.9), (50.0, 15)])
+def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
+    hz, value, town, tmp_path
+):
+    columns, road = town
+    path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
+    (found,) = _doubts(path, road, hz=hz).found
+    assert f"with {value} m/s²" in found.what
+    assert "--hz" in found.remedy
 
 
 def test_the_map_of_another_place_is_named(town, tmp_path):
@@ -284,6 +295,13 @@ def test_a_gap_in_the_recording_is_named(town, tmp_path):
     kept = (columns["time_s"] < 10.0) | (columns["time_s"] > 14.0)
     path = write_tracks(tmp_path / "t.csv", {n: v[kept] for n, v in columns.items()})
     assert "between 9.92 s and 14.08 s" in _doubts(path, road).notes[0].what
+
+
+def test_a_clock_that_begins_anew_at_midnight_is_named(town, tmp_path):
+    time = np.mod(town[0]["time_s"] + 86_390.0, 86_400.0)
+    found = _doubts(write_tracks(tmp_path / "t.csv", town[0], time_s=time, frame=None), town[1])
+    assert "no object has a row between" in found.found[0].what
+    assert "midnight" in found.found[0].remedy
 
 
 UNREADABLE = {
@@ -315,6 +333,25 @@ def test_places_that_are_no_numbers_are_named_with_their_row(value, town, tmp_pa
     x[100] = value
     with pytest.raises(ConversionError, match=r"'x_m' holds 1 values .* row 101"):
         read_tracks(write_tracks(tmp_path / "t.csv", town[0], x_m=x))
+
+
+@pytest.mark.parametrize("name", ["vx_mps", "length_m"])
+def test_an_infinite_speed_or_size_is_no_missing_one(name, town, tmp_path):
+    values = town[0][name].copy()
+    values[100] = np.inf
+    with pytest.raises(ConversionError, match=rf"'{name}' holds 1 values .* not finite.* row 101"):
+        read_tracks(write_tracks(tmp_path / "t.csv", town[0], **{name: values}))
+    values[100] = np.nan
+    table = read_tracks(write_tracks(tmp_path / "t.csv", town[0], **{name: values}))
+    kept = table.sizes if name == "length_m" else table.velocities
+    assert np.isnan(kept).sum() == 1
+
+
+def test_pedestrians_as_long_as_cars_are_named(town, tmp_path):
+    columns, road = town
+    length = np.maximum(columns["length_m"], 4.5)
+    (found,) = _doubts(write_tracks(tmp_path / "t.csv", columns, length_m=length), road).found
+    assert "the median pedestrian is 4.5 m long" in found.what
 
 
 def test_repeated_rows_are_named(town, tmp_path):
