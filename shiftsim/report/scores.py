@@ -175,8 +175,10 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
 
     Each with the key of that rollout, its `cls`, and the `reason` in words.
     """
-    keys = [("cls", "ascending"), *((name, "ascending") for name in Task._fields)]
-    ordered = run.scores.sort_by(keys)
+    is_noisy = pc.not_equal(run.scores["noise"], "none")
+    keys = ("cls", "token", "is_noisy", "planner", "noise", "seed")
+    scores = run.scores.append_column("is_noisy", is_noisy)
+    ordered = scores.sort_by([(key, "ascending") for key in keys])
     _, firsts = np.unique(ordered["token"].to_numpy(), return_index=True)
     rows = ordered.take(np.sort(firsts)[:count]).to_pylist()
     tokens = pa.array([row["token"] for row in rows], pa.string())

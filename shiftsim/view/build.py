@@ -99,7 +99,7 @@ class Gallery:
         Raises:
             ConfigError: There is none, or there are several.
         """
-        return beginning("the stored rollouts", "scenario", text, self._tokens)
+        return beginning("what is stored", "scenario", text, self._tokens)
 
     def tasks(self, token: str) -> list[Task]:
         """The rollouts that the page of a scenario shows.
@@ -249,7 +249,8 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
 
 
 def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return (row["cls"] or 0.0, row["token"], row["planner"], row["noise"], row["seed"])
+    key = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
+    return (row["cls"] or 0.0, row["token"], *key)
 
 
 def _what(violated: Mapping[str, float | None]) -> str:

@@ -454,7 +454,8 @@ function scoresOf(rollout) {
 
 function violationButton(violation, index) {
   const button = document.createElement("button");
-  button.textContent = `${violation.t.toFixed(1)} s  ${violation.words}`;
+  const words = violation.words.replace(/(\d) (?=m|s|rad)/g, "$1\u00a0"); // a number keeps its unit
+  button.textContent = `${violation.t.toFixed(1)}\u00a0s  ${words}`;
   const limit = violation.threshold === null ? "" : `, bound ${violation.threshold}`;
   button.title = `${violation.metric} (${violation.short})${limit}`;
   button.addEventListener("click", (event) => {

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
@@ -273,8 +274,8 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
 def _has_ffmpeg(writer: Any) -> bool:
     """Whether there is ffmpeg, the system's or that of the package imageio-ffmpeg."""
     if not writer.isAvailable() and find_spec("imageio_ffmpeg"):
-        from imageio_ffmpeg import get_ffmpeg_exe
         from matplotlib import rcParams
 
-        rcParams["animation.ffmpeg_path"] = get_ffmpeg_exe()
+        found = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+        rcParams["animation.ffmpeg_path"] = found
     return bool(writer.isAvailable())
