@@ -15,11 +15,20 @@ import numpy as np
 
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
+from shiftsim.sim.dynamics.lqr import TRACKED, raise_for_status
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
+from shiftsim.sim.execute import execute
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.plan_check import SHORT, find_fault, is_short, plain
+from shiftsim.sim.plan_check import (
+    GOOD,
+    SHORT,
+    Fault,
+    find_fault,
+    find_form_fault,
+    is_short,
+    plain,
+)
 from shiftsim.sim.planner import (
     BatchPlanner,
     Observation,
@@ -107,9 +116,11 @@ class Rollout:
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
         self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
-        self._noise = sample_noise(
+        self._is_tracked = planner is not None and setting.controller == "lqr"
+        noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
+        self._noise = plain(noise)
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
@@ -133,11 +144,18 @@ class Rollout:
         """
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
+        moves = iteration + 1 < self.num_samples
         if self.planner is not None:
-            plan = self._checked(plan)
-        if iteration + 1 < self.num_samples:
-            # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
-            self._move_ego(plan)
+            self._note_fallback()
+        # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
+        if self._is_tracked and isinstance(plan, Trajectory):
+            self._track(plan, moves)
+        else:
+            if self.planner is not None:
+                plan = self._checked(plan)
+            if moves:
+                self._move_ego(plan)
+        if moves:
             self._traffic.step(iteration, self._ego[row], self._tracks, row + 1)
         self.iteration += 1
         if not self.done and self._is_finished(row + 1):
@@ -169,19 +187,12 @@ class Rollout:
                 )
             command[:] = plan.acceleration, plan.steering_rate
             command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
-        elif isinstance(plan, Trajectory) and controller == "perfect":
-            follow_perfectly(plan, next_us, after)
         elif isinstance(plan, Trajectory):
-            times, states = plan.time_us, plan.states
-            status = track_and_step(
-                now_us, next_us, state, times, states, noise[0], noise[1], after, command
-            )
-            raise_for_status(status, now_us, times)
+            follow_perfectly(plan, next_us, after)
 
-    def _checked(self, plan: Any) -> Trajectory | Command:
-        """The plan in log time; its poses and whether it is a fallback are noted."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row], self._clock[row + 1]
+    def _note_fallback(self) -> None:
+        """Note whether the plan is a fallback by the planner's own account."""
+        iteration = self.iteration
         if reason := getattr(self.planner, "degraded", ""):
             if self.setting.strict:
                 raise PlannerError(
@@ -189,12 +200,45 @@ class Rollout:
                     hint="without --strict it continues, and the step is counted as degraded",
                 )
             self._degraded[iteration] = True
-        fault = find_fault(plan, now_us, next_us)
+
+    def _track(self, plan: Trajectory, moves: bool) -> None:
+        """Check a plan, note its poses, and let the tracker follow it."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._clock[row], self._clock[row + 1]
+        self._refuse(find_form_fault(plan))
+        times, states = plain(plan.time_us), plain(plan.states)
+        code, status = execute(
+            times,
+            states,
+            now_us if plan.relative else 0,
+            now_us,
+            next_us,
+            row,
+            iteration,
+            moves,
+            self._ego,
+            self._noise,
+            self._commands,
+            self._plans,
+        )
+        if code != GOOD:
+            self._refuse(find_fault(plan, now_us, next_us))
+        if status != TRACKED:
+            raise_for_status(status, now_us, plan.starting_at(now_us).time_us)
+        if iteration == 0:
+            self.is_short = is_short(plan)
+
+    def _refuse(self, fault: Fault | None) -> None:
         if fault is not None:
-            raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
+            where = f"iteration {self.iteration}"
+            raise InvalidTrajectoryError(f"{where}: {fault.message}", fault.hint)
+
+    def _checked(self, plan: Any) -> Trajectory | Command:
+        """The plan in log time; its poses are noted."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._clock[row], self._clock[row + 1]
+        self._refuse(find_fault(plan, now_us, next_us))
         if isinstance(plan, Trajectory):
-            if iteration == 0 and self.setting.controller == "lqr":
-                self.is_short = is_short(plan)
             time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
             plan = Trajectory(time_us, plain(plan.states))
             sample_poses(plan.time_us, plan.states, now_us, KEPT_US, self._plans[iteration])

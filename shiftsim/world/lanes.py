@@ -1,6 +1,7 @@
 """Lanes as nuPlan sees them: the one a vehicle is in, poses on it, and how it begins to turn."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -29,18 +30,39 @@ def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
 
     A lane is preferred to a connector, and among several the one whose heading differs least.
     """
-    x, y = float(pose[0]), float(pose[1])
+    edges = _edges_at(map, float(pose[0]), float(pose[1]))
+    return nearest_heading(map, edges, pose) if edges else None
+
+
+def find_starts(map: VectorMap, poses: FloatArray) -> list[Start | None]:
+    """As `find_start`, of vehicles at poses (N, 3)."""
+    edges = [_edges_at(map, x, y) for x, y in poses[:, :2].tolist()]
+    used = sorted({edge for choice in edges for edge in choice})
+    lines = dict(zip(used, (shapely.LineString(map.baselines.at(e)) for e in used), strict=True))
+    beside = np.array([lines[edge] for choice in edges for edge in choice], object)
+    owners = [index for index, choice in enumerate(edges) for _ in choice]
+    progress, found = _place_on_lines(beside, shapely.points(poses[np.array(owners, np.int64), :2]))
+    starts = iter(zip(progress.tolist(), found, strict=True))
+    return [
+        _nearest([Start(edge, *next(starts)) for edge in choice], pose) if choice else None
+        for choice, pose in zip(edges, poses, strict=True)
+    ]
+
+
+def _edges_at(map: VectorMap, x: float, y: float) -> list[int]:
+    """Lanes that hold a point, or connectors where none does."""
     edges = map.lanes_at(x, y)
     if not edges and len(map.intersections.containing(x, y)):
         edges = map.connectors_at(x, y)
-    if not edges:
-        return None
-    return nearest_heading(map, edges, pose)
+    return edges
 
 
 def nearest_heading(map: VectorMap, edges: list[int], pose: FloatArray) -> Start:
     """The edge whose heading beside a pose (3,) is nearest to that of the pose."""
-    starts = [start_on(map, edge, float(pose[0]), float(pose[1])) for edge in edges]
+    return _nearest([start_on(map, edge, float(pose[0]), float(pose[1])) for edge in edges], pose)
+
+
+def _nearest(starts: list[Start], pose: FloatArray) -> Start:
     # nuPlan rule 120: the difference of headings is not wrapped
     return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
 
@@ -67,13 +89,18 @@ def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, F
 
 def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
     """As `pose_on_line`, the poses (N, 3) of N shapely points."""
-    progress = shapely.line_locate_point(line, points)
+    return _place_on_lines(line, points)[1]
+
+
+def _place_on_lines(lines: Any, points: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    """Arc lengths (N,) [m] and poses (N, 3) of N points on one line, or on N of them."""
+    progress = shapely.line_locate_point(lines, points)
     here, ahead, behind = (
-        shapely.get_coordinates(shapely.line_interpolate_point(line, progress + offset))
+        shapely.get_coordinates(shapely.line_interpolate_point(lines, progress + offset))
         for offset in (0.0, _HEADING_SPACING, -_HEADING_SPACING)
     )
     step = np.where((here == ahead).all(axis=1)[:, None], here - behind, ahead - here)
-    return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
+    return progress, np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
 
 
 def _point(line: shapely.LineString, progress: float) -> tuple[float, float]:
