@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import DataError
 from shiftsim.metrics import (
     collision,
@@ -113,9 +113,10 @@ def measure(log: SimulationLog, map: VectorMap) -> Measurements:
         DataError: The rollout is too short, or a state is not finite.
         MapError: The map is such that nuPlan's own code stops.
     """
-    _check(log)
+    tracks = collision.flat_tracks(log.tracks)
+    _check(log, tracks)
     vehicle = VehicleParameters()
-    ego, tracks = collision.flat_ego(log.ego, vehicle), collision.flat_tracks(log.tracks)
+    ego = collision.flat_ego(log.ego, vehicle)
     # nuPlan's order of evaluation, which decides what is reported when several things are wrong
     route = driven_route(map, ego.centers)
     corners = corner_routes(map, ego.corners)
@@ -197,7 +198,7 @@ def _parts(m: Measurements, profile: Thresholds) -> list[MetricPart]:
     ]
 
 
-def _check(log: SimulationLog) -> None:
+def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
     where = f"rollout of scenario {log.token!r}"
     if len(log.time_us) < MIN_SAMPLES:
         raise DataError(
@@ -217,13 +218,23 @@ def _check(log: SimulationLog) -> None:
             raise DataError(
                 f"{where}: {name} {STATE_COLUMNS[column]} at sample {row} is not finite"
             )
-    tracks = log.tracks
-    sums = tracks.poses[..., 0] + tracks.poses[..., 1] + tracks.poses[..., 2]
-    sums += tracks.sizes[..., 0] + tracks.sizes[..., 1]  # not finite as soon as one of them is
-    broken = tracks.valid & ~np.isfinite(sums)
-    if broken.any():
-        row, column = (int(i) for i in np.argwhere(broken)[0])
+    row, column = find_broken(tracks)
+    if row >= 0:
         raise DataError(
-            f"{where}: track {tracks.tokens[column]!r} at sample {row} has a pose or size that "
-            "is not finite"
+            f"{where}: track {log.tracks.tokens[column]!r} at sample {row} has a pose or size "
+            "that is not finite"
         )
+
+
+@lean_kernel
+def find_broken(tracks: collision.FlatTracks) -> tuple[int, int]:
+    """Sample and track of the first pose or size that is not finite; -1, -1 where all are."""
+    poses, sizes = tracks.poses, tracks.sizes
+    for row in range(tracks.valid.shape[0]):
+        for column in range(tracks.valid.shape[1]):
+            # not finite as soon as one of them is
+            total = poses[row, column, 0] + poses[row, column, 1] + poses[row, column, 2]
+            total += sizes[row, column, 0] + sizes[row, column, 1]
+            if tracks.valid[row, column] and not np.isfinite(total):
+                return row, column
+    return -1, -1

@@ -40,7 +40,7 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind
 
 PARTS = ("", "planners", "metrics", "data", "benchmarks")  # linked into the package
-DECORATED = re.compile(r"^@(lean_)?kernel$", re.MULTILINE)
+DECORATED = re.compile(r"^@(lean_|part_)?kernel$", re.MULTILINE)
 RAISES = re.compile(r"^\s*(raise|assert)\b", re.MULTILINE)
 
 

@@ -20,10 +20,11 @@ class ConstantVelocity:
         """Poses every 0.1 s along the present heading."""
         ego = observation.ego
         x, y, heading = ego.pose.tolist()
-        distance = ego.speed * 0.1 * _STEPS
+        speed = ego.speed
+        distance = speed * 0.1 * _STEPS
         states = np.zeros((len(_STEPS), NUM_STATE))
         states[:, 0] = x + distance * np.cos(heading)
         states[:, 1] = y + distance * np.sin(heading)
         states[:, 2] = heading
-        states[:, VX] = ego.speed
+        states[:, VX] = speed
         return Trajectory(_STEPS * 100_000, states, relative=True)

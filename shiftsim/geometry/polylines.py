@@ -43,7 +43,12 @@ def project_on_polyline(
     found = 0.0
     for index in range(start, stop - 1):
         ax, ay = xy[index, 0], xy[index, 1]
-        dx, dy = xy[index + 1, 0] - ax, xy[index + 1, 1] - ay
+        bx, by = xy[index + 1, 0], xy[index + 1, 1]
+        apart_x = max(min(ax, bx) - x, 0.0, x - max(ax, bx))
+        apart_y = max(min(ay, by) - y, 0.0, y - max(ay, by))
+        if apart_x * apart_x + apart_y * apart_y > (best + SLACK) * (best + SLACK):
+            continue  # most often, and without a root
+        dx, dy = bx - ax, by - ay
         square = dx * dx + dy * dy
         along = 0.0
         if square > 0.0:
@@ -135,9 +140,15 @@ def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:
     xy = np.ascontiguousarray(poses[:, :2])
     if progress is None:
         progress = arc_lengths(xy, np.array([0, len(xy)]))
-    runs = np.empty(((len(xy) - 2) // RUN + 1, 4))
+    runs = np.empty((runs_of(len(xy)), 4))
     bound_runs(xy, runs)
     return Path(xy, np.unwrap(poses[:, 2]), progress, runs)
+
+
+@lean_kernel
+def runs_of(num_points: int) -> int:
+    """How many runs a polyline of so many vertices has."""
+    return (num_points - 2) // RUN + 1
 
 
 @lean_kernel

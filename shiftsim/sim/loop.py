@@ -16,11 +16,19 @@ import numpy as np
 
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
+from shiftsim.sim.dynamics.lqr import TRACKED, raise_for_status
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
+from shiftsim.sim.execute import execute
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.plan_check import doubt_of, find_fault, plain
+from shiftsim.sim.plan_check import (
+    GOOD,
+    Fault,
+    doubt_of,
+    find_fault,
+    find_form_fault,
+    plain,
+)
 from shiftsim.sim.planner import (
     BatchPlanner,
     Observation,
@@ -109,9 +117,11 @@ class Rollout:
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
         self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
-        self._noise = sample_noise(
+        self._is_tracked = planner is not None and setting.controller == "lqr"
+        noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
+        self._noise = plain(noise)
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
@@ -142,13 +152,18 @@ class Rollout:
         """Store this sample and move the ego; what the traffic is to do, None after the last."""
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
+        moves = iteration + 1 < self.num_samples
         if self.planner is not None:
-            plan = self._checked(plan)
-        if iteration + 1 >= self.num_samples:
-            return None
+            self._note_fallback()
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
-        self._move_ego(plan)
-        return Move(iteration, self._ego[row], self._tracks, row + 1)
+        if self._is_tracked and isinstance(plan, Trajectory):
+            self._track(plan, moves)
+        else:
+            if self.planner is not None:
+                plan = self._checked(plan)
+            if moves:
+                self._move_ego(plan)
+        return Move(iteration, self._ego[row], self._tracks, row + 1) if moves else None
 
     def _go_on(self) -> None:
         """Go to the next sample, which may be the last one."""
@@ -182,19 +197,12 @@ class Rollout:
                 )
             command[:] = plan.acceleration, plan.steering_rate
             command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
-        elif isinstance(plan, Trajectory) and controller == "perfect":
-            follow_perfectly(plan, next_us, after)
         elif isinstance(plan, Trajectory):
-            times, states = plan.time_us, plan.states
-            status = track_and_step(
-                now_us, next_us, state, times, states, noise[0], noise[1], after, command
-            )
-            raise_for_status(status, now_us, times)
+            follow_perfectly(plan, next_us, after)
 
-    def _checked(self, plan: Any) -> Trajectory | Command:
-        """The plan in log time; its poses and whether it is a fallback are noted."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row], self._clock[row + 1]
+    def _note_fallback(self) -> None:
+        """Note whether the plan is a fallback by the planner's own account."""
+        iteration = self.iteration
         if reason := getattr(self.planner, "degraded", ""):
             if self.setting.strict:
                 raise PlannerError(
@@ -202,16 +210,48 @@ class Rollout:
                     hint="without --strict it continues, and the step is counted as degraded",
                 )
             self._degraded[iteration] = True
-        fault = find_fault(plan, now_us, next_us)
+
+    def _track(self, plan: Trajectory, moves: bool) -> None:
+        """Check a plan, note its poses, and let the tracker follow it."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._clock[row], self._clock[row + 1]
+        self._refuse(find_form_fault(plan))
+        times, states = plain(plan.time_us), plain(plan.states)
+        code, status = execute(
+            times,
+            states,
+            now_us if plan.relative else 0,
+            now_us,
+            next_us,
+            row,
+            iteration,
+            moves,
+            self._ego,
+            self._noise,
+            self._commands,
+            self._plans,
+        )
+        if code != GOOD:
+            self._refuse(find_fault(plan, now_us, next_us))
+        if status != TRACKED:
+            raise_for_status(status, now_us, plan.starting_at(now_us).time_us)
+        if iteration == 0:
+            self.doubt = doubt_of(plan, self._plans[0, 0], self._ego[row])
+
+    def _refuse(self, fault: Fault | None) -> None:
         if fault is not None:
-            raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
+            where = f"iteration {self.iteration}"
+            raise InvalidTrajectoryError(f"{where}: {fault.message}", fault.hint)
+
+    def _checked(self, plan: Any) -> Trajectory | Command:
+        """The plan in log time; its poses are noted."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._clock[row], self._clock[row + 1]
+        self._refuse(find_fault(plan, now_us, next_us))
         if isinstance(plan, Trajectory):
             time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
             plan = Trajectory(time_us, plain(plan.states))
-            kept = self._plans[iteration]
-            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, kept)
-            if iteration == 0 and self.setting.controller == "lqr":
-                self.doubt = doubt_of(plan, kept[0], self._ego[row])
+            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, self._plans[iteration])
         return plan
 
     def log(self) -> SimulationLog:

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
 
@@ -17,7 +17,7 @@ SHORT = (
     "plans reach less than 1 s ahead: the tracker looks 1 s ahead, and takes the end for the rest"
 )
 
-_GOOD, _NOT_INCREASING, _TOO_LARGE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT, _TOO_LONG = range(7)
+GOOD, _NOT_INCREASING, _TOO_LARGE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT, _TOO_LONG = range(7)
 _INT64, _FLOAT64 = np.dtype(np.int64), np.dtype(np.float64)
 
 
@@ -42,10 +42,21 @@ def validate_plan(plan: object, now_us: int, next_us: int) -> None:
         raise InvalidTrajectoryError(fault.message, hint=fault.hint)
 
 
-def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
+def find_fault(plan: Any, now_us: int, next_us: int) -> Fault | None:
     """The first thing that is wrong with a plan, or None (arguments as of `validate_plan`)."""
     if isinstance(plan, Command):
         return _command_fault(plan)
+    fault = find_form_fault(plan)
+    if fault is not None:
+        return fault
+    if plan.relative:
+        now_us, next_us = 0, next_us - now_us
+    code, row, column = check_values(plain(plan.time_us), plain(plan.states), now_us, next_us)
+    return None if code == GOOD else _explain(code, row, column, plan, now_us, next_us)
+
+
+def find_form_fault(plan: Any) -> Fault | None:
+    """What is wrong with the types and shapes of a trajectory, or None."""
     if not isinstance(plan, Trajectory):
         return Fault(
             "type",
@@ -62,10 +73,7 @@ def find_fault(plan: object, now_us: int, next_us: int) -> Fault | None:
             f"need int64 (H,) and float64 (H, {NUM_STATE})",
             "Trajectory.from_poses builds both from times (H,) [s] and poses (H, 3)",
         )
-    if plan.relative:
-        now_us, next_us = 0, next_us - now_us
-    code, row, column = _check(plain(times), plain(states), now_us, next_us)
-    return None if code == _GOOD else _explain(code, row, column, plan, now_us, next_us)
+    return None
 
 
 def is_short(plan: object) -> bool:
@@ -115,10 +123,11 @@ def _describe(value: object) -> str:
     return type(value).__name__
 
 
-@kernel
-def _check(
+@lean_kernel
+def check_values(
     time_us: IntArray, states: FloatArray, now_us: int, next_us: int
 ) -> tuple[int, int, int]:
+    """GOOD, or what is wrong with a plan, and the row and column where."""
     for row in range(1, len(time_us)):
         if time_us[row] <= time_us[row - 1]:
             return _NOT_INCREASING, row, 0
@@ -134,7 +143,7 @@ def _check(
         return _STARTS_LATE, 0, 0
     if time_us[-1] < next_us:
         return _ENDS_EARLY, 0, 0
-    return _GOOD, 0, 0
+    return GOOD, 0, 0
 
 
 def _explain(

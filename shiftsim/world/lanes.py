@@ -1,6 +1,7 @@
 """Lanes as nuPlan sees them: the one a vehicle is in, poses on it, and how it begins to turn."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -29,18 +30,39 @@ def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
 
     A lane is preferred to a connector, and among several the one whose heading differs least.
     """
-    x, y = float(pose[0]), float(pose[1])
+    edges = _edges_at(map, float(pose[0]), float(pose[1]))
+    return nearest_heading(map, edges, pose) if edges else None
+
+
+def find_starts(map: VectorMap, poses: FloatArray) -> list[Start | None]:
+    """As `find_start`, of vehicles at poses (N, 3)."""
+    edges = [_edges_at(map, x, y) for x, y in poses[:, :2].tolist()]
+    used = sorted({edge for choice in edges for edge in choice})
+    lines = dict(zip(used, (shapely.LineString(map.baselines.at(e)) for e in used), strict=True))
+    beside = np.array([lines[edge] for choice in edges for edge in choice], object)
+    owners = [index for index, choice in enumerate(edges) for _ in choice]
+    progress, found = _place_on_lines(beside, shapely.points(poses[np.array(owners, np.int64), :2]))
+    starts = iter(zip(progress.tolist(), found, strict=True))
+    return [
+        _nearest([Start(edge, *next(starts)) for edge in choice], pose) if choice else None
+        for choice, pose in zip(edges, poses, strict=True)
+    ]
+
+
+def _edges_at(map: VectorMap, x: float, y: float) -> list[int]:
+    """Lanes that hold a point, or connectors where none does."""
     edges = map.lanes_at(x, y)
     if not edges and len(map.intersections.containing(x, y)):
         edges = map.connectors_at(x, y)
-    if not edges:
-        return None
-    return nearest_heading(map, edges, pose)
+    return edges
 
 
 def nearest_heading(map: VectorMap, edges: list[int], pose: FloatArray) -> Start:
     """The edge whose heading beside a pose (3,) is nearest to that of the pose."""
-    starts = [start_on(map, edge, float(pose[0]), float(pose[1])) for edge in edges]
+    return _nearest([start_on(map, edge, float(pose[0]), float(pose[1])) for edge in edges], pose)
+
+
+def _nearest(starts: list[Start], pose: FloatArray) -> Start:
     # nuPlan rule 120: the difference of headings is not wrapped
     return min(starts, key=lambda start: abs(start.pose[2] - pose[2]))
 
@@ -60,18 +82,26 @@ def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, F
 
 def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
     """As `pose_on_line`, the poses (N, 3) of N shapely points."""
-    return _poses_at(line, shapely.line_locate_point(line, points))
+    return _place_on_lines(line, points)[1]
 
 
-def _poses_at(line: shapely.LineString, progress: FloatArray) -> FloatArray:
-    """(N, 3) poses at arc lengths (N,) of a line; the heading is that to a point ahead."""
-    both = np.concatenate([progress, progress + _HEADING_SPACING])
-    points = shapely.get_coordinates(shapely.line_interpolate_point(line, both))
-    here, ahead = points[: len(progress)], points[len(progress) :]
+def _place_on_lines(lines: Any, points: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    """Arc lengths (N,) [m] and poses (N, 3) of N points on one line, or on N of them."""
+    progress = shapely.line_locate_point(lines, points)
+    return progress, _poses_at(lines, progress)
+
+
+def _poses_at(lines: Any, progress: FloatArray) -> FloatArray:
+    """(N, 3) poses at arc lengths (N,) of lines; the heading is that to a point ahead."""
+    lines = np.broadcast_to(np.asarray(lines, object), progress.shape)
+    here, ahead = (
+        shapely.get_coordinates(shapely.line_interpolate_point(lines, progress + offset))
+        for offset in (0.0, _HEADING_SPACING)
+    )
     step = ahead - here
     ends = (here == ahead).all(axis=1)
     if ends.any():  # at the very end of the line: from a point behind
-        behind = shapely.line_interpolate_point(line, progress[ends] - _HEADING_SPACING)
+        behind = shapely.line_interpolate_point(lines[ends], progress[ends] - _HEADING_SPACING)
         step[ends] = here[ends] - shapely.get_coordinates(behind)
     return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
 

@@ -277,11 +277,11 @@ class Mirrors(ConstantVelocity):
 
 
 def test_read_only_plans_compile_no_second_kernel(scenario):
-    from shiftsim.sim.dynamics.lqr import track_and_step
+    from shiftsim.sim.execute import execute
 
     simulate(scenario, ConstantVelocity())
-    before = len(track_and_step.signatures)
+    before = len(execute.signatures)
     planner = Mirrors()
     planner.scenario = scenario
     simulate(scenario, planner)
-    assert len(track_and_step.signatures) == before == 1
+    assert len(execute.signatures) == before == 1

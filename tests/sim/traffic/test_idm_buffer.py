@@ -108,7 +108,7 @@ def test_quick_corridor_answers_are_those_of_the_exact_buffer(
     runs = np.zeros(((len(line) - 2) // RUN + 1, 4))
     bound_runs(line, runs)
 
-    answer = touches_corridor(line, runs, 1.0, ring, bounds)
+    answer = touches_corridor(line, runs, 0, 1.0, ring, bounds)
 
     area = shapely.LineString(line).buffer(1.0, cap_style="flat")
     truth = MEETING if area.intersects(shapely.Polygon(ring)) else APART

@@ -6,7 +6,7 @@ which there is none, or no space, are not simulated.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
@@ -16,8 +16,8 @@ from shiftsim.sim.traffic.idm.paths import (
     finish_path,
     pose_on_path,
 )
-from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet
-from shiftsim.world.lanes import Start, find_start
+from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet, make_paths
+from shiftsim.world.lanes import Start, find_starts
 from shiftsim.world.map import VectorMap
 
 _MIN_VERTICES = 3  # of a baseline: a path of fewer than two cannot be driven, and one is lost
@@ -34,12 +34,13 @@ def place_agents(
     Raises:
         TrafficError: A vehicle starts on a baseline too short to be a path.
     """
-    occupied = list(taken)
+    starts = find_starts(map, poses)
+    places = [pose if s is None else s.pose for pose, s in zip(poses, starts, strict=True)]
+    corners = boxes_to_corners(np.reshape(places, (-1, 3)), sizes)
+    occupied, count = np.concatenate([taken, corners]), np.int64(len(taken))
     out: list[Start | None] = []
-    for pose, size in zip(poses, sizes, strict=True):
-        start = find_start(map, pose)
-        corners = boxes_to_corners(pose if start is None else start.pose, size)
-        if start is not None and any(convex_intersect(corners, o) for o in occupied):
+    for start, box in zip(starts, corners, strict=True):
+        if start is not None and touches_any(box, occupied, count):
             start = None
         if start is not None and len(map.baselines.at(start.edge)) < _MIN_VERTICES:
             raise TrafficError(
@@ -48,9 +49,19 @@ def place_agents(
                 hint="nuPlan fails here as well; leave the scenario out, or use other traffic",
             )
         if start is not None:
-            occupied.append(corners)
+            occupied[count] = box
+            count += 1
         out.append(start)
     return out
+
+
+@lean_kernel
+def touches_any(box: FloatArray, boxes: FloatArray, count: int) -> bool:
+    """Whether a box (4, 2) touches one of the first `count` of others (M, 4, 2)."""
+    for index in range(count):
+        if convex_intersect(box, boxes[index]):
+            return True
+    return False
 
 
 def make_fleet(
@@ -63,6 +74,7 @@ def make_fleet(
     """Agents at their starts."""
     count = len(starts)
     longest = max([len(map.baselines.at(start.edge)) for start in starts], default=2)
+    paths, lines, runs = make_paths(count, longest)
     fleet = Fleet(
         alive=np.ones(count, np.bool_),
         size=np.ascontiguousarray(sizes, np.float64),
@@ -72,8 +84,11 @@ def make_fleet(
         pose=np.zeros((count, 3)),
         route=np.zeros((count, MAX_ROUTE), np.int64),
         route_size=np.ones(count, np.int64),
-        path=np.zeros((count, longest, 4)),
+        path=paths,
         path_size=np.zeros(count, np.int64),
+        line=lines,
+        runs=runs,
+        first=np.full(count, -1),
     )
     target = default_target
     for agent, start in enumerate(starts):

@@ -4,14 +4,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel
-from shiftsim.geometry.polylines import RUN, bound_runs
+from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
+from shiftsim.geometry.polylines import RUN, bound_runs, runs_of
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.courtesy import ignores_ego_ahead
-from shiftsim.sim.traffic.idm.paths import remaining_path
+from shiftsim.sim.traffic.idm.paths import look_ahead
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
 from shiftsim.sim.traffic.idm.shapes import (
     MEETING,
+    OUTER,
     UNSURE,
     last_near_run,
     ring_gap,
@@ -27,12 +28,13 @@ _MARGIN = 1.1  # corridors lie within this many half widths of their line
 class Corridor(NamedTuple):
     """The path ahead of an agent, which is buffered by half its width with flat ends."""
 
-    line: FloatArray  # (K, 2) vertices [m]
+    line: FloatArray  # (K, 2) vertices, those before the agent included [m]
     runs: FloatArray  # (R, 4) bounds of its runs of segments [m]
+    first: int  # the vertex at which the agent is
     half_width: float  # of the buffer [m]
 
 
-@lean_kernel
+@part_kernel
 def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
     """The nearest footprint in the corridor ahead of an agent, the first one on ties, and the gap.
 
@@ -41,11 +43,11 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         footprints [m].
     """
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
-    size = remaining_path(fleet, agent, scratch.line)
-    line, runs = scratch.line[:size], scratch.runs[: (size - 2) // RUN + 1]
-    bound_runs(line, runs)
-    corridor = Corridor(line, runs, 0.5 * fleet.size[agent, 1])
-    path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
+    look_ahead(fleet, agent)
+    size = fleet.path_size[agent]
+    line, runs = fleet.line[agent, :size], fleet.runs[agent, : runs_of(size)]
+    corridor = Corridor(line, runs, fleet.first[agent], 0.5 * fleet.size[agent, 1])
+    path_end = fleet.path[agent, size - 1, PROGRESS]
     if not fleet.progress[agent] < path_end and not _in_corridor(
         footprints, agent, corridor, scratch
     ):
@@ -67,15 +69,18 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         other = scratch.near[nearest]
         if other == hidden or (best == 0.0 and other > lead):
             continue
+        is_first = lead == FREE  # then what is ahead is the cheaper question
+        if is_first and not _in_corridor(footprints, other, corridor, scratch):
+            continue
         gap = _gap(footprints, agent, other, best * (1.0 + _TIE) + _TINY)
         closer = gap < best or (gap == best and other < lead)
-        if closer and _in_corridor(footprints, other, corridor, scratch):
+        if is_first or (closer and _in_corridor(footprints, other, corridor, scratch)):
             best, lead = gap, other
     gap = _stop_gap(scene, agent, corridor, best)
     return (len(footprints.present), gap) if gap < best else (lead, best)
 
 
-@lean_kernel
+@part_kernel
 def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> float:
     """Distance from an agent's footprint to the red stop lines of its route, at most `limit`."""
     fleet, graph, scratch = scene.fleet, scene.graph, scene.scratch
@@ -94,7 +99,7 @@ def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> flo
     return best
 
 
-@lean_kernel
+@part_kernel
 def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: Scratch) -> int:
     """List footprints whose bounds come near the corridor, in `scratch.near`; returns how many.
 
@@ -102,7 +107,8 @@ def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: 
     """
     bounds, runs, margin = footprints.bounds, corridor.runs, _MARGIN * corridor.half_width
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for run in range(len(runs)):
+    begin = corridor.first // RUN
+    for run in range(begin, len(runs)):
         low_x, low_y = min(low_x, runs[run, 0]), min(low_y, runs[run, 1])
         high_x, high_y = max(high_x, runs[run, 2]), max(high_y, runs[run, 3])
     low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
@@ -115,6 +121,7 @@ def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: 
             and bounds[other, 1] <= high_y
             and bounds[other, 2] >= low_x
             and bounds[other, 3] >= low_y
+            and last_near_run(runs, begin, margin, bounds[other]) >= 0
         ):
             apart_x = max(bounds[agent, 0] - bounds[other, 2], bounds[other, 0] - bounds[agent, 2])
             apart_y = max(bounds[agent, 1] - bounds[other, 3], bounds[other, 1] - bounds[agent, 3])
@@ -139,17 +146,21 @@ def _in_corridor(footprints: Footprints, other: int, corridor: Corridor, scratch
 @lean_kernel
 def _meets(corridor: Corridor, ring: FloatArray, bounds: FloatArray, scratch: Scratch) -> bool:
     """Whether a ring with the given bounds (4,) meets a corridor."""
-    line, runs, half_width = corridor.line, corridor.runs, corridor.half_width
-    found = touches_corridor(line, runs, half_width, ring, bounds)
+    first, half_width = corridor.first, corridor.half_width
+    found = touches_corridor(corridor.line, corridor.runs, first, half_width, ring, bounds)
     if found != UNSURE:
         return found == MEETING
     # of the exact corridor only what comes up to the ring is needed, and a run to spare
-    near = min((last_near_run(runs, half_width, bounds) + 2) * RUN + 1, len(line))
+    line = corridor.line[first:]
+    runs = scratch.runs[: runs_of(len(line))]
+    bound_runs(line, runs)
+    last = max(last_near_run(runs, 0, half_width * OUTER, bounds), 0)
+    near = min((last + 2) * RUN + 1, len(line))
     outline = buffer_curve(line[:near], half_width, scratch.keep, scratch.outline)
     return ring_gap(ring, scratch.outline[:outline], 1e-3) == 0.0
 
 
-@lean_kernel
+@part_kernel
 def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
     """Distance between the footprint of an agent and another one, at most `limit` [m]."""
     best = limit

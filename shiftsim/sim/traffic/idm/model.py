@@ -9,7 +9,7 @@ baseline too short to be a path.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray, Held, IntArray
 from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
@@ -21,7 +21,7 @@ from shiftsim.sim.traffic.idm.scene import (
     Scene,
     lane_graph,
     make_scene,
-    row_of,
+    rows_of,
     with_longer_curves,
     with_longer_paths,
 )
@@ -107,9 +107,10 @@ class IdmTraffic:
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
         self._light_edges, self._lights = light_flags(scenario)
         # nuPlan rule 11: a difference of epoch seconds
-        self._spans = np.diff(scenario.iteration_times * 1e-6)
+        self._spans = np.diff(scenario.iteration_times * 1e-6).tolist()
         _remove(tracks, row, ~is_replayed)
-        write_agents(fleet, agents, row_of(tracks, row))
+        write_agents(fleet, agents, rows_of(tracks, row))
+        self._hold(self._scene, tracks)
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move the agents; replayed tracks and lights are those of the next iteration.
@@ -121,15 +122,18 @@ class IdmTraffic:
         if scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
         # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
-        scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
+        if len(self._light_edges):
+            scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
         if scene.courtesy.manner != OFF:
             start = find_start(self._map, center_poses(ego[None, :3])[0])
             scene.courtesy.ego_block[0] = NONE if start is None else self._map.block_of[start.edge]
         if len(self._stopped):
             self._drop_far(ego, tracks, row)
+        if tracks is not self._tracks:
+            self._hold(scene, tracks)
         end, what, first = -1, 0, BEGIN
         while end != DONE:
-            end, what = advance(scene, ego, row_of(tracks, row), self._spans[iteration], first)
+            end, what = advance(self._held, row, ego, self._spans[iteration], first)
             if end == LEFT_PATH:
                 raise TrafficError(
                     f"reactive agent {tracks.tokens[scene.agents[what]]} is outside of its own "
@@ -137,10 +141,14 @@ class IdmTraffic:
                     hint="nuPlan fails here as well; leave the scenario out, or use other traffic",
                 )
             if end == LONGER_PATHS:
-                scene = with_longer_paths(scene, what)
+                self._hold(scene := with_longer_paths(scene, what), tracks)
             elif end != DONE:
-                scene, first = with_longer_curves(scene), what
-        self._scene = scene
+                self._hold(scene := with_longer_curves(scene), tracks)
+                first = what
+
+    def _hold(self, scene: Scene, tracks: Tracks) -> None:
+        self._scene, self._tracks = scene, tracks
+        self._held = Held((scene, rows_of(tracks)))
 
     def _drop_far(self, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Remove stopped vehicles that are far from the ego, for good: nuPlan rule 712."""
@@ -176,6 +184,6 @@ class IdmTraffic:
 
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:
     """Remove tracks (a mask) from a row on."""
-    tracks.valid[row:, which] = False
+    tracks.valid[row:] &= ~which
     for values in (tracks.poses, tracks.velocities, tracks.sizes):
-        values[row:, which] = np.nan
+        np.copyto(values[row:], np.nan, where=which[:, None])

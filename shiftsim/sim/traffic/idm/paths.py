@@ -8,9 +8,9 @@ unwrapped along the path and wrapped when a pose is read.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, wrap_angle
-from shiftsim.geometry.polylines import interpolate, vertex_heading
+from shiftsim.geometry.polylines import bound_runs, interpolate, runs_of, vertex_heading
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
@@ -30,7 +30,7 @@ from shiftsim.world.layers import Polylines
 _SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
 
 
-@lean_kernel
+@part_kernel
 def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int) -> int:
     """Append the vertices of a baseline to a raw path; returns the new number of vertices."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
@@ -42,7 +42,7 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
     return size
 
 
-@lean_kernel
+@part_kernel
 def finish_path(path: FloatArray, size: int) -> int:
     """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
 
@@ -99,6 +99,22 @@ def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, f
 
 
 @lean_kernel
+def point_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float]:
+    """Point x, y [m] at a progress within the path, as in `pose_on_path`."""
+    index = min(max(first_after(path, size, progress), 1), size - 1)
+    return _point_before(path, index, progress)
+
+
+@lean_kernel
+def _point_before(path: FloatArray, index: int, progress: float) -> tuple[float, float]:
+    """Point x, y [m] at a progress on the segment that ends at a vertex."""
+    start = path[index - 1, PROGRESS]
+    span, along = path[index, PROGRESS] - start, progress - start
+    x = interpolate(path[index - 1, 0], path[index, 0], span, along)
+    return x, interpolate(path[index - 1, 1], path[index, 1], span, along)
+
+
+@part_kernel
 def choose_successor(graph: LaneGraph, edge: int) -> int:
     """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open."""
     best, chosen = np.inf, -1
@@ -116,7 +132,7 @@ def choose_successor(graph: LaneGraph, edge: int) -> int:
     return chosen
 
 
-@lean_kernel
+@part_kernel
 def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmParameters) -> int:
     """Lengthen the path of an agent until it is long enough or no edge is open.
 
@@ -141,9 +157,10 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         fleet.path_size[agent] = finish_path(path, raw)
         fleet.progress[agent] = 0.0
         _remember(fleet, agent, chosen)
+        fleet.first[agent] = -1
 
 
-@lean_kernel
+@part_kernel
 def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
     after = first_after(path, size, progress)
@@ -165,7 +182,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     return kept
 
 
-@lean_kernel
+@part_kernel
 def _remember(fleet: Fleet, agent: int, edge: int) -> None:
     """Append an edge to the route of an agent, and drop the oldest one where it is full."""
     route, size = fleet.route[agent], fleet.route_size[agent]
@@ -195,14 +212,27 @@ def set_box(
     bound_ring(box, bounds)
 
 
-@lean_kernel
-def remaining_path(fleet: Fleet, agent: int, line: FloatArray) -> int:
-    """Write the path ahead of an agent into `line` (K, 2); returns its number of vertices."""
-    path, size = fleet.path[agent], fleet.path_size[agent]
-    return _cut(path, size, fleet.progress[agent], path[size - 1, PROGRESS], line)
+@part_kernel
+def look_ahead(fleet: Fleet, agent: int) -> None:
+    """Make the `line` of an agent begin where it is; agents do not drive backwards."""
+    path, size, line = fleet.path[agent], fleet.path_size[agent], fleet.line[agent]
+    if fleet.first[agent] < 0:
+        for vertex in range(size - 1):
+            line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
+        end = point_on_path(path, size, path[size - 1, PROGRESS])
+        line[size - 1, 0], line[size - 1, 1] = end
+        bound_runs(line[:size], fleet.runs[agent, : runs_of(size)])
+    progress = clamp_progress(path, size, fleet.progress[agent])
+    after = first_after(path, size, progress)
+    fleet.first[agent] = min(after, size - 1) - 1
+    if after < size:
+        line[after - 1, 0], line[after - 1, 1] = _point_before(path, after, progress)
+        return
+    for vertex in range(size - 2, size):  # nuPlan rule 127: at its end two vertices are left
+        line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
 
 
-@lean_kernel
+@part_kernel
 def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
     """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
@@ -214,19 +244,17 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
             line[vertex, 0] = path[head + vertex, 0]
             line[vertex, 1] = path[head + vertex, 1]
         return 2
-    x, y, _ = pose_on_path(path, size, first)
-    line[0, 0], line[0, 1] = x, y
+    line[0, 0], line[0, 1] = _point_before(path, after, first)
     count = 1
     while after < size and path[after, PROGRESS] < last:
         line[count, 0], line[count, 1] = path[after, 0], path[after, 1]
         count += 1
         after += 1
-    x, y, _ = pose_on_path(path, size, last)
-    line[count, 0], line[count, 1] = x, y
+    line[count, 0], line[count, 1] = point_on_path(path, size, last)
     return count + 1
 
 
-@lean_kernel
+@part_kernel
 def move_agent(scene: Scene, agent: int) -> int:
     """Pose and footprint of an agent from its progress; returns -1 where a curve is too long."""
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray
-from shiftsim.geometry.polylines import RUN
+from shiftsim.geometry.polylines import runs_of
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
@@ -65,6 +65,9 @@ class Fleet(NamedTuple):
     route_size: IntArray  # (A,) how many of them
     path: FloatArray  # (A, K, 4) vertices of the path: x [m], y [m], heading [rad], progress [m]
     path_size: IntArray  # (A,) how many of them
+    line: FloatArray  # (A, K, 2) the path ahead [m]: vertices from `first` on, the others are gone
+    runs: FloatArray  # (A, R, 4) bounds of the path's runs of segments, those driven included [m]
+    first: IntArray  # (A,) where in `line` the agent is; before the path is surveyed -1
 
 
 class Footprints(NamedTuple):
@@ -86,7 +89,7 @@ class Scratch(NamedTuple):
 
     line: FloatArray  # (K, 2) a piece of a path [m]
     keep: BoolArray  # (K,) flags of its vertices
-    runs: FloatArray  # (R, 4) bounds of the line's runs of segments [m]
+    runs: FloatArray  # (R, 4) bounds of a line's runs of segments [m]
     outline: FloatArray  # (W, 2) outline of the buffer of a path [m]
     near: IntArray  # (M,) footprints that may be in the corridor
     apart: FloatArray  # (M,) lower bounds of the gaps to them [m]
@@ -120,7 +123,7 @@ class Scene(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2)."""
+    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2); or T of them."""
 
     valid: BoolArray
     poses: FloatArray
@@ -128,9 +131,10 @@ class Row(NamedTuple):
     sizes: FloatArray
 
 
-def row_of(tracks: Tracks, row: int) -> Row:
-    """One row of tracks as kernels take it."""
-    return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
+def rows_of(tracks: Tracks, index: int | slice = slice(None)) -> Row:
+    """One row of tracks, or many, as kernels take them."""
+    parts = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
+    return Row._make(part[index] for part in parts)
 
 
 def lane_graph(map: VectorMap) -> LaneGraph:
@@ -174,7 +178,7 @@ def _make_scratch(longest_path: int, count: int) -> Scratch:
     return Scratch(
         line=np.zeros((points, 2)),
         keep=np.zeros(points, np.bool_),
-        runs=np.zeros((points // RUN + 1, 4)),
+        runs=np.zeros((runs_of(points), 4)),
         outline=np.zeros((curve_capacity(points), 2)),
         near=np.zeros(count, np.int64),
         apart=np.zeros(count),
@@ -183,10 +187,21 @@ def _make_scratch(longest_path: int, count: int) -> Scratch:
 
 def with_longer_paths(scene: Scene, needed: int) -> Scene:
     """The same scene, for paths of `needed` vertices and more."""
-    path = np.zeros((len(scene.agents), 2 * needed, 4))
-    path[:, : scene.fleet.path.shape[1]] = scene.fleet.path
-    scratch = _make_scratch(2 * needed, len(scene.footprints.present))
-    return scene._replace(fleet=scene.fleet._replace(path=path), scratch=scratch)
+    fleet, count = scene.fleet, 2 * needed
+    path, line, runs = make_paths(len(scene.agents), count)
+    for longer, before in ((path, fleet.path), (line, fleet.line), (runs, fleet.runs)):
+        longer[:, : before.shape[1]] = before
+    scratch = _make_scratch(count, len(scene.footprints.present))
+    return scene._replace(fleet=fleet._replace(path=path, line=line, runs=runs), scratch=scratch)
+
+
+def make_paths(num_agents: int, longest: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Empty paths of at most `longest` vertices, and their `line` and `runs`, as in `Fleet`."""
+    return (
+        np.zeros((num_agents, longest, 4)),
+        np.zeros((num_agents, longest, 2)),
+        np.zeros((num_agents, runs_of(longest), 4)),
+    )
 
 
 def with_longer_curves(scene: Scene) -> Scene:

@@ -15,7 +15,7 @@ from shiftsim.geometry.rings import orientation, point_segment_distance, segment
 APART, MEETING, UNSURE = 0, 1, 2
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
 # bound), and shallow concave vertices are left out (outer bound; see `buffer`).
-_INNER, _OUTER = 0.97, 1.02
+_INNER, OUTER = 0.97, 1.02
 
 
 @lean_kernel
@@ -154,34 +154,41 @@ def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: fl
 
 
 @lean_kernel
-def last_near_run(runs: FloatArray, half_width: float, bounds: FloatArray) -> int:
-    """The last run of a corridor that may reach into a bounding box, or 0."""
-    reach = half_width * _OUTER
-    for run in range(len(runs) - 1, 0, -1):
+def last_near_run(runs: FloatArray, first: int, reach: float, bounds: FloatArray) -> int:
+    """The last run, of those from `first` on, that comes within `reach` [m] of bounds; or -1."""
+    low_x, low_y = bounds[0] - reach, bounds[1] - reach
+    high_x, high_y = bounds[2] + reach, bounds[3] + reach
+    for run in range(len(runs) - 1, first - 1, -1):
         if (
-            runs[run, 0] <= bounds[2] + reach
-            and runs[run, 1] <= bounds[3] + reach
-            and runs[run, 2] >= bounds[0] - reach
-            and runs[run, 3] >= bounds[1] - reach
+            runs[run, 0] <= high_x
+            and runs[run, 1] <= high_y
+            and runs[run, 2] >= low_x
+            and runs[run, 3] >= low_y
         ):
             return run
-    return 0
+    return -1
 
 
 @lean_kernel
 def touches_corridor(
-    line: FloatArray, runs: FloatArray, half_width: float, ring: FloatArray, bounds: FloatArray
+    line: FloatArray,
+    runs: FloatArray,
+    first: int,
+    half_width: float,
+    ring: FloatArray,
+    bounds: FloatArray,
 ) -> int:
     """Whether a ring meets the flat-capped buffer of a polyline: APART, MEETING, or UNSURE.
 
-    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps. The line (K, 2)
-    has runs with bounds (R, 4), the ring (V, 2) the bounds (4,).
+    UNSURE where the answer hangs on the exact shape of the buffer, or on its caps. The line (K, 2),
+    of which the vertices from `first` on count, has runs with bounds (R, 4), the ring (V, 2) the
+    bounds (4,).
     """
-    reach = half_width * _OUTER
+    reach = half_width * OUTER
     low_x, low_y = bounds[0] - reach, bounds[1] - reach
     high_x, high_y = bounds[2] + reach, bounds[3] + reach
     answer = APART
-    for run in range(len(runs)):
+    for run in range(first // RUN, len(runs)):
         if (
             runs[run, 0] > high_x
             or runs[run, 1] > high_y
@@ -189,7 +196,7 @@ def touches_corridor(
             or runs[run, 3] < low_y
         ):
             continue
-        for vertex in range(run * RUN + 1, min((run + 1) * RUN + 1, len(line))):
+        for vertex in range(max(run * RUN, first) + 1, min((run + 1) * RUN + 1, len(line))):
             px, py = line[vertex - 1, 0], line[vertex - 1, 1]
             qx, qy = line[vertex, 0], line[vertex, 1]
             if (
@@ -204,7 +211,7 @@ def touches_corridor(
                 return MEETING
             if found == UNSURE:
                 answer = UNSURE
-    x, y = line[0, 0], line[0, 1]
+    x, y = line[first, 0], line[first, 1]
     around = bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
     if answer == APART and around and winds_around(ring, x, y):
         return MEETING
@@ -215,7 +222,7 @@ def touches_corridor(
 def _touches_segment(
     px: float, py: float, qx: float, qy: float, half_width: float, ring: FloatArray
 ) -> int:
-    inner, outer = half_width * _INNER, half_width * _OUTER
+    inner, outer = half_width * _INNER, half_width * OUTER
     low_x, high_x = min(px, qx) - outer, max(px, qx) + outer
     low_y, high_y = min(py, qy) - outer, max(py, qy) + outer
     dx, dy = qx - px, qy - py

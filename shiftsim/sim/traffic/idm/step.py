@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, Held, IntArray, contents, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.sim.dynamics.idm import idm_step
 from shiftsim.sim.traffic.idm.courtesy import place_ego_ahead
@@ -18,17 +18,20 @@ _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA
 
 
 @lean_kernel
-def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) -> tuple[int, int]:
+def advance(held: Held, at: int, ego: FloatArray, span: float, first: int) -> tuple[int, int]:
     """Move every agent by one step, `span` [s] long, and write where it is.
 
-    The scene has the lights, and the row the replayed tracks, of the end of the step; `ego` (11,)
-    is of its beginning. `first` is BEGIN, or the agent that an interrupted step goes on with.
+    Held are the scene, which has the lights of the end of the step, and the tracks, of which row
+    `at` is of the end of the step; `ego` (11,) is of its beginning. `first` is BEGIN, or the agent
+    that an interrupted step goes on with.
 
     Returns:
         DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
         agent whose footprint needs more, to go on with; LEFT_PATH and the agent that is outside of
         its own corridor.
     """
+    scene, rows = contents(held)
+    row = Row(rows.valid[at], rows.poses[at], rows.velocities[at], rows.sizes[at])
     fleet, agents = scene.fleet, scene.agents
     heading = ego[EGO_HEADING]
     x = ego[0] + _EGO_CENTER * np.cos(heading)
@@ -59,7 +62,7 @@ def advance(scene: Scene, ego: FloatArray, row: Row, span: float, first: int) ->
     return DONE, 0
 
 
-@lean_kernel
+@part_kernel
 def _place_replayed(scene: Scene, row: Row) -> None:
     """Put the replayed tracks that are present where they are."""
     footprints = scene.footprints
@@ -72,7 +75,7 @@ def _place_replayed(scene: Scene, row: Row) -> None:
             set_box(footprints, place, x, y, heading, row.sizes[track, 0], row.sizes[track, 1])
 
 
-@lean_kernel
+@part_kernel
 def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
     """Remove agents that are far from the ego's centre, for good."""
     fleet = scene.fleet
@@ -83,7 +86,7 @@ def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
             scene.footprints.present[agent] = False
 
 
-@lean_kernel
+@part_kernel
 def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, span: float) -> None:
     """Progress and speed of an agent after the step, behind the lead that `find_lead` gave."""
     fleet, parameters = scene.fleet, scene.parameters
@@ -116,7 +119,7 @@ def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, spa
     fleet.speed[agent] = max(speed, 0.0)
 
 
-@lean_kernel
+@part_kernel
 def write_agents(fleet: Fleet, tracks: IntArray, row: Row) -> None:
     """Write the agents, whose tracks are given (A,), into a row; the gone as absent."""
     for agent in range(len(tracks)):
