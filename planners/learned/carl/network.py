@@ -103,6 +103,7 @@ class FeaturesExtractor(nn.Module):
         for conv, norm in zip(layers[0:-1:3], layers[1:-1:3], strict=True):
             if conv is not layers[0]:
                 hidden = conv(hidden)
+            assert isinstance(norm, nn.LayerNorm)
             turned = hidden.permute(0, 2, 3, 1)
             scale, shift = (part.permute(1, 2, 0) for part in (norm.weight, norm.bias))
             hidden = layer_norm(turned, scale.shape, scale, shift, norm.eps).relu_()
@@ -156,6 +157,7 @@ class CarlNetwork(nn.Module):
 def _first_layer(layer: nn.Module, pictures: Tensor) -> Tensor:
     """(B, 8, 126, 126), channels last, of pictures (B, 9, 256, 256) of 0 to 255."""
     assert isinstance(layer, nn.Conv2d)
+    assert layer.bias is not None
     if pictures.is_cuda or pictures.dtype != torch.uint8 or torch.is_grad_enabled():
         whole = pictures.to(torch.float32, memory_format=torch.channels_last, copy=True)
         return layer(whole.div_(255.0))
@@ -179,6 +181,7 @@ def _store_channels_last(cnn: nn.Sequential) -> None:
             for part in (layer.weight, layer.bias):
                 part.data = part.data.permute(1, 2, 0).contiguous().permute(2, 0, 1)
     first = cnn[0].weight
+    assert isinstance(first, Tensor)
     first.data = first.data.permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
 
 

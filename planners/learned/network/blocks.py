@@ -219,8 +219,9 @@ class EgoStateEncoder(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, >= 6) to (B, 128)."""
-        weight = torch.cat([layer.weight for layer in self.linears], dim=1).t()
-        place = torch.stack([layer.bias for layer in self.linears]) + self.pos_embed
+        linears = [layer for layer in self.linears if isinstance(layer, Linear)]
+        weight = torch.cat([layer.weight for layer in linears], dim=1).t()
+        place = torch.stack([layer.bias for layer in linears]) + self.pos_embed
         tokens = torch.addcmul(place, state[:, :STATE_CHANNELS, None], weight)
         query = self.query.expand(len(state), -1, -1)
         return self.attn(query, tokens, tokens)[:, 0]
@@ -286,7 +287,7 @@ class PointsEncoder(nn.Module):
         return both
 
 
-def _forget(encoder: nn.Module, keys: object) -> None:
+def _forget(encoder: PointsEncoder, keys: object) -> None:
     """Called when an encoder has got other weights."""
     encoder._kept = None
 
