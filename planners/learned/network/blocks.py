@@ -267,7 +267,7 @@ class PointsEncoder(nn.Module):
         self.first_mlp = _points_mlp(channels, 128, 256)
         self.second_mlp = _points_mlp(512, 256, DIM)
         self._kept: tuple[_FoldedMlp, _FoldedMlp] | None = None  # for inference
-        self.register_load_state_dict_post_hook(_forget)
+        self.register_load_state_dict_post_hook(_forget)  # type: ignore[no-untyped-call]
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, 128)."""
