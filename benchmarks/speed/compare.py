@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 FILES = ("dynamics", "metrics", "planners", "traffic", "pdm", "store", "scenario", "nets")
-LONG = "memory or help or batch_against or gpu or first_step or plain_sampler"
+LONG = "memory or help or batch_against or gpu or first_step or plain_one"
 SCENES = ("bench_scene_100", "s04_left_turn")  # of the ten that networks drive
 OPTIONS = "-q -p no:cacheprovider --benchmark-disable-gc --benchmark-timer=time.process_time"
 

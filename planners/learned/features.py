@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.device import on_device
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.sim.planner import History, SceneInfo
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, Tracks, Trajectory
@@ -139,13 +140,11 @@ def straight_on(history: History) -> Trajectory:
 
 def stack_scenes(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
     """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
-    import torch
-
     out: list[Any] = []
     for arrays in zip(*scenes, strict=True):
         shape = np.max([array.shape for array in arrays], axis=0)
         batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
-        out.append(torch.from_numpy(batch).to(device))
+        out.append(on_device(batch, device))
     return out

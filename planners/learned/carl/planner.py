@@ -18,7 +18,7 @@ from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
-from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.device import on_device, resolve_device
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
@@ -31,7 +31,6 @@ MAX_STEERING = 0.83775804096  # rad, 48 degrees: the target of a full steering a
 MAX_ACCELERATION, MAX_BRAKING = 2.4, 3.2  # m/s^2
 DT = 0.1  # s
 REVERSE_GAIN = 0.75  # of the present acceleration, where braking would reverse the ego
-CPU_BATCH = 4  # scenes in one pass on a CPU; more of them do not fit its caches
 
 Action = NDArray[np.float32]
 
@@ -90,17 +89,11 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         """Actions (2,) in [-1, 1]: acceleration and steering."""
         import torch
 
-        device = self.device
-        step = CPU_BATCH if device == "cpu" else len(features)
-        actions: list[Action] = []
+        parts = (np.stack(part) for part in zip(*features, strict=True))
+        pictures, measured = (on_device(part, self.device) for part in parts)
         with torch.inference_mode():
-            for start in range(0, len(features), step):
-                part = features[start : start + step]
-                pictures = torch.from_numpy(np.stack([f.pictures for f in part])).to(device)
-                measured = torch.from_numpy(np.stack([f.measurements for f in part])).to(device)
-                each = [network(pictures, measured).action for network in self.networks]
-                actions += list(torch.stack(each).mean(dim=0).cpu().numpy())
-        return actions
+            each = [network(pictures, measured).action for network in self.networks]
+            return list(torch.stack(each).mean(dim=0).cpu().numpy())
 
     def decode(self, output: Action, observation: Observation) -> state.Command:
         """The command, for the motion model without a tracker."""

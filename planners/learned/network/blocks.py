@@ -5,6 +5,7 @@ away is not computed here: the ego's own history, and all but the last step of a
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -98,13 +99,21 @@ class NeighborhoodAttention(nn.Module):
 
     def _bias(self, length: int) -> Tensor:
         """(1, heads, L, L) logits added to a pair of positions, -inf outside of the window."""
-        positions = torch.arange(length, device=self.rpb.device)
-        first = (positions - self.window // 2).clamp(0, length - self.window)
+        offset, outside = _windows(length, self.window, self.rpb.device)
+        return (self.rpb[:, offset] + outside)[None]
+
+
+@lru_cache
+def _windows(length: int, window: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(L, L) column of the bias for a pair of positions, and -inf where it is outside, else 0."""
+    with torch.inference_mode(False):
+        positions = torch.arange(length, device=device)
+        first = (positions - window // 2).clamp(0, length - window)
         ahead = positions[None, :] - first[:, None]
-        inside = (ahead >= 0) & (ahead < self.window)
-        offset = positions[None, :] - positions[:, None] + self.window - 1
-        bias = self.rpb[:, offset.clamp(0, 2 * self.window - 2)]
-        return bias.masked_fill(~inside, -torch.inf)[None]
+        offset = positions[None, :] - positions[:, None] + window - 1
+        outside = torch.zeros(length, length, device=device)
+        outside[(ahead < 0) | (ahead >= window)] = -torch.inf
+        return offset.clamp(0, 2 * window - 2), outside
 
 
 class _HistoryBlock(nn.Module):
@@ -210,8 +219,10 @@ class EgoStateEncoder(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, >= 6) to (B, 128)."""
-        embedded = [layer(state[:, i, None]) for i, layer in enumerate(self.linears)]
-        tokens = torch.stack(embedded, dim=1) + self.pos_embed
+        linears = [layer for layer in self.linears if isinstance(layer, Linear)]
+        weight = torch.cat([layer.weight for layer in linears], dim=1).t()
+        place = torch.stack([layer.bias for layer in linears]) + self.pos_embed
+        tokens = torch.addcmul(place, state[:, :STATE_CHANNELS, None], weight)
         query = self.query.expand(len(state), -1, -1)
         return self.attn(query, tokens, tokens)[:, 0]
 
@@ -255,15 +266,30 @@ class PointsEncoder(nn.Module):
         super().__init__()
         self.first_mlp = _points_mlp(channels, 128, 256)
         self.second_mlp = _points_mlp(512, 256, DIM)
+        self._kept: tuple[_FoldedMlp, _FoldedMlp] | None = None  # for inference
+        self.register_load_state_dict_post_hook(_forget)  # type: ignore[no-untyped-call]
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, 128)."""
         lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
         size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
-        first, second = _folded(self.first_mlp), _folded(self.second_mlp)
+        first, second = self._folded()
         parts = zip(torch.split(lines, size), torch.split(valid, size), strict=True)
         encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
         return encoded.reshape(*keep.shape[:2], encoded.shape[1])
+
+    def _folded(self) -> "tuple[_FoldedMlp, _FoldedMlp]":
+        if self._kept is not None and torch.is_inference_mode_enabled():
+            return self._kept
+        both = _folded(self.first_mlp), _folded(self.second_mlp)
+        if torch.is_inference_mode_enabled():
+            self._kept = both
+        return both
+
+
+def _forget(encoder: PointsEncoder, keys: object) -> None:
+    """Called when an encoder has got other weights."""
+    encoder._kept = None
 
 
 class _FoldedMlp(NamedTuple):

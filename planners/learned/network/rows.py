@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 ROWS, COLUMNS = 16, 2  # from which on a product is computed in the way of large ones
+# by count: as many rows, then the last one again up to `ROWS`
+_REPEATED = [torch.arange(ROWS, device="cpu").clamp(max=count - 1) for count in range(ROWS)]
 _CUBIC, _TWICE = 0.044715, 2.0 * math.sqrt(2.0 / math.pi)  # of the GELU by tanh
 
 
@@ -24,15 +26,23 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
         return functional.linear(x, weight, bias)
     rows, outputs = x.reshape(-1, x.shape[-1]), len(weight)
     count = len(rows)
+    if count == 0:
+        return x.new_zeros(*x.shape[:-1], outputs)
     if count < ROWS:
-        rows = functional.pad(rows, (0, 0, 0, ROWS - count))
+        rows = rows.index_select(0, _REPEATED[count])  # quicker than zeros after them
     if outputs < COLUMNS:
-        weight = functional.pad(weight, (0, 0, 0, COLUMNS - outputs))
-        bias = None if bias is None else functional.pad(bias, (0, COLUMNS - outputs))
+        weight = weight.expand(COLUMNS, -1)
+        bias = None if bias is None else bias.expand(COLUMNS)
     out = functional.linear(rows, weight, bias)
     if out.shape != (count, outputs):
         out = out[:count, :outputs]
     return out.reshape(*x.shape[:-1], outputs)
+
+
+def filled(x: Tensor) -> Tensor:
+    """Rows (N, C), and on a CPU the last one again up to `ROWS`, for several products in a row."""
+    few = 0 < len(x) < ROWS and not x.is_cuda
+    return x.index_select(0, _REPEATED[len(x)]) if few else x
 
 
 class Linear(nn.Linear):
@@ -104,16 +114,6 @@ def _over_rows(layer: Linear, x: Tensor) -> Tensor:
     return torch.baddbmm(layer.bias[:, None], weight, x)
 
 
-class Convolution(nn.Conv2d):
-    """`torch.nn.Conv2d`, on a CPU in the way of several pictures also for one."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        """(B, channels, H, W) to (B, channels, H, W)."""
-        if len(input) > 1 or input.is_cuda:
-            return super().forward(input)
-        return super().forward(input.expand(2, -1, -1, -1))[:1]
-
-
 class Scenes(NamedTuple):
     """How the rows of several scenes lie one after another."""
 
@@ -180,6 +180,9 @@ class Attention(nn.Module):
         `queries` says how many rows of `query` each scene has, `keys` how those of `context` lie.
         """
         asked = self.projected(query, context, context)
+        if len(queries) == 1:
+            q, k, v = (part[None] for part in asked)
+            return self.out_proj(self.mixed(q, k, v, keys.masks[0])[0])
         parts = zip(
             torch.split(asked[0], list(queries)),
             torch.split(asked[1], keys.counts),
@@ -199,6 +202,10 @@ class Attention(nn.Module):
         if key is value:
             dim = self.out_proj.in_features
             return linear(query, weights[:dim], biases[:dim]), *self.keys_values(key)
+        dim = 2 * self.out_proj.in_features
+        if query is key:
+            q, k = linear(query, weights[:dim], biases[:dim]).chunk(2, dim=-1)
+            return q, k, linear(value, weights[dim:], biases[dim:])
         q, k, v = (
             linear(x, weight, bias)
             for x, weight, bias in zip(
@@ -223,3 +230,15 @@ class Attention(nn.Module):
     def heads(self, x: Tensor) -> Tensor:
         """(..., heads, N, width) of projections (..., N, D)."""
         return x.reshape(*x.shape[:-1], self.num_heads, self.width).transpose(1, 2)
+
+
+def store_by_columns(network: nn.Module) -> None:
+    """Lay out the weights by columns; a product with few rows reads them faster so.
+
+    Neither names nor shapes change, and weights that are loaded later keep the layout.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            module.weight.data = module.weight.data.t().contiguous().t()
+        elif isinstance(module, Attention):
+            module.in_proj_weight.data = module.in_proj_weight.data.t().contiguous().t()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network import blocks
-from shiftsim.planners.learned.network.rows import Linear, without_padding
+from shiftsim.planners.learned.network.rows import Linear, store_by_columns, without_padding
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS = 6
@@ -93,6 +93,7 @@ class PlanTfNetwork(nn.Module):
         self.norm = nn.LayerNorm(blocks.DIM)
         self.trajectory_decoder = TrajectoryDecoder()
         self.agent_predictor = _head(2 * STEPS, bias=False)
+        store_by_columns(self)
 
     def forward(self, seen: Inputs, *, predict: bool = False) -> Outputs:
         """Plan for a batch; the agents' predictions only where asked for, no plan needs them."""

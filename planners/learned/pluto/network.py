@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network import blocks
-from shiftsim.planners.learned.network.rows import Linear, Scenes, without_padding
+from shiftsim.planners.learned.network.rows import Linear, Scenes, store_by_columns, without_padding
 from shiftsim.planners.learned.pluto.network_decoder import (
     DEPTH,
     HEADS,
@@ -106,6 +106,8 @@ class StaticObjectsEncoder(nn.Module):
 
     def forward(self, shape: Tensor, category: Tensor, valid: Tensor) -> Tensor:
         """(B, S, 128) from sizes (B, S, 2); zero where not valid (B, S)."""
+        if not category.numel():
+            return shape.new_zeros(*category.shape, blocks.DIM)
         tokens: Tensor = self.obj_encoder(shape) + self.type_emb(category)
         return tokens * valid[..., None]
 
@@ -143,6 +145,7 @@ class PlutoNetwork(nn.Module):
             Linear(blocks.DIM, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM)
         )
         self.ref_free_decoder = MlpLayer(blocks.DIM, 2 * blocks.DIM, 4 * STEPS)
+        store_by_columns(self)
 
     def forward(self, seen: Inputs) -> Outputs:
         """Plan for a batch."""

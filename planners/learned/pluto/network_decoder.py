@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder
-from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, present
+from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, filled, present
 
 DEPTH, HEADS, MODES, STEPS = 4, 4, 12, 80
 NUM_FREQUENCIES = 64
@@ -35,7 +35,9 @@ class MlpLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
-        return self.mlp(x)
+        rows = x.reshape(-1, x.shape[-1])
+        out = self.mlp(filled(rows))[: len(rows)]
+        return out.view(*x.shape[:-1], out.shape[1])
 
 
 class FourierEmbedding(nn.Module):
@@ -54,12 +56,14 @@ class FourierEmbedding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., 128)."""
-        turns = x[..., None] * self.freqs.weight * (2.0 * torch.pi)
-        waves = torch.cat([turns.cos(), turns.sin(), x[..., None]], dim=-1)
-        total = self.mlps[0](waves[..., 0, :])
+        rows = x.reshape(-1, x.shape[-1])
+        few = filled(rows)[..., None]
+        turns = few * self.freqs.weight * (2.0 * torch.pi)
+        waves = torch.cat([turns.cos(), turns.sin(), few], dim=-1)
+        total = self.mlps[0](waves[:, 0])
         for index in range(1, len(self.mlps)):
-            total = total + self.mlps[index](waves[..., index, :])
-        return self.to_out(total)
+            total = total + self.mlps[index](waves[:, index])
+        return self.to_out(total)[: len(rows)].view(*x.shape[:-1], DIM)
 
 
 class DecoderBlock(nn.Module):

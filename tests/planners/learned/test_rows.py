@@ -6,7 +6,6 @@ torch = pytest.importorskip("torch")
 
 from shiftsim.planners.learned.network.rows import (  # noqa: E402  # needs torch
     Attention,
-    Convolution,
     Linear,
     linear,
     make_scenes,
@@ -38,13 +37,6 @@ def test_few_rows_and_columns_are_those_of_a_large_product(outputs, bias):
 def test_leading_dimensions_are_kept():
     x, weight = torch.randn(2, 3, 5).transpose(0, 1), torch.randn(4, 5)
     torch.testing.assert_close(linear(x, weight), x @ weight.T)
-
-
-def test_one_picture_is_convolved_as_several():
-    layer = Convolution(3, 5, 3, stride=2)
-    x = torch.randn(4, 3, 9, 9)
-    assert layer(x[:1]).shape == (1, 5, 4, 4)
-    torch.testing.assert_close(layer(x[:1]), layer(x)[:1], rtol=0.0, atol=ROUNDING)
 
 
 def official(layer, query, context, keep):

@@ -15,7 +15,7 @@ from shiftsim.planners.learned.deterministic import keyed_normals
 from shiftsim.planners.learned.diffusion.network.decoder import DiT, Prepared
 from shiftsim.planners.learned.diffusion.network.encoder import SceneEncoder
 from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE, STATE, sample
-from shiftsim.planners.learned.network.rows import Attention
+from shiftsim.planners.learned.network.rows import store_by_columns
 from shiftsim.world.ranges import CHECKPOINT, require
 
 ROWS = 4  # of agents; a matrix product of 12 rows is faster than one of 11
@@ -99,7 +99,7 @@ class DiffusionNetwork(nn.Module):
             {name: Normaliser(row) for name, row in args["observation_normalizer"].items()}
         )
         self.state_normaliser = Normaliser(args["state_normalizer"])
-        _store_by_columns(self)
+        store_by_columns(self)
 
     def normalise(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The inputs as the network reads them; those without a normaliser as they are."""
@@ -151,18 +151,6 @@ class DiffusionNetwork(nn.Module):
     def denormalise(self, states: Tensor) -> Tensor:
         """(..., 4) x, y [m], cos, sin of normalised ones."""
         return states * self.state_normaliser.std + self.state_normaliser.mean
-
-
-def _store_by_columns(network: nn.Module) -> None:
-    """Lay out the weights by columns; a product with few rows reads them faster so.
-
-    Neither names nor shapes change, and weights that are loaded later keep the layout.
-    """
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            module.weight.data = module.weight.data.t().contiguous().t()
-        elif isinstance(module, Attention):
-            module.in_proj_weight.data = module.in_proj_weight.data.t().contiguous().t()
 
 
 def _padded(x: Tensor) -> Tensor:
