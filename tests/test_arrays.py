@@ -200,6 +200,7 @@ print(sum(norms.stats.cache_hits.values()), sum(digest.stats.cache_hits.values()
 """
 
 
+@pytest.mark.thorough
 def test_kept_kernels_are_used_without_all_that_numba_compiles_with(tmp_path):
     """What is loaded calls only what is there, and what is compiled later finds the rest."""
     path = tmp_path / "program.py"

@@ -357,14 +357,14 @@ def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[fl
     """The next plan of each, or the error in its place, and how long each took [s]."""
     planners = [cast(BatchPlanner, rollout.planner) for rollout in rollouts]
     observe = [rollout.observe for rollout in rollouts]
-    began = perf_counter()
     if isinstance(planners[0], BatchPlanner):
-        plans = planners[0].plan_batch(planners, [one() for one in observe])
+        seen, began = [one() for one in observe], perf_counter()
+        plans = planners[0].plan_batch(planners, seen)
         return [*plans], [(perf_counter() - began) / len(plans)] * len(plans)
     out, seconds = list[Plan | Exception](), list[float]()
     for planner, one in zip(planners, observe, strict=True):
-        seen, began = one(), perf_counter()
-        out.append(_attempt(partial(planner.plan, seen)) if planner is not None else None)
+        observation, began = one(), perf_counter()
+        out.append(_attempt(partial(planner.plan, observation)) if planner is not None else None)
         seconds.append(perf_counter() - began)
     return out, seconds
 

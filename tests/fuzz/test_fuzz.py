@@ -39,6 +39,7 @@ def outcomes(*arguments: object) -> Counter[str]:
 
 @pytest.mark.slow
 @pytest.mark.learned
+@pytest.mark.thorough
 def test_what_once_failed_is_read_or_refused():
     assert outcomes().total() == sum(1 for _ in CORPUS.glob("*/*"))
 

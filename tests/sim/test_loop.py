@@ -249,6 +249,9 @@ class Clock:
 class Group(Recorder):
     """Plans for several scenarios at once."""
 
+    def fork(self):
+        return Group()
+
     def plan_batch(self, planners, observations):
         return [p.plan(o) for p, o in zip(planners, observations, strict=True)]
 

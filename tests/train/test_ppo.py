@@ -74,6 +74,7 @@ def short(monkeypatch):
         monkeypatch.setattr(ppo, name, value)
 
 
+@pytest.mark.thorough
 def test_it_goes_on_from_imitation_and_writes_a_network(short, small):
     settings = small(ppo_samples=128, samples=128)
     lines = []

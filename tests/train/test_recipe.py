@@ -28,6 +28,7 @@ def train(settings, **options):
     Training(settings, lambda text: None, **options).run()
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_curve_and_network(small, trained):
     first, _ = trained
     again, other = small("again"), small("other", seed=6)
