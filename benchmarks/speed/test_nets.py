@@ -286,7 +286,7 @@ def test_rollouts_on_a_gpu(store, size, capsys, name):
     import torch
 
     batches = GPU_BATCHES if torch.cuda.is_available() and size(2) > 1 else (1, 2)
-    few = ["--scenarios", "2", "--seeds", "1", "--iterations", "4"] if len(batches) == 2 else []
+    few = ["--scenarios", "2", "--seeds", "1", "--iterations", "6"] if len(batches) == 2 else []
     gpu.main([str(store), "--planners", name, "--batches", *map(str, batches), *few])
     printed = capsys.readouterr().out
     print(f"\n{printed}", end="")
