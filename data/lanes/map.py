@@ -56,7 +56,9 @@ class _Maker:
         if not source.pieces:
             what = f"map {source.name!r} has no lane that cars may use"
             raise MapError(what, "leave this scene out: without lanes there is no route")
-        points = np.concatenate([np.zeros((0, 2)), *(piece.left for piece in source.pieces)])
+        lines = [line for piece in source.pieces for line in (piece.left, piece.right)]
+        lines += [shapely.get_coordinates(area) for area in source.paved]
+        points = np.concatenate(lines)
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         require(MAP_EXTENT, "extent", extent, f"map {source.name!r}: the lanes'", error=MapError)
         self.source, self.warnings = source, Counter[str]()
@@ -78,7 +80,7 @@ class _Maker:
             crosswalks=parts.areas(source.crosswalks),
             walkways=parts.areas(source.walkways),
             car_parks=parts.areas(source.car_parks),
-            drivable_areas=parts.areas(source.drivable_areas or self._covered()),
+            drivable_areas=parts.areas(self._drivable()),
         )
         ids = [*parts.lane_ids, *parts.connector_ids]
         runs = [lane.parts for lane in graph.lanes]
@@ -162,8 +164,11 @@ class _Maker:
             return LIGHT_KIND
         return PASS_THROUGH if all(self.graph.connectors[i].is_seam for i in numbers) else 0
 
-    def _covered(self) -> list[shapely.Polygon]:
-        """What the pieces cover, for a source without drivable areas."""
+    def _drivable(self) -> list[shapely.Polygon]:
+        """The drivable areas; what the pieces cover, for a source without."""
+        found = [*self.source.drivable_areas, *drivable_tiles(self.source.paved)]
+        if found:
+            return found
         pieces = [piece.polygon for piece in self.source.pieces if piece.polygon.area > 0]
         return drivable_tiles(merge_areas([*pieces, *self.source.car_parks], _CLOSING))
 

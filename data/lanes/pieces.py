@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import FloatArray
+from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.opendrive.shapes import BASELINE_STEP, divide, join_lines, lane_polygon
 
 _APART = 1e-3  # m, closer vertices of a source are one
@@ -71,13 +72,29 @@ class StopArea:
     piece: str | None = None  # piece that ends at it; None: found by its place
 
 
+def stop_area(piece: LanePiece, kind: int, ends: FloatArray | None = None) -> StopArea | None:
+    """The stop polygon before the stop line of a piece.
+
+    `ends` (2, 2) are those of the line [m], where it is not the end of the piece. None where the
+    line encloses nothing with what lies before it.
+    """
+    if ends is None:
+        ends = np.stack([piece.left[-1], piece.right[-1]])
+    step = piece.middle[-2] - piece.middle[-1]
+    back = STOP_LINE_DEPTH * step / np.hypot(*step)
+    polygon = shapely.Polygon(np.concatenate([ends, ends[::-1] + back])).buffer(0)
+    found = isinstance(polygon, shapely.Polygon) and polygon.area > 0
+    return StopArea(polygon, kind, piece.id) if found else None
+
+
 @dataclass(frozen=True)
 class MapSource:
     """All that a source tells of a map, in a local metric frame."""
 
     name: str  # of the map
     pieces: Sequence[LanePiece]  # lanes that cars may use
-    drivable_areas: Sequence[shapely.Polygon] = ()  # none: the union of the lanes
+    drivable_areas: Sequence[shapely.Polygon] = ()  # they and `paved` none: union of the lanes
+    paved: Sequence[shapely.Polygon] = ()  # drivable, too: merged and cut into tiles
     stop_areas: Sequence[StopArea] = ()
     crosswalks: Sequence[shapely.Polygon] = ()
     walkways: Sequence[shapely.Polygon] = ()

@@ -18,25 +18,13 @@ import shapely
 
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import LanePiece, MapSource
+from shiftsim.data.open_data.codes import TYPES
 from shiftsim.data.open_data.scenes import Scene
 from shiftsim.data.open_data.source import Source, find_below, text_or_none
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.world.state import AgentKind
 
-# by type: what nuPlan calls it, length and width [m]
-TYPES = {
-    "vehicle": (AgentKind.VEHICLE, 4.6, 1.9),
-    "bus": (AgentKind.VEHICLE, 11.6, 2.9),
-    "cyclist": (AgentKind.BICYCLE, 1.8, 0.6),
-    "motorcyclist": (AgentKind.BICYCLE, 2.2, 0.8),
-    "pedestrian": (AgentKind.PEDESTRIAN, 0.7, 0.7),
-    "construction": (AgentKind.CZONE_SIGN, 0.5, 0.5),
-    "riderless_bicycle": (AgentKind.GENERIC_OBJECT, 1.6, 0.5),
-    "static": (AgentKind.GENERIC_OBJECT, 1.0, 1.0),
-    "unknown": (AgentKind.GENERIC_OBJECT, 1.0, 1.0),
-}
 EGO = "AV"
 _COLUMNS = {
     "observed": pa.bool_(),

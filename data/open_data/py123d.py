@@ -4,78 +4,56 @@ py123d itself is not needed: its files are Arrow tables whose objects are packed
 have no version of their own, so every column is checked; tested with files of py123d 0.7.0.
 """
 
+from collections import defaultdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.open_data.py123d_map import HINT, need_msgpack, read_map, unpack
-from shiftsim.data.open_data.scenes import LightStates, Scene
-from shiftsim.data.open_data.source import Source, find_below
+from shiftsim.data.lanes.lights import LightStates, states_of_lists
+from shiftsim.data.lanes.map import PieceMap, build_lane_map
+from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea
+from shiftsim.data.open_data import codes
+from shiftsim.data.open_data.packed import PackedTable, need_msgpack, vectors, yaws
+from shiftsim.data.open_data.scenes import Scene
+from shiftsim.data.open_data.source import Source, find_below, text_or_none
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConversionError
-from shiftsim.world.state import AgentKind, LightStatus
+from shiftsim.world.state import AgentKind
 
+HINT = "convert the log again with py123d 0.7.0"  # the version that is tested
 EGO = "ego"
-
-
-def _codes(count: int, **groups: str) -> dict[int, AgentKind]:
-    out = dict.fromkeys(range(count), AgentKind.GENERIC_OBJECT)
-    for kind, codes in groups.items():
-        out |= dict.fromkeys(map(int, codes.split()), AgentKind[kind.upper()])
-    return out
-
-
-# by class of labels: kind of every label
-LABELS = {
-    "DefaultBoxDetectionLabel": _codes(
-        12, vehicle="0 1 2", bicycle="3", pedestrian="4", traffic_cone="7", barrier="9"
-    ),
-    "WODMotionBoxDetectionLabel": _codes(5, vehicle="1", pedestrian="2", bicycle="3"),
-    "WODPerceptionBoxDetectionLabel": _codes(5, vehicle="1", pedestrian="2", bicycle="4"),
-    "NuScenesBoxDetectionLabel": _codes(
-        23,
-        vehicle="0 1 2 3 4 5 6 7",
-        bicycle="8 9",
-        pedestrian="10 11 12 13 14 15 16",
-        traffic_cone="17",
-        barrier="18",
-    ),
-    "AV2SensorBoxDetectionLabel": _codes(
-        30,
-        vehicle="1 5 6 10 17 18 19 24 25 26",
-        bicycle="3 14 29",
-        pedestrian="15 16 22 27",
-        traffic_cone="7 8",
-        czone_sign="12",
-    ),
-    "NuPlanBoxDetectionLabel": _codes(
-        7, vehicle="0", bicycle="1", pedestrian="2", traffic_cone="3", barrier="4", czone_sign="5"
-    ),
-}
-_LICENCES = {
-    "av2": "CC BY-NC-SA 4.0",
-    "nuscenes": "CC BY-NC-SA 4.0",
-    "wod": "Waymo Open Dataset License Agreement for Non-Commercial Use",
-}
-_LIGHTS = (LightStatus.GREEN, LightStatus.YELLOW, LightStatus.RED)  # others: unknown
 _POSE, _BOX, _VELOCITY = (pa.list_(pa.float64(), width) for width in (7, 10, 3))
-_EGO_COLUMNS = {"timestamp_us": pa.int64(), "imu_se3": _POSE}
-_BOX_COLUMNS = {
-    "timestamp_us": pa.int64(),
-    "bounding_box_se3": pa.list_(_BOX),
-    "track_token": pa.list_(pa.string()),
-    "label": pa.list_(pa.uint16()),
-    "velocity_3d": pa.list_(_VELOCITY),
+_FILES = {  # columns by file of a log; those of boxes and lights hold lists
+    "sync": {},
+    "ego_state_se3": {"timestamp_us": pa.int64(), "imu_se3": _POSE},
+    "box_detections_se3": {
+        "timestamp_us": pa.int64(),
+        "bounding_box_se3": pa.list_(_BOX),
+        "track_token": pa.list_(pa.string()),
+        "velocity_3d": pa.list_(_VELOCITY),
+        "label": pa.list_(pa.uint16()),
+    },
+    "traffic_light_detections": {
+        "timestamp_us": pa.int64(),
+        "lane_id": pa.list_(pa.int32()),
+        "status": pa.list_(pa.uint8()),
+    },
 }
-_LIGHT_COLUMNS = {
-    "timestamp_us": pa.int64(),
-    "lane_id": pa.list_(pa.int32()),
-    "status": pa.list_(pa.uint8()),
+_LINES = {"left": "left_boundary", "right": "right_boundary", "center": "centerline"}
+_MAP = {
+    "object_id": pa.int64(),
+    "map_layer": pa.int8(),
+    "features": pa.binary(),
+    "wkb": pa.binary(),
 }
+_WITH_FEATURES = ("lane", "lane group", "stop zone")
+_DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
 
 
 class Py123dReader:
@@ -89,26 +67,25 @@ class Py123dReader:
 
     def files(self, path: Path) -> list[Path]:
         """Tracks, lights, and the map of the log or of its city."""
-        names = "sync", "ego_state_se3", "box_detections_se3", "traffic_light_detections"
-        files = [path / f"{name}.arrow" for name in names]
-        return [file for file in (*files, _map_path(path, _notes(path))) if file.is_file()]
+        files = [path / f"{name}.arrow" for name in _FILES]
+        files.append(_map_path(path, _open(path, "sync")[1]))
+        return [file for file in files if file.is_file()]
 
     def read(self, path: Path) -> Scene:
         """One log."""
-        notes = _notes(path)
+        notes = _open(path, "sync")[1]  # of the whole log
         dataset, split = str(notes.get("dataset", "")), str(notes.get("split", ""))
         if dataset.startswith("wod") and split.endswith("test"):
-            raise ConversionError(
-                f"{path}: split {split!r} hides the future", "convert train or val"
-            )
+            what = f"{path}: split {split!r} hides the future"
+            raise ConversionError(what, "convert train or val")
         lights = _read_lights(path)
         lit = frozenset() if lights is None else frozenset(lights.names)
         map_path = _map_path(path, notes)
         city = path.name if map_path.parent == path else str(notes.get("location", ""))
         samples = _read_tracks(path)
         with Source(map_path).naming():
-            lanes = read_map(map_path, f"{dataset}-{city}", lit)
-        licences = [text for name, text in _LICENCES.items() if dataset.startswith(name)]
+            lanes = _read_map(map_path, f"{dataset}-{city}", lit)
+        licences = [text for name, text in codes.LICENCES.items() if dataset.startswith(name)]
         return Scene(
             samples=samples,
             map=lanes,
@@ -121,21 +98,10 @@ class Py123dReader:
         )
 
 
-def _open(
-    log: Path, name: str, columns: dict[str, pa.DataType]
-) -> tuple[Source, pa.Table, dict[Any, Any]]:
-    """A file of a log, some columns of it, and the `metadata` of its schema."""
-    source = Source(log / f"{name}.arrow", HINT)
-    table = source.columns(columns, prefix=f"{name}.")
-    packed = (table.schema.metadata or {}).get(b"metadata")
-    if packed is None:
-        raise source.fault("the schema has no 'metadata'")
-    return source, table, unpack(source, packed, "'metadata'")
-
-
-def _notes(log: Path) -> dict[Any, Any]:
-    """What py123d says of a whole log."""
-    return _open(log, "sync", {})[2]
+def _open(log: Path, name: str) -> tuple[PackedTable, dict[Any, Any]]:
+    """A file of a log, and the `metadata` of its schema."""
+    file = PackedTable(log / f"{name}.arrow", _FILES[name], HINT, prefix=f"{name}.")
+    return file, file.notes()
 
 
 def _map_path(log: Path, notes: dict[Any, Any]) -> Path:
@@ -150,37 +116,33 @@ def _map_path(log: Path, notes: dict[Any, Any]) -> Path:
 def _read_tracks(log: Path) -> TrackSamples:
     """The boxes of all steps, and the box of the recording car."""
     ego_us, ego = _ego_boxes(log)
-    source, table, notes = _open(log, "box_detections_se3", _BOX_COLUMNS)
-    stamps = source.numbers(table, "timestamp_us", "time").astype(np.int64)
-    lists = {name: table[name].combine_chunks() for name in list(_BOX_COLUMNS)[1:]}
-    counts = {n: lists[n].value_lengths().fill_null(0).to_numpy() for n in lists}
-    for name, count in counts.items():
-        if (count != counts["label"]).any():
-            raise source.fault(f"{name!r} and 'label' differ in length")
+    file, notes = _open(log, "box_detections_se3")
+    stamps = file.stamps(file.table)
+    counts, columns = file.lists(*list(_FILES["box_detections_se3"])[1:])
     label_class = str(notes.get("box_detection_label_class")).rpartition(".")[2]
-    if label_class not in LABELS:
+    if label_class not in codes.LABELS:
         what = f"label class {label_class!r} is unknown"
-        raise source.fault(what, f"known are: {', '.join(LABELS)}")
-    labels, kinds = lists["label"].flatten().to_pylist(), LABELS[label_class]
-    for label in sorted(set(labels) - set(kinds)):
-        raise source.fault(f"label {label} of {label_class} is unknown")
-    category = np.array([kinds[label] for label in labels], np.int64)
-    boxes = _vectors(lists["bounding_box_se3"].flatten())
-    _require_boxes(source, boxes)
-    velocities = _vectors(lists["velocity_3d"].flatten())[:, :2]
+        raise file.fault(what, f"known are: {', '.join(codes.LABELS)}")
+    boxes, tokens, velocities, labels = columns
+    kinds = codes.LABELS[label_class]
+    if unknown := set(labels.to_pylist()) - set(kinds):
+        raise file.fault(f"label {min(unknown)} of {label_class} is unknown")
+    category = [kinds[label] for label in labels.to_pylist()]
+    every = np.concatenate([file.boxes(vectors(boxes)), ego])
+    moves = np.concatenate([vectors(velocities)[:, :2], np.full((len(ego), 2), np.nan)])
     names = [kind.name.lower() for kind in AgentKind]
-    with source.naming():
+    with file.naming():
         return make_samples(
             log.name,
-            time_us=np.concatenate([np.repeat(stamps, counts["label"]), ego_us]),
-            ids=np.array([*lists["track_token"].flatten().to_pylist(), *[EGO] * len(ego)]),
-            category=np.concatenate([category, np.full(len(ego), AgentKind.VEHICLE)]),
+            time_us=np.concatenate([np.repeat(stamps, counts), ego_us]),
+            ids=np.array([*tokens.to_pylist(), *[EGO] * len(ego)]),
+            category=np.array([*category, *[AgentKind.VEHICLE] * len(ego)], np.int64),
             categories=names,
             kind_of=dict(zip(names, AgentKind, strict=True)),
-            xy=np.concatenate([boxes[:, :2], ego[:, :2]]),
-            headings=np.concatenate([_yaws(boxes[:, 3:7]), ego[:, 2]]),
-            velocities=np.concatenate([velocities, np.full((len(ego), 2), np.nan)]),
-            sizes=np.concatenate([boxes[:, 7:9], ego[:, 3:]]),
+            xy=every[:, :2],
+            headings=every[:, 2],
+            velocities=moves,
+            sizes=every[:, 3:],
         )
 
 
@@ -189,55 +151,78 @@ def _ego_boxes(log: Path) -> tuple[IntArray, FloatArray]:
 
     Stored velocities of egos are 0 in many rows in which the car moves, and are not used.
     """
-    source, table, notes = _open(log, "ego_state_se3", _EGO_COLUMNS)
-    stamps = source.numbers(table, "timestamp_us", "time").astype(np.int64)
-    poses = _vectors(table["imu_se3"].combine_chunks())
+    file, notes = _open(log, "ego_state_se3")
+    poses = vectors(file.table["imu_se3"].combine_chunks())
     try:
         to_center = np.array(notes["center_to_imu_se3"], np.float64).reshape(7)
         size = np.array([notes["length"], notes["width"]], np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise source.fault(f"'metadata' lacks {error}") from error
+        raise file.fault(f"'metadata' lacks {error}") from error
     sizes = np.broadcast_to(size, (len(poses), 2))
-    _require_boxes(source, np.column_stack([poses, sizes]))
-    heading = _yaws(poses[:, 3:])
-    cos, sin = np.cos(heading), np.sin(heading)
-    x = poses[:, 0] + cos * to_center[0] - sin * to_center[1]
-    y = poses[:, 1] + sin * to_center[0] + cos * to_center[1]
-    boxes = np.column_stack([x, y, heading + _yaws(to_center[None, 3:]), sizes])
-    stamps, first = np.unique(stamps, return_index=True)  # of equal stamps the first is kept
+    boxes = file.boxes(np.column_stack([poses, sizes]))
+    cos, sin = np.cos(boxes[:, 2]), np.sin(boxes[:, 2])
+    boxes[:, 0] = boxes[:, 0] + cos * to_center[0] - sin * to_center[1]
+    boxes[:, 1] = boxes[:, 1] + sin * to_center[0] + cos * to_center[1]
+    boxes[:, 2] += yaws(to_center[None, 3:])
+    # of equal stamps the first is kept
+    stamps, first = np.unique(file.stamps(file.table), return_index=True)
     return stamps, boxes[first]
-
-
-def _require_boxes(source: Source, boxes: FloatArray) -> None:
-    for field, part in (("position", slice(2)), ("rotation", slice(3, 7)), ("size", slice(7, 9))):
-        source.require(field, boxes[:, part], "box")
-
-
-def _vectors(column: pa.FixedSizeListArray) -> FloatArray:
-    """(R, width) a column of vectors; NaN where there is none."""
-    out = np.full((len(column), column.type.list_size), np.nan)
-    found = column.drop_null().flatten().to_numpy(zero_copy_only=False)
-    out[column.is_valid().to_numpy(zero_copy_only=False)] = found.reshape(-1, out.shape[1])
-    return out
-
-
-def _yaws(q: FloatArray) -> FloatArray:
-    """(R,) headings of quaternions (R, 4) w, x, y, z [rad]."""
-    w, x, y, z = q.T
-    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _read_lights(log: Path) -> LightStates | None:
     if not (log / "traffic_light_detections.arrow").is_file():
         return None
-    source, table, _ = _open(log, "traffic_light_detections", _LIGHT_COLUMNS)
-    stamps = source.numbers(table, "timestamp_us", "time").astype(np.int64)
-    lanes, codes = (table[name].to_pylist() for name in ("lane_id", "status"))
-    names = sorted({lane for row in lanes for lane in row or ()})
-    column = {lane: i for i, lane in enumerate(names)}
-    status = np.full((len(stamps), len(names)), LightStatus.ABSENT, np.int64)
-    for row, (ids, values) in enumerate(zip(lanes, codes, strict=True)):
-        for lane, code in zip(ids or (), values or (), strict=False):
-            status[row, column[lane]] = _LIGHTS[code] if code < 3 else LightStatus.UNKNOWN
-    order = np.argsort(stamps, kind="stable")
-    return LightStates(tuple(map(str, names)), stamps[order], status[order])
+    file, _ = _open(log, "traffic_light_detections")
+    lanes, shown = (file.table[name].to_pylist() for name in ("lane_id", "status"))
+    return states_of_lists(file.stamps(file.table), lanes, shown, codes.LIGHT_CODES)
+
+
+@lru_cache(maxsize=1)  # logs of one city follow each other
+def _read_map(path: Path, name: str, lit: frozenset[str]) -> PieceMap:
+    """A map; `lit` are the lanes that have a light."""
+    file = PackedTable(path, _MAP, HINT)
+    found: defaultdict[str, dict[str, dict[Any, Any]]] = defaultdict(dict)
+    areas: defaultdict[str, list[shapely.Polygon]] = defaultdict(list)
+    stops: list[StopArea] = []
+    for number, code, features, wkb in zip(*(file.table[n].to_pylist() for n in _MAP), strict=True):
+        layer = codes.LAYERS.get(code, "")
+        place = f"{layer} {number}"
+        if layer in _WITH_FEATURES:
+            found[layer][str(number)] = file.unpack(features or b"", place)
+        if layer and layer != "lane":
+            areas[layer].append(file.polygon(wkb, place))
+        if layer == "stop zone":
+            kind = found[layer][str(number)].get("stop_zone_type")
+            code = kind if isinstance(kind, int) else 0
+            stops.append(StopArea(areas[layer][-1], codes.STOP_CODES.get(code, codes.OTHER_STOP)))
+    inside = {n for n, g in found["lane group"].items() if g.get("intersection_id") is not None}
+    return build_lane_map(
+        MapSource(
+            name=name,
+            pieces=[
+                LanePiece(
+                    id=number,
+                    **{s: file.line_of(lane, key, f"lane {number}") for s, key in _LINES.items()},
+                    successors=tuple(map(str, lane.get("successor_ids") or ())),
+                    left_neighbor=text_or_none(lane.get("left_lane_id")),
+                    right_neighbor=text_or_none(lane.get("right_lane_id")),
+                    is_connector=text_or_none(lane.get("lane_group_id")) in inside,
+                    speed_limit=_limit(file, lane, number),
+                    light=number if number in lit else None,
+                )
+                for number, lane in found["lane"].items()
+                if lane.get("lane_type") != codes.BIKE_LANE
+            ],
+            # Waymo has no drivable areas
+            drivable_areas=[a for n in _DRIVABLE for a in areas[n] if areas["drivable area"]],
+            stop_areas=stops,
+            crosswalks=areas["crosswalk"],
+            walkways=areas["walkway"],
+            car_parks=areas["car park"],
+        )
+    )
+
+
+def _limit(file: Source, lane: dict[Any, Any], number: str) -> float | None:
+    limit = lane.get("speed_limit_mps")
+    return None if limit is None else file.number(limit, "speed limit", f"lane {number}")

@@ -14,14 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
 from shiftsim import __version__
-from shiftsim.arrays import IntArray
 from shiftsim.data.deepplan.convert import Progress, Spread, one_by_one
 from shiftsim.data.deepplan.parts import Broken, alone_in
 from shiftsim.data.deepplan.recording import Converted
 from shiftsim.data.deepplan.windows import ConversionConfig
+from shiftsim.data.lanes.lights import LightStates, light_rows
 from shiftsim.data.lanes.map import PieceMap
 from shiftsim.data.store.schema import VERSION
 from shiftsim.data.store.tables import digest
@@ -30,21 +28,10 @@ from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.tracks.scenarios import make_scenarios, write_converted
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import TrafficLights
 
 _SAVE_EVERY = 1000  # scenes; what is saved is not converted again
-_NOT_LISTED = -1
 # a recording car is an ego whatever it does, also standing
 _RECORDED = ConversionConfig(min_peak_speed=0.0, max_overlap=1e6)
-
-
-@dataclass(frozen=True)
-class LightStates:
-    """States of lights over time; each holds until the next one."""
-
-    names: tuple[str, ...]  # L names, as in `LanePiece.light`
-    time_us: IntArray  # (G,) ascending [us]
-    status: IntArray  # (G, L) LightStatus codes, -1 not listed
 
 
 @dataclass(frozen=True)
@@ -183,19 +170,6 @@ def convert_scene(scene: Scene, *, vehicles: bool = False) -> Made:
     converted = replace(converted, recording=recording, windows=windows)
     warnings = Counter(scene.map.warnings) + Counter(converted.summary.warnings)
     return Made(scene.map.road, converted, warnings)
-
-
-def light_rows(states: LightStates, lights: Mapping[str, str], time_us: IntArray) -> TrafficLights:
-    """Status of every connector with a light at some times; not listed before the first state.
-
-    `lights` holds the name of the light by connector.
-    """
-    column = {name: i for i, name in enumerate(states.names)}
-    known = {connector: column[name] for connector, name in lights.items() if name in column}
-    at = np.searchsorted(states.time_us, time_us, side="right") - 1
-    status = states.status[np.maximum(at, 0)][:, list(known.values())]
-    status[at < 0] = _NOT_LISTED
-    return TrafficLights(tuple(known), status.astype(np.int8))
 
 
 class _Converter:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.pieces import clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.errors import ConversionError, DataError
@@ -128,6 +128,10 @@ class Source:
         values = table[column].to_numpy().astype(np.float64, copy=False)
         self.require(field, values, f"column {column!r}")
         return values
+
+    def stamps(self, table: pa.Table) -> IntArray:
+        """(R,) the column of time stamps [us]."""
+        return self.numbers(table, "timestamp_us", "time").astype(np.int64)
 
 
 def find_below(folder: Path, pattern: str, remedy: str) -> list[Path]:

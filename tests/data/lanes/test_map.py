@@ -149,6 +149,15 @@ def test_a_map_without_lanes_is_refused():
     assert error.value.hint
 
 
+def test_paved_areas_wider_than_a_map_are_refused_before_they_are_tiled(monkeypatch):
+    monkeypatch.setattr(
+        "shiftsim.data.lanes.map.drivable_tiles", lambda areas: pytest.fail("tiled")
+    )
+    lane, wide = piece("a", (0, 0), (9, 0)), piece("b", (0, 0), (1e6, 0)).polygon
+    with pytest.raises(MapError, match="'extent': 1000000 is beyond"):
+        build_lane_map(MapSource("x", [lane], paved=[wide]))
+
+
 def test_two_lanes_of_one_id_are_refused():
     with pytest.raises(MapError, match="lane 'a': its id occurs twice"):
         build_lane_map(MapSource("x", [piece("a", (0, 0), (9, 0)), piece("a", (9, 0), (20, 0))]))

@@ -1,0 +1,78 @@
+"""Traffic lights of a recording: their states, however a data set tells them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from shiftsim.arrays import IntArray
+from shiftsim.world.state import LightStatus, TrafficLights
+
+
+@dataclass(frozen=True)
+class LightStates:
+    """States of lights over time; each holds until the next one."""
+
+    names: tuple[str, ...]  # L names, as in `LanePiece.light`
+    time_us: IntArray  # (G,) ascending [us]
+    status: IntArray  # (G, L) LightStatus codes, -1 not listed
+
+
+class Cycle(NamedTuple):
+    """What a light shows again and again, in time steps."""
+
+    status: Sequence[LightStatus]
+    lengths: Sequence[float]  # of each status; at least 0, not all 0
+    offset: float  # step at which it begins
+
+
+def states_of_cycles(
+    cycles: Mapping[str, Cycle], steps: IntArray, step_s: float
+) -> LightStates | None:
+    """States of lights (by name) with fixed cycles, a row per step; None where there is none."""
+    columns = [
+        np.array(cycle.status, np.int64)[
+            np.searchsorted(
+                np.cumsum(cycle.lengths), (steps - cycle.offset) % sum(cycle.lengths), side="right"
+            )
+        ]
+        for cycle in cycles.values()
+    ]
+    if not columns:
+        return None
+    time_us = np.rint(steps * step_s * 1e6).astype(np.int64)
+    return LightStates(tuple(cycles), time_us, np.stack(columns, axis=1))
+
+
+def states_of_lists(
+    time_us: IntArray,
+    lights: Sequence[Sequence[int] | None],
+    codes: Sequence[Sequence[int] | None],
+    meaning: Mapping[int, LightStatus],
+) -> LightStates:
+    """States of lights that are listed anew, with a code for each, at each time (G,) [us].
+
+    `meaning` is that of codes; others are unknown.
+    """
+    names = sorted({light for row in lights for light in row or ()})
+    column = {light: number for number, light in enumerate(names)}
+    table = np.full((len(time_us), len(names)), LightStatus.ABSENT, np.int64)
+    for row, (found, shown) in enumerate(zip(lights, codes, strict=True)):
+        for light, code in zip(found or (), shown or (), strict=False):
+            table[row, column[light]] = meaning.get(code, LightStatus.UNKNOWN)
+    order = np.argsort(time_us, kind="stable")
+    return LightStates(tuple(map(str, names)), time_us[order], table[order])
+
+
+def light_rows(states: LightStates, lights: Mapping[str, str], time_us: IntArray) -> TrafficLights:
+    """Status of every connector with a light at some times; not listed before the first state.
+
+    `lights` holds the name of the light by connector.
+    """
+    column = {name: i for i, name in enumerate(states.names)}
+    known = {connector: column[name] for connector, name in lights.items() if name in column}
+    at = np.searchsorted(states.time_us, time_us, side="right") - 1
+    status = states.status[np.maximum(at, 0)][:, list(known.values())]
+    status[at < 0] = LightStatus.ABSENT
+    return TrafficLights(tuple(known), status.astype(np.int8))
