@@ -74,6 +74,7 @@ UNITS = {
 TYPES = {
     pa.string(): "string",
     pa.float64(): "float64",
+    pa.float32(): "float32",
     pa.int64(): "int64",
     pa.int32(): "int32",
     pa.int8(): "int8",

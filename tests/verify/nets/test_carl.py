@@ -95,9 +95,6 @@ def test_a_changed_output_of_a_loop_is_a_mismatch(tmp_path, scenes):
     for iteration, name in enumerate(("measurements", "action", "alpha", "beta", "value")):
         arrays[f"out/{name}"][iteration, 0] += 1e-3
         wanted.add((f"carl {name}", f"{Path(LOOP).stem} iteration {iteration}"))
-    arrays["out/command"][6, 0] += 1e-3
-    for kind in ("their", "our"):
-        wanted.add((f"carl command of {kind} action", f"{Path(LOOP).stem} iteration 6"))
     for channel in range(9):
         arrays[f"it{channel + 7:02d}/bev_semantics"][channel, 255, 255] ^= 1
     report = compared(LOOP, arrays, tmp_path, scenes)
@@ -105,6 +102,10 @@ def test_a_changed_output_of_a_loop_is_a_mismatch(tmp_path, scenes):
     pictures = {pair for pair in differing(report) if pair[0].startswith("carl picture")}
     assert len(pictures) == 9
     assert {where.split()[-1] for _, where in pictures} == {str(c + 7) for c in range(9)}
+    arrays["out/command"][6, 0] += 1e-3  # the ego goes on by it, so that later pictures differ, too
+    for kind in ("their", "our"):
+        wanted.add((f"carl command of {kind} action", f"{Path(LOOP).stem} iteration 6"))
+    assert wanted | pictures <= differing(compared(LOOP, arrays, tmp_path, scenes))
 
 
 @pytest.mark.thorough
