@@ -356,14 +356,14 @@ Plan: TypeAlias = Trajectory | Command | None
 def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:
     """The next plan of each, or the error in its place, and how long each took [s]."""
     planners = [cast(BatchPlanner, rollout.planner) for rollout in rollouts]
-    observe = [rollout.observe for rollout in rollouts]
+    seen = [rollout.observe() for rollout in rollouts]
+    began = perf_counter()
     if isinstance(planners[0], BatchPlanner):
-        seen, began = [one() for one in observe], perf_counter()
         plans = planners[0].plan_batch(planners, seen)
         return [*plans], [(perf_counter() - began) / len(plans)] * len(plans)
     out, seconds = list[Plan | Exception](), list[float]()
-    for planner, one in zip(planners, observe, strict=True):
-        observation, began = one(), perf_counter()
+    for planner, observation in zip(planners, seen, strict=True):
+        began = perf_counter()
         out.append(_attempt(partial(planner.plan, observation)) if planner is not None else None)
         seconds.append(perf_counter() - began)
     return out, seconds

@@ -33,7 +33,7 @@ def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, 
         label = f"{name} error" + (f" × {factor:g}" if factor != 1.0 else "")
         left.plot(samples, values, label=label, color=colour, linewidth=0.9)
     left.set(xlabel="samples [million]", ylabel="mean absolute error", yscale="log")
-    left.legend(frameon=False)
+    left.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     at = [row["samples"] / 1e6 for row in scores]
     style = planner_styles(["carl"])["carl"]
     for noise in ("none", "ou-high"):

@@ -16,8 +16,7 @@ from shiftsim.arrays import kernel
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.view import CHANNELS, SIZE
 
-USED = tuple(range(4)), tuple(range(5, 9))  # stop signs are never drawn
-NUM_USED, BLOCKS = 8, SIZE // 2
+NUM_USED, BLOCKS = 8, SIZE // 2  # channels without stop signs, which are never drawn
 _EMPTY = 4
 _SHAPE = (len(CHANNELS), SIZE, SIZE)
 _CODEC = pa.Codec("zstd", 3)
