@@ -284,3 +284,17 @@ def test_the_past_of_the_ego_is_that_of_the_recording(history_rows):
     first = planner.seen[0].history
     np.testing.assert_array_equal(first.ego, scenario.ego[past])
     np.testing.assert_array_equal(first.time_us, scenario.time_us[past])
+
+
+@pytest.mark.parametrize("strange", [0, 1])
+def test_only_the_first_plan_is_doubted(strange):
+    class Elsewhere(Recorder):
+        def plan(self, observation):
+            plan = super().plan(observation)
+            if len(self.seen) == strange + 1:
+                plan.states[:, X] += 42.0
+            return plan
+
+    rollout = Rollout(cruise_scenario(iterations=5), Elsewhere())
+    loop.drive(rollout)
+    assert ("42 m away" in rollout.doubt) == (strange == 0)
