@@ -109,6 +109,8 @@ def test_the_weight_of_the_first_type_counts_for_all_scores():
     types = [(2, 0.8), (1, 0.2)]
     assert final_score(types, [1.0, 1.0]) == pytest.approx(0.6)
     assert final_score(types, [2.0, 1.0]) == pytest.approx(0.72)
+    with pytest.raises(ValueError, match="shorter"):
+        final_score(types, [1.0])
 
 
 def lists(*rows):
@@ -155,7 +157,7 @@ def test_changes_are_counted_from_lane_to_lane():
     road = lanes(left=[NONE, 0, 1, 2])
     found = [[changes_between(road, a, b) for b in range(4)] for a in range(4)]
     assert found == [[abs(a - b) for b in range(4)] for a in range(4)]
-    assert changes_between(lanes(left=[NONE, 0, NONE, 2]), 0, 3) is None  # two roads side by side
+    assert changes_between(lanes(left=[NONE, NONE, 1, 2]), 0, 3) is None  # beside three others
     assert changes_between(lanes(left=[NONE, 0], block=[0, 1]), 0, 1) is None
 
 
@@ -255,3 +257,31 @@ def test_a_rollout_that_starts_beside_the_road_has_no_lane_changes():
         states[:, 1] = -40.0
         with pytest.raises(DataError, match="starts on no lane"):
             lane_changes_to_goal(straight_road(), replace(log, **{name: states}))
+
+
+# lanes 0 to 2 lead to 3 to 5; 6 and 7 are elsewhere
+TWO_BLOCKS = {"left": [NONE, 0, 1, NONE, 3, 4, NONE, 6], "block": [0, 0, 0, 1, 1, 1, 2, 2]}
+
+
+@pytest.mark.parametrize(
+    ("expert", "ego", "initial", "final"),
+    [
+        # the expert's second lane counts where it is in the block of the first
+        ([[0], [1], [2], [5]], [[2], [1], [1], [5]], 1, 0),
+        ([[0], [3], [3]], [[1], [4], [4]], 1, 1),
+        ([[0], [], [3]], [[2], [2], [5]], 2, 2),
+        # of several edges the first
+        ([[0, 3], [1, 5], [4]], [[2, 4], [2], [4]], 1, 0),
+        # an expert who stays in a lane needs no change at the start
+        ([[0], [0], [0]], [[1], [1], [1]], 0, 1),
+        # an ego that leaves the route is compared where the route began
+        ([[0], [3], [3]], [[6], [6], [6]], None, 0),
+        ([[0], [3], [3]], [[6, 7], [6, 7], [6, 7]], None, 0),
+        ([[0], [3], [4]], [[1], [6], [6]], 1, 1),
+    ],
+)
+def test_lane_changes_to_the_goal(expert, ego, initial, final, monkeypatch):
+    log = as_recorded(cruise_scenario(speed=14.0, iterations=len(ego) + 1))
+    routes = iter([lists(*expert), lists(*ego)])
+    monkeypatch.setattr(interplan, "driven_route", lambda *_: next(routes))
+    assert lane_changes_to_goal(lanes(**TWO_BLOCKS), log) == LaneChanges(initial, final)
