@@ -181,6 +181,7 @@ def test_contacts_are_judged_by_type_and_by_the_lanes_at_their_own_sample() -> N
         (7, 0, "active_front", 5.0, True),
     ]
     assert [c.time_us for c in found] == TIMES[[2, 3, 4, 4, 7]].tolist()
+    assert all(type(c.at_fault) is bool for c in found)  # as JSON needs it
 
 
 def hits(kind: AgentKind, *delta_v: float, at_fault: bool = True) -> list[Collision]:
