@@ -134,6 +134,7 @@ BLOCKS = SimpleNamespace(
         ([[0, 2], [2], [3]], [0, 3]),
         ([[2, 3], [3, 4], [4], [0]], [2, 0]),
         ([[2, 3], [2, 0], [3], [1]], [2, 1]),  # as does the third with the first
+        ([[2], [3, 2], [3]], [2, 3]),
         ([[2], [3, 2], [3, 4]], [2, 3]),  # the last list that counted is the one to compare with
         ([[2], [4, 3]], [2]),  # the first edge of a list decides
         ([[0], [2], [0]], [0, 2, 0]),
