@@ -201,7 +201,7 @@ def _read_tracks(log: Path) -> TrackSamples:
     category = [*(kinds[label] for label in labels.to_pylist()), *[AgentKind.VEHICLE] * len(ego)]
     every = np.concatenate([file.boxes(_vectors(boxes, 9)), ego])
     names = [kind.name.lower() for kind in AgentKind]
-    with file.naming():
+    with Source(log).naming():
         return make_samples(
             log.name,
             time_us=np.concatenate([file.stamps()[rows], ego_us]),

@@ -8,7 +8,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.data.tracks.axes import check_headings, check_reference, check_velocities
-from shiftsim.data.tracks.build import numbered
+from shiftsim.data.tracks.build import MAX_PAUSE_S, MAX_SPAN_S, numbered
 from shiftsim.data.tracks.columns import KINDS, UNITS, Columns
 from shiftsim.data.tracks.evidence import FAST, LEAST_CONTRADICTING, Doubts, Motion
 from shiftsim.data.tracks.fit import Fit, fit_map
@@ -22,9 +22,7 @@ _MAX_SPEED = 60.0  # m/s, of 95 % of the vehicles' rows
 _LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
 _MOVING = 1.0  # m/s
 _MAX_GAP = 1.0  # s without a row of any object
-_MAX_PAUSE = 3600.0  # s without a row of any object within one recording
 _LEAST_OBJECTS = 5  # that begin at once
-_MAX_SPAN = 1e5  # s from the first row to the last one
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
@@ -112,12 +110,12 @@ def _check_times(table: TrackTable, step: FloatArray, out: Doubts) -> bool:
     slow, fast = _RATES
     span = float(np.ptp(table.time_us)) / 1e6
     if 0.99 / fast <= period <= 1.01 / slow:
-        if span > _MAX_SPAN:
+        if span > MAX_SPAN_S:
             out.say(
-                f"the rows span {span:g} s, more than {_MAX_SPAN:g} s",
+                f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
                 "leave out rows with a wrong time, check its unit, or convert parts by themselves",
             )
-        return span <= _MAX_SPAN
+        return span <= MAX_SPAN_S
     column = table.columns.found.get("time")
     remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
     if column is not None and table.hz is None:
@@ -143,9 +141,9 @@ def _check_gaps(table: TrackTable, out: Doubts) -> None:
     if len(gaps):
         first = gaps[np.diff(stamps)[gaps].argmax()]
         begin, end = (stamps[first : first + 2] - stamps[0]) / 1e6
-        if end - begin > _MAX_PAUSE:
+        if end - begin > MAX_PAUSE_S:
             out.say(
-                f"no object has a row between {begin:g} s and {end:g} s, at most {_MAX_PAUSE:g} s",
+                f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
                 "if the clock begins anew at midnight, add a day to the times after it; if two"
                 " recordings were joined, convert each by itself",
             )
