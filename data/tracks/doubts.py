@@ -28,6 +28,8 @@ _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
 _LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
 _LONGEST_WALKER = 2.0  # m, median of pedestrians
+_WALKING = (0.85, 2.1)  # m/s, of the median pedestrian; about 1.35 m/s everywhere
+_LEAST_WALKERS, _LEAST_WALK = 5, 4.0  # pedestrians that walk, and m that each of them must walk
 _ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving vehicles' rows
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
@@ -79,6 +81,7 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
             "check --hz or the unit of time, unless the limits of the map are wrong",
         )
     _check_accelerations(motion, out)
+    _check_walkers(motion, out)
     _check_sizes(motion, out)
     check_headings(motion, fit, out)
     check_velocities(motion, fit, out)
@@ -255,6 +258,27 @@ def _check_accelerations(motion: Motion, out: Doubts) -> None:
             f"moving vehicles accelerate, brake and turn with {usual:.2g} m/s² in the middle of"
             f" {len(rows)} rows, at most {_MAX_ACCELERATION:g} m/s²",
             "check --hz or the unit of time; positions that jitter need smoothing",
+        )
+
+
+def _check_walkers(motion: Motion, out: Doubts) -> None:
+    """How fast pedestrians walk while they do, the same whatever a clock counts."""
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
+    is_walker = np.array(walks, np.bool_)[motion.table.category[motion.ends[:-1]]]
+    speeds = []
+    for first, stop in zip(motion.ends[:-1][is_walker], motion.ends[1:][is_walker], strict=True):
+        way = motion.table.xy[stop - 1] - motion.table.xy[first]
+        if np.hypot(*way) > _LEAST_WALK:
+            speed = motion.speed[first:stop]
+            speeds.append(np.median(speed[speed > 0.5 * np.percentile(speed, 90)]))
+    if len(speeds) < _LEAST_WALKERS:
+        return
+    walking = out.figures["walking_mps"] = float(np.median(speeds))
+    if not _WALKING[0] <= walking <= _WALKING[1]:
+        out.note(
+            f"the median pedestrian walks with {walking:.2g} m/s, usual is {_WALKING[0]:g} …"
+            f" {_WALKING[1]:g} m/s",
+            "check --hz or the unit of time, and the column of kinds",
         )
 
 
