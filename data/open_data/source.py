@@ -98,12 +98,15 @@ class Source:
         if isinstance(points, list):
             points = [(p["x"], p["y"]) if isinstance(p, dict) else p for p in points]
         try:
-            line = np.array(points, np.float64)[:, :2]
-        except (IndexError, ValueError, OverflowError):
-            line = np.empty((0, 2))
-        self.require("position", line, place)
-        line = clean_line(line)
-        if len(line) < least or line.shape[1] < 2:
+            line = np.array(points, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self.fault(f"{place} is no line of points ({error})") from error
+        line = line if line.size else np.empty((0, 2))
+        if line.ndim != 2 or line.shape[1] < 2:
+            raise self.fault(f"{place} is no line of points (shape {line.shape})")
+        self.require("position", line[:, :2], place)
+        line = clean_line(line[:, :2])
+        if len(line) < least:
             raise self.fault(f"{place} has {len(line)} points that differ, need {least}")
         return line
 

@@ -279,6 +279,23 @@ def changed_arrow(path, change):
 
 
 BOXES = "box_detections_se3"
+
+
+def with_line(value):
+    """Another left border of the first lane of a map."""
+
+    def change(table):
+        first, *others = table["features"].to_pylist()
+        shown = None
+        if isinstance(value, np.ndarray):
+            shown = {b"dtype": value.dtype.str, b"shape": value.shape, b"data": value.tobytes()}
+        new = {"left_boundary": shown | {b"__ndarray__": True} if shown else value}
+        first = msgpack.packb(msgpack.unpackb(first, strict_map_key=False) | new)
+        return table.set_column(2, "features", pa.array([first, *others], pa.binary()))
+
+    return change
+
+
 ARROW_FAULTS = {
     "column 'box_detections_se3.label' is missing": (BOXES, without(f"{BOXES}.label")),
     "'box_detections_se3.label' is list": (
@@ -295,6 +312,13 @@ ARROW_FAULTS = {
     ),
     "'metadata' is missing": (BOXES, lambda table: table.replace_schema_metadata(None)),
     "cannot be unpacked": ("map", with_value("features", b"\xc1")),
+    "lane 1: 'left_boundary' is 'x', need an array": ("map", with_line("x")),
+    r"no line of points \(shape \(9,\)\)": ("map", with_line(np.arange(9.0))),
+    r"no line of points \(shape \(5, 1\)\)": ("map", with_line(np.ones((5, 1)))),
+    r"no line of points \(shape \(\)\)": ("map", with_line(np.array(5.0))),
+    "has 0 points that differ": ("map", with_line(np.ones((0, 3)))),
+    "has 1 points that differ": ("map", with_line(np.ones((4, 3)))),
+    "an array of '<i8'": ("map", with_line(np.ones((5, 3), np.int64))),
     "lane 1: 'left_boundary' is missing": ("map", with_value("features", b"\x80")),
 }
 
