@@ -2,6 +2,8 @@
 
 import difflib
 from collections.abc import Iterable
+from importlib import import_module
+from types import ModuleType
 
 _MAX_TEXT = 100_000  # characters
 _MAX_MESSAGE = 1000  # characters
@@ -77,6 +79,19 @@ class InvalidTrajectoryError(PlannerError):
 
 class MissingExtraError(ShiftsimError, ImportError):
     """An optional dependency is not installed."""
+
+
+def import_extra(module: str, extra: str) -> ModuleType:
+    """A module that an extra of shiftsim brings.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        what = f"{extra} needs {module}, which is not installed"
+        raise MissingExtraError(what, f"pip install 'shiftsim[{extra}]'") from error
 
 
 def readable(value: object) -> str:

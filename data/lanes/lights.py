@@ -47,22 +47,25 @@ def states_of_cycles(
 
 def states_of_lists(
     time_us: IntArray,
-    lights: Sequence[Sequence[int] | None],
-    codes: Sequence[Sequence[int] | None],
+    row: IntArray,
+    lights: IntArray,
+    codes: IntArray,
     meaning: Mapping[int, LightStatus],
 ) -> LightStates:
-    """States of lights that are listed anew, with a code for each, at each time (G,) [us].
+    """States of lights that are listed anew at each time.
 
-    `meaning` is that of codes; others are unknown.
+    Args:
+        time_us: (G,) times [us].
+        row: (A,) for each listed light, the index of its time.
+        lights: (A,) numbers of the listed lights.
+        codes: (A,) what they show.
+        meaning: That of codes; others are unknown.
     """
-    names = sorted({light for row in lights for light in row or ()})
-    column = {light: number for number, light in enumerate(names)}
+    names, column = np.unique(lights, return_inverse=True)
     table = np.full((len(time_us), len(names)), LightStatus.ABSENT, np.int64)
-    for row, (found, shown) in enumerate(zip(lights, codes, strict=True)):
-        for light, code in zip(found or (), shown or (), strict=False):
-            table[row, column[light]] = meaning.get(code, LightStatus.UNKNOWN)
+    table[row, column] = [meaning.get(code, LightStatus.UNKNOWN) for code in codes.tolist()]
     order = np.argsort(time_us, kind="stable")
-    return LightStates(tuple(map(str, names)), time_us[order], table[order])
+    return LightStates(tuple(map(str, names.tolist())), time_us[order], table[order])
 
 
 def light_rows(states: LightStates, lights: Mapping[str, str], time_us: IntArray) -> TrafficLights:

@@ -7,9 +7,7 @@ stored velocities are taken, except those of tracks that they contradict through
 """
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,29 +15,45 @@ import pyarrow.compute as pc
 import shapely
 
 from shiftsim.data.lanes.map import build_lane_map
-from shiftsim.data.lanes.pieces import LanePiece, MapSource
+from shiftsim.data.lanes.pieces import MapSource
 from shiftsim.data.open_data.codes import TYPES
+from shiftsim.data.open_data.lane_names import LaneNames
 from shiftsim.data.open_data.scenes import Scene
-from shiftsim.data.open_data.source import Source, find_below, text_or_none
+from shiftsim.data.open_data.source import Source, find_below, need
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 
 EGO = "AV"
-_COLUMNS = {
-    "observed": pa.bool_(),
-    "track_id": pa.string(),
-    "object_type": pa.string(),
-    "timestep": pa.int64(),
-    "position_x": pa.float64(),
-    "position_y": pa.float64(),
-    "heading": pa.float64(),
-    "velocity_x": pa.float64(),
-    "velocity_y": pa.float64(),
-    "start_timestamp": pa.float64(),  # ns
-    "city": pa.string(),
+# columns of positions, headings and velocities, and the field of `OPEN_DATA` of each
+_MOTION = {
+    name: name.partition("_")[0]
+    for name in ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 }
-_MOTION = {n: n.partition("_")[0] for n in list(_COLUMNS)[4:9]}  # column -> field of `OPEN_DATA`
+_COLUMNS = [
+    need("observed", pa.bool_()),
+    need("track_id", pa.string()),
+    need("object_type", pa.string()),
+    need("timestep", pa.int64()),
+    *(need(name, pa.float64()) for name in _MOTION),
+    need("start_timestamp", pa.float64()),  # ns
+    need("city", pa.string()),
+]
+_LINE = [{"x": float, "y": float}]
+_LANE = LaneNames(
+    left="left_lane_boundary",
+    right="right_lane_boundary",
+    center="centerline",  # the data set of sensors has none
+    successors="successors",
+    left_neighbor="left_neighbor_id",
+    right_neighbor="right_neighbor_id",
+    line=_LINE,
+)
+_MAP = {
+    "lane_segments": {str: {**_LANE.form, "id": int, "lane_type": str, "is_intersection": bool}},
+    "drivable_areas": {str: {"area_boundary": _LINE}},
+    "pedestrian_crossings": {str: {"edge1": _LINE, "edge2": _LINE}},
+}
 _STEP_US = 100_000  # us
 _LEFT_OUT = "background"
 _SQUEEZED_S = 0.5  # s
@@ -83,8 +97,6 @@ class Av2Reader:
 
 def _read_tracks(source: Source) -> TrackSamples:
     table = source.columns(_COLUMNS)
-    if not len(table):
-        raise source.fault("no rows")
     if pc.all(table["observed"]).as_py():
         raise source.fault(
             "holds the observed 5 s only", "convert train or val; test hides the future"
@@ -94,9 +106,7 @@ def _read_tracks(source: Source) -> TrackSamples:
     table = table.filter(pc.not_equal(table["object_type"], _LEFT_OUT))
     encoded = pc.dictionary_encode(table["object_type"].combine_chunks())
     types = [str(name) for name in encoded.dictionary.to_pylist()]
-    if unknown := sorted(set(types) - set(TYPES)):
-        what = f"column 'object_type' holds {unknown[0]!r}"
-        raise source.fault(what, f"known are: {', '.join(TYPES)}")
+    source.known(types, TYPES, "object_type")
     sizes = np.array([TYPES[name][1:] for name in types])
     read = {name: source.numbers(table, name, field) for name, field in _MOTION.items()}
     step = source.numbers(table, "timestep", "step").astype(np.int64)
@@ -119,51 +129,26 @@ def _read_map(source: Source, name: str) -> MapSource:
     """The map of a scene: what its `log_map_archive_*.json` says."""
     try:
         found = json.loads(source.content(_MAX_BYTES))
-        return MapSource(
-            name=name,
-            pieces=[
-                _piece(source, item, f"lane_segments {key!r}")
-                for key, item in found["lane_segments"].items()
-                if item["lane_type"] != "BIKE"  # they double the connectors of vehicles
-            ],
-            drivable_areas=[
-                _area(source, f"drivable_areas {key!r}", item["area_boundary"])
-                for key, item in found["drivable_areas"].items()
-            ],
-            crosswalks=[
-                _area(source, f"crossing {key!r}", [*item["edge1"], *item["edge2"][::-1]])
-                for key, item in found["pedestrian_crossings"].items()
-            ],
-        )
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise source.fault(f"not readable as JSON ({error})") from error
-    except KeyError as error:
-        raise source.fault(f"{error.args[0]!r} is missing") from error
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise source.fault(f"a value has the wrong type ({error})") from error
-
-
-def _piece(source: Source, item: dict[str, Any], place: str) -> LanePiece:
-    lines = {
-        key: source.line(_points(item[key]), f"{place}: {key!r}")
-        for key in ("left_lane_boundary", "right_lane_boundary", "centerline")
-        if key != "centerline" or item.get(key) is not None  # the data set of sensors has none
-    }
-    return LanePiece(
-        id=str(item["id"]),
-        left=lines["left_lane_boundary"],
-        right=lines["right_lane_boundary"],
-        center=lines.get("centerline"),
-        successors=tuple(map(str, item["successors"])),
-        left_neighbor=text_or_none(item.get("left_neighbor_id")),
-        right_neighbor=text_or_none(item.get("right_neighbor_id")),
-        is_connector=bool(item["is_intersection"]),
+    source.expect(found, _MAP, "the file")
+    return MapSource(
+        name=name,
+        pieces=[
+            _LANE.piece(source, lane, str(lane["id"]), is_connector=lane["is_intersection"])
+            for lane in found["lane_segments"].values()
+            if lane["lane_type"] != "BIKE"  # they double the connectors of vehicles
+        ],
+        drivable_areas=[
+            _area(source, item["area_boundary"], f"drivable_areas {key!r}")
+            for key, item in found["drivable_areas"].items()
+        ],
+        crosswalks=[
+            _area(source, [*item["edge1"], *item["edge2"][::-1]], f"crossing {key!r}")
+            for key, item in found["pedestrian_crossings"].items()
+        ],
     )
 
 
-def _area(source: Source, place: str, points: Sequence[Any]) -> shapely.Polygon:
-    return largest_part(shapely.Polygon(source.line(_points(points), place, least=3)))
-
-
-def _points(found: Sequence[Any]) -> list[tuple[float, float]]:
-    return [(point["x"], point["y"]) for point in found]
+def _area(source: Source, points: list[object], place: str) -> shapely.Polygon:
+    return largest_part(shapely.Polygon(source.line(points, place, least=3)))

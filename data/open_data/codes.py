@@ -79,8 +79,9 @@ LABELS = {
         7, vehicle="0", bicycle="1", pedestrian="2", traffic_cone="3", barrier="4", czone_sign="5"
     ),
 }
-LIGHT_CODES = dict(enumerate((LightStatus.GREEN, LightStatus.YELLOW, LightStatus.RED)))
-STOP_CODES = dict(enumerate((OTHER_STOP, LIGHT_STOP, 1, 4, 0, 3)))  # type of a stop polygon
+LIGHTS = dict(enumerate((LightStatus.GREEN, LightStatus.YELLOW, LightStatus.RED)))
+# type of a stop polygon
+STOPS: dict[int | None, int] = dict(enumerate((OTHER_STOP, LIGHT_STOP, 1, 4, 0, 3)))
 _LAYERS = "lane, lane group, intersection, crosswalk, walkway, car park, drivable area, stop zone"
 LAYERS = dict(enumerate(_LAYERS.split(", ")))  # of the map
 BIKE_LANE = 3  # type of a lane

@@ -6,35 +6,34 @@ planning problem has no recorded track, so every car that drives is an ego.
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 
+from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.lights import Cycle, LightStates, states_of_cycles
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, stop_area
 from shiftsim.data.open_data import codes
 from shiftsim.data.open_data.scenes import Scene
-from shiftsim.data.open_data.source import find_below
-from shiftsim.data.open_data.xml_source import XmlSource, first_ref, refs
+from shiftsim.data.open_data.source import Source, find_below
 from shiftsim.data.tracks.build import make_samples
+from shiftsim.data.tracks.motion import unit_vectors
 from shiftsim.data.tracks.samples import TrackSamples
+from shiftsim.data.xml_elements import xml_elements
 from shiftsim.world.state import AgentKind, LightStatus
 
 VERSIONS = ("2018b", "2020a")
 _MAX_BYTES = 500_000_000
 _MAX_STEPS = 1_000_000
-_CONNECTORS = [f"intersection/incoming/successors{way}" for way in ("Right", "Straight", "Left")]
-_SPEED = "velocity/exact"
 _STATE = {  # field of `OPEN_DATA` by path
     "time/exact": "step",
     "position/point/x": "position",
     "position/point/y": "position",
     "orientation/exact": "heading",
-    _SPEED: "velocity",
+    "velocity/exact": "velocity",  # may be missing
 }
 
 
@@ -56,12 +55,11 @@ class CommonRoadReader:
         with file.naming():
             lanes = build_lane_map(file.map(f"commonroad-{name}"))
             samples = file.tracks()
-        warnings = {**samples.warnings, **file.warnings}
         return Scene(
-            samples=replace(samples, warnings=warnings),
+            samples=samples,
             map=lanes,
-            egos=None,
             lights=file.lights(samples.duration),
+            warnings=file.warnings,
             metadata={
                 "source": f"CommonRoad {name}: {file.root.get('source', 'unknown')}",
                 "licence": "that of the source",
@@ -70,21 +68,16 @@ class CommonRoadReader:
         )
 
 
-class _File(XmlSource):
+class _File(Source):
     """What one file says."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, _MAX_BYTES)
-        version = self.root.get("commonRoadVersion")
-        if self.root.tag != "commonRoad" or version not in VERSIONS:
-            found = f"<{self.root.tag} commonRoadVersion={version!r}>"
-            raise self.fault(
-                f"begins with {found}, need commonRoad of {' or '.join(VERSIONS)}",
-                "write it again with a current commonroad-io, or leave it out",
-            )
+        super().__init__(path)
+        content = self.content(_MAX_BYTES)
+        (self.root,) = xml_elements(content, "commonRoad", self.fault)
+        self.known([self.root.get("commonRoadVersion")], VERSIONS, "commonRoadVersion")
         self.warnings: Counter[str] = Counter()
-        length = self.root.get("timeStepSize", "")
-        self.step_s = self.number(length, "step length", "'timeStepSize'")
+        self.step_s = self.number(self.root.get("timeStepSize"), "step length", "'timeStepSize'")
 
     def lights(self, duration: float) -> LightStates | None:
         """States of all lights with a cycle, a row per step."""
@@ -92,7 +85,7 @@ class _File(XmlSource):
         for light in self.root.iterfind("trafficLight"):
             place = f"trafficLight {light.get('id')!r}"
             elements = light.findall("cycle/cycleElement")
-            lengths = [self.number_at(e, "duration", "step", place) for e in elements]
+            lengths = [self._at(e, "duration", "step", place) for e in elements]
             if not lengths or min(lengths) < 0 or not sum(lengths):
                 continue
             colors = [codes.COLORS.get(e.findtext("color"), LightStatus.UNKNOWN) for e in elements]
@@ -104,19 +97,32 @@ class _File(XmlSource):
 
     def map(self, name: str) -> MapSource:
         """The lanelets and what belongs to them."""
-        limits = self._sign_limits()
-        inside = {ref for path in _CONNECTORS for ref in refs(self.root, path)}
+        limits = {}  # by traffic sign [m/s]
+        for sign in self.root.iterfind("trafficSign/trafficSignElement"):
+            kind = sign.findtext("trafficSignID", "")
+            if kind.startswith(codes.SPEED_SIGNS) and sign.findtext("additionalValue"):
+                number = sign.getparent().get("id", "")
+                limits[number] = self._at(
+                    sign, "additionalValue", "speed limit", f"sign {number!r}"
+                )
+        inside = set(
+            self.root.xpath("intersection/incoming/*[contains(name(), 'successors')]/@ref")
+        )
         areas: dict[str, list[shapely.Polygon]] = {"crosswalk": [], "parking": [], "paved": []}
         pieces, stops = list[LanePiece](), list[StopArea]()
         for lanelet in self.root.iterfind("lanelet"):
             types = {(e.text or "").strip() for e in lanelet.iterfind("laneletType")}
             piece = self._piece(lanelet, inside, limits)
             kinds = types if types & codes.UNPAVED else types | {"paved"}
-            for kind in kinds & areas.keys():
-                areas[kind].append(piece.polygon)
+            for area in kinds & areas.keys():
+                areas[area].append(piece.polygon)
             if not types & codes.NO_LANES:
                 pieces.append(piece)
-                stops += self._stop_areas(lanelet, piece)
+                kind = codes.OTHER_STOP if piece.light is None else codes.LIGHT_STOP
+                for line in lanelet.iterfind("stopLine"):
+                    drawn = len(line.findall("point")) >= 2  # else at the end of the lanelet
+                    ends = self._line(line, ".", f"stopLine of {piece.id!r}")[:2] if drawn else None
+                    stops += filter(None, [stop_area(piece, kind, ends)])
         return MapSource(
             name=name,
             pieces=pieces,
@@ -126,45 +132,25 @@ class _File(XmlSource):
             car_parks=areas["parking"],
         )
 
-    def _sign_limits(self) -> dict[str, float]:
-        """Speed limit by traffic sign [m/s]."""
-        return {
-            sign.get("id", ""): self.number_at(
-                element, "additionalValue", "speed limit", f"trafficSign {sign.get('id')!r}"
-            )
-            for sign in self.root.iterfind("trafficSign")
-            for element in sign.iterfind("trafficSignElement")
-            if element.findtext("additionalValue")
-            and element.findtext("trafficSignID", "").startswith(codes.SPEED_SIGNS)
-        }
-
     def _piece(self, lanelet: Any, inside: set[str], limits: dict[str, float]) -> LanePiece:
         name = lanelet.get("id", "")
         place = f"lanelet {name!r}"
-        own = [
-            self.number(e.text, "speed limit", f"{place}: 'speedLimit'")
-            for e in lanelet.iterfind("speedLimit")
-        ]
-        own += [limits[ref] for ref in refs(lanelet, "trafficSignRef") if ref in limits]
+        own = [limits[i] for i in lanelet.xpath("trafficSignRef/@ref") if i in limits]
+        if lanelet.find("speedLimit") is not None:
+            own.append(self._at(lanelet, "speedLimit", "speed limit", place))
+        beside = (f"adjacent{side}[@drivingDir='same']/@ref" for side in ("Left", "Right"))
+        left, right = (next(iter(lanelet.xpath(path)), None) for path in beside)
         return LanePiece(
             id=name,
-            left=self.line_at(lanelet, "leftBound", f"{place}: 'leftBound'"),
-            right=self.line_at(lanelet, "rightBound", f"{place}: 'rightBound'"),
-            successors=tuple(refs(lanelet, "successor")),
-            left_neighbor=first_ref(lanelet, "adjacentLeft[@drivingDir='same']"),
-            right_neighbor=first_ref(lanelet, "adjacentRight[@drivingDir='same']"),
+            left=self._line(lanelet, "leftBound", place),
+            right=self._line(lanelet, "rightBound", place),
+            successors=tuple(lanelet.xpath("successor/@ref")),
+            left_neighbor=left,
+            right_neighbor=right,
             is_connector=name in inside or "intersection" in lanelet.xpath("laneletType/text()"),
             speed_limit=min(own, default=None),
-            light=first_ref(lanelet, "trafficLightRef"),
+            light=next(iter(lanelet.xpath("trafficLightRef/@ref")), None),
         )
-
-    def _stop_areas(self, lanelet: Any, piece: LanePiece) -> Iterator[StopArea]:
-        kind = codes.OTHER_STOP if piece.light is None else codes.LIGHT_STOP
-        for line in lanelet.iterfind("stopLine"):
-            place, drawn = f"lanelet {piece.id!r}: 'stopLine'", len(line.findall("point")) >= 2
-            ends = self.line_at(lanelet, "stopLine", place)[:2] if drawn else None
-            if area := stop_area(piece, kind, ends):
-                yield area
 
     def tracks(self) -> TrackSamples:
         """All obstacles whose states are exact; the others are counted."""
@@ -188,7 +174,7 @@ class _File(XmlSource):
             categories=categories.tolist(),
             xy=np.column_stack([x, y]),
             headings=heading,
-            velocities=speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]),
+            velocities=speed[:, None] * unit_vectors(heading),
             sizes=np.column_stack([length, width]),
             kind_of={name: codes.OBSTACLES.get(name, AgentKind.GENERIC_OBJECT) for name in names},
         )
@@ -202,14 +188,25 @@ class _File(XmlSource):
                 continue
             name, category = obstacle.get("id", ""), obstacle.findtext("type") or "unknown"
             place = f"obstacle {name!r}"
-            size = [self.number_at(box, n, "size", place) for n in ("length", "width")]
+            size = [self._at(box, side, "size", place) for side in ("length", "width")]
             for state in obstacle.xpath("initialState | trajectory/state"):
-                lacking = {path for path in _STATE if state.find(path) is None}
-                if lacking - {_SPEED}:
+                values = {
+                    path: self._at(state, path, field, place)
+                    for path, field in _STATE.items()
+                    if state.find(path) is not None
+                }
+                if values.keys() | {"velocity/exact"} != _STATE.keys():
                     self.warnings["state that is not exact, left out"] += 1
                     continue
-                values = [
-                    np.nan if path in lacking else self.number_at(state, path, field, place)
-                    for path, field in _STATE.items()
-                ]
-                yield name, category.strip(), [*values, *size]
+                yield name, category.strip(), [*(values.get(k, np.nan) for k in _STATE), *size]
+
+    def _at(self, element: Any, path: str, field: str, place: str) -> float:
+        """The number at a path below an element."""
+        return self.number(element.findtext(path), field, f"{place}: {path!r}")
+
+    def _line(self, element: Any, path: str, place: str) -> FloatArray:
+        """(K, 2) the line of the points at a path below an element [m]."""
+        place = f"{place}: {path!r}"
+        found = element.iterfind(f"{path}/point")
+        points = [[self._at(point, axis, "position", place) for axis in "xy"] for point in found]
+        return self.line(points, place)

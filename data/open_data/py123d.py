@@ -11,49 +11,73 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.lights import LightStates, states_of_lists
 from shiftsim.data.lanes.map import PieceMap, build_lane_map
-from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea
+from shiftsim.data.lanes.pieces import MapSource, StopArea
 from shiftsim.data.open_data import codes
-from shiftsim.data.open_data.packed import PackedTable, need_msgpack, vectors, yaws
+from shiftsim.data.open_data.lane_names import LaneNames
 from shiftsim.data.open_data.scenes import Scene
-from shiftsim.data.open_data.source import Source, find_below, text_or_none
+from shiftsim.data.open_data.source import Source, find_below, items, need
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
-from shiftsim.errors import ConversionError
+from shiftsim.errors import import_extra
 from shiftsim.world.state import AgentKind
 
 HINT = "convert the log again with py123d 0.7.0"  # the version that is tested
 EGO = "ego"
-_POSE, _BOX, _VELOCITY = (pa.list_(pa.float64(), width) for width in (7, 10, 3))
-_FILES = {  # columns by file of a log; those of boxes and lights hold lists
-    "sync": {},
-    "ego_state_se3": {"timestamp_us": pa.int64(), "imu_se3": _POSE},
-    "box_detections_se3": {
-        "timestamp_us": pa.int64(),
-        "bounding_box_se3": pa.list_(_BOX),
-        "track_token": pa.list_(pa.string()),
-        "velocity_3d": pa.list_(_VELOCITY),
-        "label": pa.list_(pa.uint16()),
-    },
-    "traffic_light_detections": {
-        "timestamp_us": pa.int64(),
-        "lane_id": pa.list_(pa.int32()),
-        "status": pa.list_(pa.uint8()),
-    },
+_LANE = LaneNames(
+    left="left_boundary",
+    right="right_boundary",
+    center="centerline",
+    successors="successor_ids",
+    left_neighbor="left_lane_id",
+    right_neighbor="right_lane_id",
+    speed_limit="speed_limit_mps",
+    line=np.ndarray,
+)
+_LANE_FORM = {**_LANE.form, "lane_type": (int,), "lane_group_id": (int,)}
+_FEATURES = {  # by layer
+    "lane": _LANE_FORM,
+    "lane group": {"intersection_id": (int,)},
+    "stop zone": {"stop_zone_type": (int,)},
 }
-_LINES = {"left": "left_boundary", "right": "right_boundary", "center": "centerline"}
-_MAP = {
-    "object_id": pa.int64(),
-    "map_layer": pa.int8(),
-    "features": pa.binary(),
-    "wkb": pa.binary(),
-}
-_WITH_FEATURES = ("lane", "lane group", "stop zone")
 _DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
+_STAMP = need("timestamp_us", pa.int64())
+_ABOUT = {"dataset": str, "location": (str,)}
+_FILES = {  # columns and metadata
+    "sync": ([], {**_ABOUT, "split": str, "version": (str,), "map_metadata": (_ABOUT,)}),
+    "ego_state_se3": (
+        [_STAMP, need("imu_se3", items(pa.float64(), 7))],
+        {"length": float, "width": float, "center_to_imu_se3": [float]},
+    ),
+    "box_detections_se3": (
+        [
+            _STAMP,
+            need("bounding_box_se3", items(items(pa.float64(), 10))),
+            need("track_token", items(pa.string())),
+            need("velocity_3d", pa.list_(items(pa.float64(), 3))),  # null where it is unknown
+            need("label", items(pa.uint16())),
+        ],
+        {"box_detection_label_class": str},
+    ),
+    "traffic_light_detections": (
+        [_STAMP, need("lane_id", items(pa.int32())), need("status", items(pa.uint8()))],
+        {},
+    ),
+    "map": (
+        [
+            need("object_id", pa.int64()),
+            need("map_layer", pa.int8()),
+            need("features", pa.binary()),
+            need("wkb", pa.binary()),
+        ],
+        {},
+    ),
+}
 
 
 class Py123dReader:
@@ -61,29 +85,26 @@ class Py123dReader:
 
     def find(self, folder: Path) -> list[Path]:
         """Folders of the logs, sorted."""
-        need_msgpack()
+        import_extra("msgpack", "py123d")
         hint = "give the folder that py123d wrote, with logs/ and maps/"
         return [path.parent for path in find_below(folder, "ego_state_se3.arrow", hint)]
 
     def files(self, path: Path) -> list[Path]:
         """Tracks, lights, and the map of the log or of its city."""
         files = [path / f"{name}.arrow" for name in _FILES]
-        files.append(_map_path(path, _open(path, "sync")[1]))
-        return [file for file in files if file.is_file()]
+        return [file for file in (*files[:-1], _map_path(path)) if file.is_file()]
 
     def read(self, path: Path) -> Scene:
         """One log."""
-        notes = _open(path, "sync")[1]  # of the whole log
-        dataset, split = str(notes.get("dataset", "")), str(notes.get("split", ""))
+        sync = _File(path, "sync")
+        dataset, split = sync.notes["dataset"], sync.notes["split"]
         if dataset.startswith("wod") and split.endswith("test"):
-            what = f"{path}: split {split!r} hides the future"
-            raise ConversionError(what, "convert train or val")
-        lights = _read_lights(path)
-        lit = frozenset() if lights is None else frozenset(lights.names)
-        map_path = _map_path(path, notes)
-        city = path.name if map_path.parent == path else str(notes.get("location", ""))
+            raise sync.fault(f"split {split!r} hides the future", "convert train or val")
+        lights, map_path = _read_lights(path), _map_path(path)
+        city = path.name if map_path.parent == path else sync.notes.get("location")
         samples = _read_tracks(path)
         with Source(map_path).naming():
+            lit = frozenset(lights.names if lights else ())
             lanes = _read_map(map_path, f"{dataset}-{city}", lit)
         licences = [text for name, text in codes.LICENCES.items() if dataset.startswith(name)]
         return Scene(
@@ -92,23 +113,78 @@ class Py123dReader:
             egos=(EGO,),
             lights=lights,
             metadata={
-                "source": f"{dataset} {split}, through py123d {notes.get('version', '')}",
+                "source": f"{dataset} {split}, through py123d {sync.notes.get('version')}",
                 "licence": next(iter(licences), "that of the source"),
             },
         )
 
 
-def _open(log: Path, name: str) -> tuple[PackedTable, dict[Any, Any]]:
-    """A file of a log, and the `metadata` of its schema."""
-    file = PackedTable(log / f"{name}.arrow", _FILES[name], HINT, prefix=f"{name}.")
-    return file, file.notes()
+class _File(Source):
+    """An Arrow file: its columns, and what msgpack packed in its metadata and cells."""
+
+    def __init__(self, log: Path, name: str, at: Path | None = None) -> None:
+        super().__init__(at or log / f"{name}.arrow", HINT)
+        columns, form = _FILES[name]
+        self.table = self.columns(columns, prefix="" if name == "map" else f"{name}.")
+        packed = (self.table.schema.metadata or {}).get(b"metadata")
+        self.notes = self.unpack(packed, form, "'metadata'")
+
+    def unpack(self, data: bytes | None, form: Any, place: str) -> dict[Any, Any]:
+        """What msgpack packed: plain values and arrays of float64, nothing else."""
+        unpackb = import_extra("msgpack", "py123d").unpackb
+        try:
+            found: Any = data and unpackb(data, strict_map_key=False, object_hook=_array)
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+            raise self.fault(f"{place} cannot be unpacked ({error})") from error
+        self.expect(found, form, place)
+        return dict(found)
+
+    def stamps(self) -> IntArray:
+        """(R,) time stamps [us]."""
+        return self.numbers(self.table, "timestamp_us", "time").astype(np.int64)
+
+    def lists(self) -> tuple[IntArray, list[pa.Array]]:
+        """The row of each item of the lists in all columns but the first, and the items."""
+        found = [column.combine_chunks() for column in self.table.columns[1:]]
+        rows = [pc.list_parent_indices(column).to_numpy() for column in found]
+        for name, one in zip(self.table.column_names[1:], rows, strict=True):
+            if not np.array_equal(one, rows[0]):
+                raise self.fault(f"lists of {name!r} have lengths of their own")
+        return rows[0], [column.flatten() for column in found]
+
+    def boxes(self, found: FloatArray) -> FloatArray:
+        """(R, 5) x, y, heading, length, width of boxes x, y, z, quaternion, length, width."""
+        parts = ("position", slice(2)), ("rotation", slice(3, 7)), ("size", slice(7, 9))
+        for field, part in parts:
+            self.require(field, found[:, part], "box")
+        return np.column_stack([found[:, :2], _yaws(found[:, 3:7]), found[:, 7:9]])
 
 
-def _map_path(log: Path, notes: dict[Any, Any]) -> Path:
+def _array(found: dict[Any, Any]) -> Any:
+    if b"__ndarray__" not in found:
+        return found
+    if found[b"dtype"] != "<f8":
+        raise ValueError(f"an array of {found[b'dtype']!r}, need '<f8'")
+    return np.frombuffer(found[b"data"], "<f8").reshape(found[b"shape"])
+
+
+def _yaws(q: FloatArray) -> FloatArray:
+    """(R,) headings of quaternions (R, 4) w, x, y, z [rad]."""
+    w, x, y, z = q.T
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _vectors(column: pa.Array, count: int) -> FloatArray:
+    """(R, count) the first parts of a column of vectors; NaN where there is none."""
+    parts = [pc.list_element(column, i).to_numpy(zero_copy_only=False) for i in range(count)]
+    return np.column_stack(parts)
+
+
+def _map_path(log: Path) -> Path:
     """Where the map of a log is: beside it, or in the `maps` of the whole folder."""
+    notes = _File(log, "sync").notes
     about = notes.get("map_metadata") or notes
-    dataset = str(about.get("dataset", ""))
-    shared = f"maps/{dataset}/{dataset}_{about.get('location')}.arrow"
+    shared = f"maps/{about['dataset']}/{about['dataset']}_{about.get('location')}.arrow"
     beside = log / "map.arrow"
     return next((p for p in (beside, *(up / shared for up in log.parents)) if p.is_file()), beside)
 
@@ -116,32 +192,26 @@ def _map_path(log: Path, notes: dict[Any, Any]) -> Path:
 def _read_tracks(log: Path) -> TrackSamples:
     """The boxes of all steps, and the box of the recording car."""
     ego_us, ego = _ego_boxes(log)
-    file, notes = _open(log, "box_detections_se3")
-    stamps = file.stamps(file.table)
-    counts, columns = file.lists(*list(_FILES["box_detections_se3"])[1:])
-    label_class = str(notes.get("box_detection_label_class")).rpartition(".")[2]
-    if label_class not in codes.LABELS:
-        what = f"label class {label_class!r} is unknown"
-        raise file.fault(what, f"known are: {', '.join(codes.LABELS)}")
-    boxes, tokens, velocities, labels = columns
+    file = _File(log, "box_detections_se3")
+    rows, (boxes, tokens, velocities, labels) = file.lists()
+    label_class = file.notes["box_detection_label_class"].rpartition(".")[2]
+    file.known([label_class], codes.LABELS, "label class")
     kinds = codes.LABELS[label_class]
-    if unknown := set(labels.to_pylist()) - set(kinds):
-        raise file.fault(f"label {min(unknown)} of {label_class} is unknown")
-    category = [kinds[label] for label in labels.to_pylist()]
-    every = np.concatenate([file.boxes(vectors(boxes)), ego])
-    moves = np.concatenate([vectors(velocities)[:, :2], np.full((len(ego), 2), np.nan)])
+    file.known(labels.unique().to_pylist(), kinds, f"{label_class}: label")
+    category = [*(kinds[label] for label in labels.to_pylist()), *[AgentKind.VEHICLE] * len(ego)]
+    every = np.concatenate([file.boxes(_vectors(boxes, 9)), ego])
     names = [kind.name.lower() for kind in AgentKind]
-    with file.naming():
+    with Source(log).naming():
         return make_samples(
             log.name,
-            time_us=np.concatenate([np.repeat(stamps, counts), ego_us]),
+            time_us=np.concatenate([file.stamps()[rows], ego_us]),
             ids=np.array([*tokens.to_pylist(), *[EGO] * len(ego)]),
-            category=np.array([*category, *[AgentKind.VEHICLE] * len(ego)], np.int64),
+            category=np.array(category, np.int64),
             categories=names,
             kind_of=dict(zip(names, AgentKind, strict=True)),
             xy=every[:, :2],
             headings=every[:, 2],
-            velocities=moves,
+            velocities=np.concatenate([_vectors(velocities, 2), np.full((len(ego), 2), np.nan)]),
             sizes=every[:, 3:],
         )
 
@@ -151,64 +221,62 @@ def _ego_boxes(log: Path) -> tuple[IntArray, FloatArray]:
 
     Stored velocities of egos are 0 in many rows in which the car moves, and are not used.
     """
-    file, notes = _open(log, "ego_state_se3")
-    poses = vectors(file.table["imu_se3"].combine_chunks())
-    try:
-        to_center = np.array(notes["center_to_imu_se3"], np.float64).reshape(7)
-        size = np.array([notes["length"], notes["width"]], np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise file.fault(f"'metadata' lacks {error}") from error
-    sizes = np.broadcast_to(size, (len(poses), 2))
-    boxes = file.boxes(np.column_stack([poses, sizes]))
-    cos, sin = np.cos(boxes[:, 2]), np.sin(boxes[:, 2])
-    boxes[:, 0] = boxes[:, 0] + cos * to_center[0] - sin * to_center[1]
-    boxes[:, 1] = boxes[:, 1] + sin * to_center[0] + cos * to_center[1]
-    boxes[:, 2] += yaws(to_center[None, 3:])
+    file = _File(log, "ego_state_se3")
     # of equal stamps the first is kept
-    stamps, first = np.unique(file.stamps(file.table), return_index=True)
-    return stamps, boxes[first]
+    stamps, first = np.unique(file.stamps(), return_index=True)
+    poses = _vectors(file.table["imu_se3"].combine_chunks(), 7)[first]
+    sizes = np.broadcast_to([file.notes["length"], file.notes["width"]], (len(poses), 2))
+    boxes = file.boxes(np.column_stack([poses, sizes]))
+    center = np.array(file.notes["center_to_imu_se3"])
+    if center.shape != (7,):
+        raise file.fault(f"'center_to_imu_se3' has {center.size} numbers, need 7")
+    cos, sin = np.cos(boxes[:, 2]), np.sin(boxes[:, 2])
+    boxes[:, 0] = boxes[:, 0] + cos * center[0] - sin * center[1]
+    boxes[:, 1] = boxes[:, 1] + sin * center[0] + cos * center[1]
+    boxes[:, 2] += _yaws(center[None, 3:])
+    return stamps, boxes
 
 
 def _read_lights(log: Path) -> LightStates | None:
     if not (log / "traffic_light_detections.arrow").is_file():
         return None
-    file, _ = _open(log, "traffic_light_detections")
-    lanes, shown = (file.table[name].to_pylist() for name in ("lane_id", "status"))
-    return states_of_lists(file.stamps(file.table), lanes, shown, codes.LIGHT_CODES)
+    file = _File(log, "traffic_light_detections")
+    rows, (lanes, shown) = file.lists()
+    return states_of_lists(file.stamps(), rows, lanes.to_numpy(), shown.to_numpy(), codes.LIGHTS)
 
 
 @lru_cache(maxsize=1)  # logs of one city follow each other
 def _read_map(path: Path, name: str, lit: frozenset[str]) -> PieceMap:
     """A map; `lit` are the lanes that have a light."""
-    file = PackedTable(path, _MAP, HINT)
-    found: defaultdict[str, dict[str, dict[Any, Any]]] = defaultdict(dict)
+    file = _File(path.parent, "map", at=path)
+    table = file.table.filter(pc.is_in(file.table["map_layer"], pa.array(codes.LAYERS, pa.int8())))
+    numbers, layers, features, wkb = (column.to_pylist() for column in table.columns)
+    found: defaultdict[str, dict[int, dict[Any, Any]]] = defaultdict(dict)
     areas: defaultdict[str, list[shapely.Polygon]] = defaultdict(list)
     stops: list[StopArea] = []
-    for number, code, features, wkb in zip(*(file.table[n].to_pylist() for n in _MAP), strict=True):
-        layer = codes.LAYERS.get(code, "")
+    shapes = shapely.from_wkb(wkb, on_invalid="ignore")
+    for number, code, packed, shape in zip(numbers, layers, features, shapes, strict=True):
+        layer = codes.LAYERS[code]
         place = f"{layer} {number}"
-        if layer in _WITH_FEATURES:
-            found[layer][str(number)] = file.unpack(features or b"", place)
-        if layer and layer != "lane":
-            areas[layer].append(file.polygon(wkb, place))
+        if layer in _FEATURES:
+            found[layer][number] = file.unpack(packed, _FEATURES[layer], place)
+        if layer != "lane":
+            areas[layer].append(file.area(shape, f"wkb of {place}"))
         if layer == "stop zone":
-            kind = found[layer][str(number)].get("stop_zone_type")
-            code = kind if isinstance(kind, int) else 0
-            stops.append(StopArea(areas[layer][-1], codes.STOP_CODES.get(code, codes.OTHER_STOP)))
-    inside = {n for n, g in found["lane group"].items() if g.get("intersection_id") is not None}
+            kind = codes.STOPS.get(found[layer][number].get("stop_zone_type"), codes.OTHER_STOP)
+            stops.append(StopArea(areas[layer][-1], kind))
+    groups = found["lane group"].items()
+    inside = {number for number, group in groups if group.get("intersection_id") is not None}
     return build_lane_map(
         MapSource(
             name=name,
             pieces=[
-                LanePiece(
-                    id=number,
-                    **{s: file.line_of(lane, key, f"lane {number}") for s, key in _LINES.items()},
-                    successors=tuple(map(str, lane.get("successor_ids") or ())),
-                    left_neighbor=text_or_none(lane.get("left_lane_id")),
-                    right_neighbor=text_or_none(lane.get("right_lane_id")),
-                    is_connector=text_or_none(lane.get("lane_group_id")) in inside,
-                    speed_limit=_limit(file, lane, number),
-                    light=number if number in lit else None,
+                _LANE.piece(
+                    file,
+                    lane,
+                    str(number),
+                    is_connector=lane.get("lane_group_id") in inside,
+                    light=str(number) if str(number) in lit else None,
                 )
                 for number, lane in found["lane"].items()
                 if lane.get("lane_type") != codes.BIKE_LANE
@@ -221,8 +289,3 @@ def _read_map(path: Path, name: str, lit: frozenset[str]) -> PieceMap:
             car_parks=areas["car park"],
         )
     )
-
-
-def _limit(file: Source, lane: dict[Any, Any], number: str) -> float | None:
-    limit = lane.get("speed_limit_mps")
-    return None if limit is None else file.number(limit, "speed limit", f"lane {number}")

@@ -40,10 +40,11 @@ class Scene:
 
     samples: TrackSamples
     map: PieceMap
-    egos: tuple[str, ...] | None  # ids of the recording cars; None where there is none
+    egos: tuple[str, ...] | None = None  # ids of the recording cars; None where there is none
     lights: LightStates | None = None
     left_out_s: float = 0.0  # time at its end that no scenario reaches [s]
     metadata: Mapping[str, object] = field(default_factory=dict)  # source, licence and so on
+    warnings: Mapping[str, int] = field(default_factory=dict)  # what the reader left out, by kind
 
 
 class Reader(Protocol):
@@ -168,8 +169,10 @@ def convert_scene(scene: Scene, *, vehicles: bool = False) -> Made:
         for window in converted.windows
     )
     converted = replace(converted, recording=recording, windows=windows)
-    warnings = Counter(scene.map.warnings) + Counter(converted.summary.warnings)
-    return Made(scene.map.road, converted, warnings)
+    warnings = Counter(scene.map.warnings)
+    warnings.update(scene.warnings)
+    warnings.update(converted.summary.warnings)
+    return Made(scene.map.road, converted, +warnings)
 
 
 class _Converter:

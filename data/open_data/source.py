@@ -1,7 +1,13 @@
-"""A file of an open data set: what is read of it is checked, and faults name it and a remedy."""
+"""A file of an open data set: what is read of it is checked, and faults name it and a remedy.
 
-from collections.abc import Iterator, Mapping
+Every reader says in a table what it needs: of columns the Arrow type, and whether there may be
+nulls (`need`, `maybe`, `items`); of JSON and msgpack the form (`Source.expect`). What passes is
+used without further checks but those of ranges.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +16,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.pieces import clean_line
 from shiftsim.data.polygons import largest_part
-from shiftsim.errors import ConversionError, DataError
+from shiftsim.errors import ConversionError, DataError, readable
 from shiftsim.world.ranges import OPEN_DATA, require
 
 REPAIR = "get the file again from its source, or leave the scene out"
 _MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 8_000_000
+# what JSON and msgpack call a type of Python, and the types of values that will do
+_KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
+    bool: ("true or false", (bool,)),
+    int: ("an integer", (int,)),
+    float: ("a number", (int, float)),
+    str: ("a text", (str,)),
+    list: ("a list", (list,)),
+    dict: ("a map", (dict,)),
+    np.ndarray: ("an array", (np.ndarray,)),
+}
+need, maybe = partial(pa.field, nullable=False), pa.field  # columns without and with nulls
 
 
 class Source:
@@ -67,7 +84,8 @@ class Source:
             number = float(value)
         except (TypeError, ValueError):
             raise self.fault(f"{place} is {value!r}, need a number") from None
-        self.require(field, number, place)
+        if not OPEN_DATA[field].holds(number):
+            self.require(field, number, place)
         return number
 
     def require(self, field: str, values: Any, place: str, *, may_be_nan: bool = False) -> None:
@@ -76,12 +94,21 @@ class Source:
         require(OPEN_DATA, field, values, where, error=ConversionError, may_be_nan=may_be_nan)
 
     def line(self, points: Any, place: str, least: int = 2) -> FloatArray:
-        """(K, 2) a line of points (K', 2 or 3) without repeated ones [m]."""
-        if len(points) < least:
-            raise self.fault(f"{place} has {len(points)} points, need {least}")
-        line = np.ascontiguousarray(np.asarray(points, np.float64)[:, :2])
-        self.require("position", line, place)
-        return clean_line(line)
+        """(K, 2) a line of points (K', 2 or 3), or maps of x and y, without repeated ones [m]."""
+        if isinstance(points, list):
+            points = [(p["x"], p["y"]) if isinstance(p, dict) else p for p in points]
+        try:
+            line = np.array(points, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self.fault(f"{place} is no line of points ({error})") from error
+        line = line if line.size else np.empty((0, 2))
+        if line.ndim != 2 or line.shape[1] < 2:
+            raise self.fault(f"{place} is no line of points (shape {line.shape})")
+        self.require("position", line[:, :2], place)
+        line = clean_line(line[:, :2])
+        if len(line) < least:
+            raise self.fault(f"{place} has {len(line)} points that differ, need {least}")
+        return line
 
     def area(self, shape: shapely.Geometry | None, place: str) -> shapely.Polygon:
         """The largest valid part of a polygon."""
@@ -90,48 +117,98 @@ class Source:
         self.require("position", shapely.get_coordinates(shape), place)
         return largest_part(shapely.force_2d(shape))
 
-    def columns(self, wanted: Mapping[str, pa.DataType], prefix: str = "") -> pa.Table:
+    def known(self, values: Iterable[Any], all_known: Collection[Any], place: str) -> None:
+        """Every value is one of those that are known."""
+        for value in values:
+            if value not in all_known:
+                hint = f"known are: {', '.join(map(str, all_known))}"
+                raise self.fault(f"{place} {value!r} is unknown", hint)
+
+    def expect(self, value: Any, form: Any, place: str) -> None:
+        """Raise an error unless what JSON or msgpack holds has a form.
+
+        Args:
+            value: What it holds.
+            form: A type; `[form]`: a list of such; `{name: form}`: a map with at least these names;
+                `{str: form}`: a map with any names; `(form,)`: such, or nothing.
+            place: Where it is, for the message.
+        """
+        if value is None and isinstance(form, tuple):
+            return
+        form = form[0] if isinstance(form, tuple) else form
+        if value is None:
+            raise self.fault(f"{place} is missing")
+        name, types = _KINDS[form if isinstance(form, type) else type(form)]
+        if type(value) not in types:
+            raise self.fault(f"{place} is {readable(value)[:40]!r}, need {name}")
+        if isinstance(form, list):
+            for number, item in enumerate(value):
+                self.expect(item, form[0], f"{place}, item {number}")
+        elif isinstance(form, dict):
+            each = dict.fromkeys(value, form[str]) if str in form else form
+            for key, inner in each.items():
+                self.expect(value.get(key), inner, f"{place}: {key!r}")
+
+    def columns(self, wanted: Sequence[pa.Field], prefix: str = "") -> pa.Table:
         """Columns of a Parquet file, or of an Arrow IPC file (`.arrow`), by their plain names.
 
         Args:
-            wanted: Type of each column.
+            wanted: Name and type of each column, and where in it there may be nulls.
             prefix: What their names begin with in the file.
 
         Raises:
-            ConversionError: The file is missing or broken, or a column is missing or of another
-                type.
+            ConversionError: The file is missing, broken or without rows, a column is missing or of
+                another type, or has nulls where it may not.
         """
         self._require_size(_MAX_BYTES)
-        names = {f"{prefix}{name}": name for name in wanted}
+        names = [f"{prefix}{field.name}" for field in wanted]
         try:
-            table = _read(self.path, list(names))
+            table = _read(self.path, names)
             table.validate(full=True)
         except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
             raise self.fault(f"cannot be read ({error})") from error
-        if len(table) > _MAX_ROWS:
-            what = f"{len(table)} rows, at most {_MAX_ROWS} can be read"
-            raise self.fault(what, "split the recording")
-        for name, plain in names.items():
+        if not 0 < len(table) <= _MAX_ROWS and names:
+            what = f"{len(table)} rows, need 1 to {_MAX_ROWS}"
+            raise self.fault(what, "split the recording" if len(table) else "")
+        for name, field in zip(names, wanted, strict=True):
             if name not in table.column_names:
                 raise self.fault(f"column {name!r} is missing")
-            kind, found = wanted[plain], table.schema.field(name).type
-            if found != kind and not (kind == pa.string() and found == pa.large_string()):
-                raise self.fault(f"column {name!r} is {found}, need {kind}")
+            found = table.schema.field(name).type
+            if _bare(found) != _bare(field.type):
+                raise self.fault(f"column {name!r} is {found}, need {_bare(field.type)}")
+            if count := sum(_nulls(chunk, field) for chunk in table[name].chunks):
+                raise self.fault(f"column {name!r} holds {count} nulls, need a value everywhere")
         notes = table.schema.metadata
-        table = table.select(list(names)).rename_columns(list(names.values()))
+        table = table.select(names).rename_columns([field.name for field in wanted])
         return table.replace_schema_metadata(notes)
 
     def numbers(self, table: pa.Table, column: str, field: str) -> FloatArray:
         """(R,) a column as float64, all in the range of the field."""
-        if count := table[column].null_count:
-            raise self.fault(f"column {column!r} holds {count} nulls", "leave those rows out")
         values = table[column].to_numpy().astype(np.float64, copy=False)
         self.require(field, values, f"column {column!r}")
         return values
 
-    def stamps(self, table: pa.Table) -> IntArray:
-        """(R,) the column of time stamps [us]."""
-        return self.numbers(table, "timestamp_us", "time").astype(np.int64)
+
+def items(kind: pa.DataType, length: int = -1) -> pa.DataType:
+    """The type of lists without nulls, all of a length if it is given."""
+    return pa.list_(need("item", kind), length)
+
+
+def _bare(kind: pa.DataType) -> pa.DataType:
+    """A type, whatever it calls the items of lists, and whether there may be nulls among them."""
+    if pa.types.is_fixed_size_list(kind):
+        return pa.list_(_bare(kind.value_type), kind.list_size)
+    if pa.types.is_list(kind):
+        return pa.list_(_bare(kind.value_type))
+    return pa.string() if pa.types.is_large_string(kind) else kind
+
+
+def _nulls(found: pa.Array, wanted: pa.Field) -> int:
+    """How many nulls there are where there may be none."""
+    count = 0 if wanted.nullable else found.null_count
+    if isinstance(found, pa.ListArray | pa.FixedSizeListArray):
+        count += _nulls(found.flatten(), wanted.type.value_field)
+    return count
 
 
 def find_below(folder: Path, pattern: str, remedy: str) -> list[Path]:
@@ -152,8 +229,3 @@ def _read(path: Path, names: list[str]) -> pa.Table:
         known_at = [i for i, name in enumerate(schema.names) if name in names]
         options = pa.ipc.IpcReadOptions(included_fields=known_at, use_threads=False)
         return pa.ipc.open_file(source, options=options).read_all()
-
-
-def text_or_none(value: Any) -> str | None:
-    """An id as text."""
-    return None if value is None else str(value)

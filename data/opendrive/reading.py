@@ -5,8 +5,6 @@ counted in `OpenDrive.warnings`, one count per kind; what cannot raises one erro
 road and element.
 """
 
-import io
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,13 +15,14 @@ from lxml import etree
 from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.elements import CUBIC, Reader, read_object, read_signal
 from shiftsim.data.opendrive.records import OpenDrive, Road
+from shiftsim.data.xml_elements import xml_elements
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import OPENDRIVE
 
 MAX_BYTES = 200_000_000
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
-_TOP_LEVEL = ("OpenDRIVE", "header", "road", "junction")
+_TOP_LEVEL = ("header", "road", "junction")
 
 
 def read_opendrive(path: Path) -> OpenDrive:
@@ -53,7 +52,13 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     roads: dict[str, Road] = {}
     seen: set[tuple[str, str]] = set()
     junctions: dict[str, records.Junction] = {}
-    for element in _top_elements(_strip_junk(data, reader), reader):
+
+    def fault(what: str, remedy: str) -> ConversionError:
+        return ConversionError(f"{source}: {what}", remedy or "give an .xodr file, exported again")
+
+    for element in xml_elements(_strip_junk(data, reader), "OpenDRIVE", fault, _TOP_LEVEL):
+        if element.tag.startswith("{"):
+            _drop_namespaces(element)
         name = element.get("id", "")
         if element.tag == "header":
             reader.place = "header"
@@ -79,51 +84,6 @@ def _strip_junk(data: bytes, reader: Reader) -> bytes:
             reader.warn("bytes before the XML declaration")
         return data[start:]
     return data.lstrip(b" \t\r\n")
-
-
-def _top_elements(data: bytes, reader: Reader) -> Iterator[Any]:
-    """Header, roads and junctions one by one; each is freed when the next is asked for."""
-    root = None
-    try:
-        for event, element in etree.iterparse(
-            io.BytesIO(data),
-            events=("start", "end"),
-            tag=[f"{{*}}{name}" for name in _TOP_LEVEL],
-            remove_comments=True,
-            remove_pis=True,
-            resolve_entities=False,
-            load_dtd=False,
-            no_network=True,
-            huge_tree=False,
-        ):
-            if root is None:
-                root = element
-                _check_root(root, reader)
-            if event == "end" and element.getparent() is root:
-                if element.tag.startswith("{"):
-                    _drop_namespaces(element)
-                yield element
-                element.clear()
-    except etree.XMLSyntaxError as error:
-        raise ConversionError(
-            f"{reader.source}: not well-formed XML: {error.msg}", "export the map again"
-        ) from error
-    if root is None:
-        raise _not_opendrive(reader)
-
-
-def _check_root(root: Any, reader: Reader) -> None:
-    if root.getroottree().docinfo.doctype:
-        what = f"{reader.source}: has a DOCTYPE, which OpenDRIVE does not use"
-        raise ConversionError(what, "remove the DOCTYPE and its entities")
-    if root.getparent() is not None or etree.QName(root).localname != "OpenDRIVE":
-        raise _not_opendrive(reader)
-
-
-def _not_opendrive(reader: Reader) -> ConversionError:
-    return ConversionError(
-        f"{reader.source}: its first element is not OpenDRIVE", "give the path of an .xodr file"
-    )
 
 
 def _drop_namespaces(element: Any) -> None:

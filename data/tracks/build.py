@@ -23,6 +23,8 @@ from shiftsim.errors import ConversionError
 from shiftsim.world.state import AgentKind
 
 MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
+MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
+MAX_SPAN_S = 1e5  # s from the first row to the last one
 # length and width of objects of unknown size [m]
 SIZES = {
     AgentKind.VEHICLE: (4.6, 1.9),
@@ -68,7 +70,7 @@ def make_samples(
 
     Raises:
         ConversionError: A value is not finite, a category is unknown, or an object has two rows at
-            one time.
+            one time. Nothing is seen for an hour, or the rows span more than a day.
     """
     warnings: Counter[str] = Counter()
     for what, values in (("position", xy), ("heading", headings)):
@@ -91,6 +93,7 @@ def make_samples(
         derived = None
     _refuse_twice(name, track_ids, track, time_us)
     stamps, frame = numbered(time_us)
+    _refuse_pauses(name, stamps)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[track[1:] == track[:-1]]
     period = float(np.median(step)) if len(step) else ROW_S
@@ -119,6 +122,19 @@ def make_samples(
     if float(np.median(np.diff(samples.clock))) < 0.5 * period:
         return on_common_clock(samples)
     return samples
+
+
+def _refuse_pauses(name: str, stamps: IntArray) -> None:
+    """Every row of the recording takes memory, also those in which nothing is seen."""
+    first = int(np.diff(stamps).argmax())
+    pause, span = np.diff(stamps).max() / 1e6, (stamps[-1] - stamps[0]) / 1e6
+    if pause > MAX_PAUSE_S or span > MAX_SPAN_S:
+        begin = (stamps[first] - stamps[0]) / 1e6
+        raise ConversionError(
+            f"{name}: the rows span {span:g} s, with none between {begin:g} s and"
+            f" {begin + pause:g} s; at most {MAX_SPAN_S:g} s, and {MAX_PAUSE_S:g} s without a row",
+            "leave out rows with a wrong time, check its unit, or convert parts by themselves",
+        )
 
 
 def on_common_clock(samples: TrackSamples) -> TrackSamples:

@@ -8,7 +8,7 @@ import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.data.tracks.axes import check_headings, check_reference, check_velocities
-from shiftsim.data.tracks.build import numbered
+from shiftsim.data.tracks.build import MAX_PAUSE_S, MAX_SPAN_S, numbered
 from shiftsim.data.tracks.columns import KINDS, UNITS, Columns
 from shiftsim.data.tracks.evidence import FAST, LEAST_CONTRADICTING, Doubts, Motion
 from shiftsim.data.tracks.fit import Fit, fit_map
@@ -22,14 +22,14 @@ _MAX_SPEED = 60.0  # m/s, of 95 % of the vehicles' rows
 _LEAST_SPEED = 1.0  # m/s, of the fastest vehicle
 _MOVING = 1.0  # m/s
 _MAX_GAP = 1.0  # s without a row of any object
-_MAX_PAUSE = 3600.0  # s without a row of any object within one recording
 _LEAST_OBJECTS = 5  # that begin at once
-_MAX_SPAN = 1e5  # s from the first row to the last one
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
 _LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
 _LONGEST_WALKER = 2.0  # m, median of pedestrians
+_WALKING = (0.85, 2.1)  # m/s, of the median pedestrian; about 1.35 m/s everywhere
+_LEAST_WALKERS, _LEAST_WALK = 5, 4.0  # pedestrians that walk, and m that each of them must walk
 _ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving vehicles' rows
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
@@ -81,6 +81,7 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Doubts:
             "check --hz or the unit of time, unless the limits of the map are wrong",
         )
     _check_accelerations(motion, out)
+    _check_walkers(motion, out)
     _check_sizes(motion, out)
     check_headings(motion, fit, out)
     check_velocities(motion, fit, out)
@@ -112,12 +113,12 @@ def _check_times(table: TrackTable, step: FloatArray, out: Doubts) -> bool:
     slow, fast = _RATES
     span = float(np.ptp(table.time_us)) / 1e6
     if 0.99 / fast <= period <= 1.01 / slow:
-        if span > _MAX_SPAN:
+        if span > MAX_SPAN_S:
             out.say(
-                f"the rows span {span:g} s, more than {_MAX_SPAN:g} s",
+                f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
                 "leave out rows with a wrong time, check its unit, or convert parts by themselves",
             )
-        return span <= _MAX_SPAN
+        return span <= MAX_SPAN_S
     column = table.columns.found.get("time")
     remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
     if column is not None and table.hz is None:
@@ -143,9 +144,9 @@ def _check_gaps(table: TrackTable, out: Doubts) -> None:
     if len(gaps):
         first = gaps[np.diff(stamps)[gaps].argmax()]
         begin, end = (stamps[first : first + 2] - stamps[0]) / 1e6
-        if end - begin > _MAX_PAUSE:
+        if end - begin > MAX_PAUSE_S:
             out.say(
-                f"no object has a row between {begin:g} s and {end:g} s, at most {_MAX_PAUSE:g} s",
+                f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
                 "if the clock begins anew at midnight, add a day to the times after it; if two"
                 " recordings were joined, convert each by itself",
             )
@@ -257,6 +258,27 @@ def _check_accelerations(motion: Motion, out: Doubts) -> None:
             f"moving vehicles accelerate, brake and turn with {usual:.2g} m/s² in the middle of"
             f" {len(rows)} rows, at most {_MAX_ACCELERATION:g} m/s²",
             "check --hz or the unit of time; positions that jitter need smoothing",
+        )
+
+
+def _check_walkers(motion: Motion, out: Doubts) -> None:
+    """How fast pedestrians walk while they do, the same whatever a clock counts."""
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
+    is_walker = np.array(walks, np.bool_)[motion.table.category[motion.ends[:-1]]]
+    speeds = []
+    for first, stop in zip(motion.ends[:-1][is_walker], motion.ends[1:][is_walker], strict=True):
+        way = motion.table.xy[stop - 1] - motion.table.xy[first]
+        if np.hypot(*way) > _LEAST_WALK:
+            speed = motion.speed[first:stop]
+            speeds.append(np.median(speed[speed > 0.5 * np.percentile(speed, 90)]))
+    if len(speeds) < _LEAST_WALKERS:
+        return
+    walking = out.figures["walking_mps"] = float(np.median(speeds))
+    if not _WALKING[0] <= walking <= _WALKING[1]:
+        out.note(
+            f"the median pedestrian walks with {walking:.2g} m/s, usual is {_WALKING[0]:g} …"
+            f" {_WALKING[1]:g} m/s",
+            "check --hz or the unit of time, and the column of kinds",
         )
 
 

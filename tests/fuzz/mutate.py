@@ -10,6 +10,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import msgpack
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lxml import etree
@@ -198,50 +199,96 @@ def _database(path: Path, random: Random) -> str:
 
 
 def _parquet(path: Path, random: Random) -> str:
-    """A value changed; rows or columns away, twice or of another type; the footer changed."""
+    """A value changed; rows or columns away, twice, null or of another type; the footer changed."""
     file = pq.ParquetFile(path)
     table, notes = file.read(), dict(file.metadata.metadata or {})
     groups = max(file.metadata.row_group(0).num_rows, 1) if file.num_row_groups else 1
-    name = random.choice(table.column_names)
-    index, kind = table.column_names.index(name), random.random()
-    what = name
-    if kind < 0.06:
-        table, what = table.drop_columns([name]), f"{name} away"
-    elif kind < 0.12:
-        other = random.choice((pa.string(), pa.int64(), pa.float64(), pa.float32()))
-        table, what = table.set_column(index, name, table[name].cast(other)), f"{name} as {other}"
-    elif kind < 0.2:
-        row = random.randrange(max(len(table), 1))
-        parts = random.choice(
-            ([table[:row]], [table, table[:row]], [table[:row], table[row + 1 :]])
-        )
-        table, what = pa.concat_tables(parts), "rows away or twice"
-    elif kind < 0.3 and notes:
-        key = random.choice(list(notes))
-        if key != b"ARROW:schema":
-            content = json.loads(notes[key])
-            what = "footer: " + change_value(content, random)
-            notes[key] = json.dumps(content).encode()
+    keys = [key for key in notes if key != b"ARROW:schema"]
+    if keys and random.random() < 0.1:
+        key = random.choice(keys)
+        content = json.loads(notes[key])
+        what = "footer: " + change_value(content, random)
+        notes[key] = json.dumps(content).encode()
     else:
-        values = table[name].to_pylist()
-        row = random.randrange(len(values))
-        old, what = values[row], f"{name}[{row}]"
-        if isinstance(old, list) and old and random.random() < 0.8:
-            at = random.randrange(len(old))
-            old[at] = _like(old[at], random)
-            what += f"[{at}] = {str(old[at])[:30]}"
-        elif isinstance(old, list):
-            values[row] = random.choice(([], old[:-1], old * 2, old[::-1]))
-        else:
-            values[row] = _like(old, random)
-            what += f" = {str(values[row])[:30]}"
-        field = table.schema.field(index)
-        table = table.set_column(index, field, pa.array(values, field.type))
+        table, what = _table(table, random)
     notes.pop(b"ARROW:schema", None)
     with pq.ParquetWriter(path, table.schema, store_schema=False) as writer:
         writer.write_table(table, row_group_size=groups)
         writer.add_key_value_metadata(notes)
     return what
+
+
+def _arrow(path: Path, random: Random) -> str:
+    """As for Parquet; and what msgpack packed in the schema or a cell changed."""
+    with pa.OSFile(str(path)) as source:
+        table = pa.ipc.open_file(source).read_all()
+    notes = dict(table.schema.metadata or {})
+    packed = [name for name in ("features",) if name in table.column_names]
+    if packed and random.random() < 0.4:
+        cells = table[packed[0]].to_pylist()
+        row = random.randrange(len(cells))
+        cells[row], what = _repacked(cells[row], random)
+        at = table.column_names.index(packed[0])
+        table = table.set_column(at, packed[0], pa.array(cells, pa.binary()))
+        what = f"{packed[0]}[{row}]: {what}"
+    elif notes and random.random() < 0.3:
+        key = random.choice(list(notes))
+        notes[key], what = _repacked(notes[key], random)
+        what = f"{key!r}: {what}"
+    else:
+        table, what = _table(table, random)
+    table = table.replace_schema_metadata(notes)
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+    return what
+
+
+def _repacked(data: bytes, random: Random) -> tuple[bytes, str]:
+    content = msgpack.unpackb(data, strict_map_key=False)
+    what = change_value(content, random)
+    return msgpack.packb(content), what
+
+
+def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
+    name = random.choice(table.column_names)
+    index, kind = table.column_names.index(name), random.random()
+    field = table.schema.field(index)
+    if kind < 0.06:
+        return table.drop_columns([name]), f"{name} away"
+    if kind < 0.12:
+        other = random.choice((pa.string(), pa.int64(), pa.float64(), pa.float32()))
+        if pa.types.is_list(field.type) and random.random() < 0.7:
+            other = pa.list_(other)
+        new = table[name].cast(other) if random.random() < 0.7 else pa.nulls(len(table), other)
+        return table.set_column(index, name, new), f"{name} as {other}"
+    if kind < 0.2:
+        row = random.randrange(max(len(table), 1))
+        parts = random.choice(
+            ([table[:row]], [table, table[:row]], [table[:row], table[row + 1 :]])
+        )
+        return pa.concat_tables(parts), "rows away or twice"
+    values = table[name].to_pylist()
+    row = random.randrange(len(values))
+    old, what = values[row], f"{name}[{row}]"
+    if kind < 0.24:
+        values = [None] * len(values)
+        what = f"{name} = null"
+    elif kind < 0.3:
+        values[row] = None
+        what += " = null"
+    elif isinstance(old, list) and old and random.random() < 0.8:
+        at = random.randrange(len(old))
+        if isinstance(old[at], list) and old[at]:
+            old, what = old[at], f"{what}[{at}]"
+            at = random.randrange(len(old))
+        old[at] = _like(old[at], random)
+        what += f"[{at}] = {str(old[at])[:30]}"
+    elif isinstance(old, list):
+        values[row] = random.choice(([], old[:-1], old * 2, old[::-1], [*old, None]))
+    else:
+        values[row] = _like(old, random)
+        what += f" = {str(values[row])[:30]}"
+    return table.set_column(index, field, pa.array(values, field.type)), what
 
 
 def _like(old: Any, random: Random) -> Any:
@@ -307,9 +354,11 @@ def _packed(path: Path, random: Random) -> str:
 
 _WAYS: dict[str, Any] = {
     ".xodr": (_xml, _xml, _text),
+    ".xml": (_xml, _text, _text),
     ".db": (_database,),
     ".gpkg": (_database,),
     ".parquet": (_parquet,),
+    ".arrow": (_arrow,),
     ".json": (_json, _text),
     ".jsonl": (_json, _text, _lines),
     ".toml": (_text, _lines),

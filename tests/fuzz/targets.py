@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -270,20 +270,26 @@ def _read_site(folder: Path) -> Any:
     return site, recordings, read_store(folder / "store")
 
 
-def _open_data(folder: Path) -> None:
-    open_data_files.write_av2(folder / "av2")
-    open_data_files.write_commonroad(folder / "commonroad")
-    open_data_files.write_py123d(folder / "py123d")
+def _av2(folder: Path) -> None:
+    open_data_files.write_av2(folder / "scene")
 
 
-def _read_open_data(folder: Path) -> Any:
+def _commonroad(folder: Path) -> None:
+    for version in ("2018b", "2020a"):
+        open_data_files.write_commonroad(folder / version, version)
+
+
+def _py123d(folder: Path) -> None:
+    open_data_files.write_py123d(folder / "logs")
+
+
+def _read_scenes(name: str, folder: Path) -> Any:
     from shiftsim.data.open_data.av2 import Av2Reader
     from shiftsim.data.open_data.commonroad import CommonRoadReader
     from shiftsim.data.open_data.py123d import Py123dReader
     from shiftsim.data.open_data.scenes import convert_scene
 
-    readers = {"*.parquet": Av2Reader(), "*.xml": CommonRoadReader(), "*.arrow": Py123dReader()}
-    reader = next(r for pattern, r in readers.items() if any(folder.rglob(pattern)))
+    reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name]()
     made = [convert_scene(reader.read(path)) for path in reader.find(folder)]
     return [(one.road, one.converted.egos, one.converted.windows) for one in made]
 
@@ -462,7 +468,9 @@ TARGETS = {
     "nuplan-log": Target(_logs, _read_log),
     "nuplan-map": Target(_packages, _read_package),
     "dsc3d": Target(_sites, _read_site, "*.[jp]*"),
-    "open-data": Target(_open_data, _read_open_data, "*.[ajpx]*"),
+    "av2": Target(_av2, partial(_read_scenes, "av2"), "*.[jp]*"),
+    "commonroad": Target(_commonroad, partial(_read_scenes, "commonroad"), "*.xml"),
+    "py123d": Target(_py123d, partial(_read_scenes, "py123d"), "*.arrow"),
     "store": Target(_stores, read_store),
     "run-folder": Target(_runs, _read_run),
     "checkpoint": Target(_checkpoints, _read_checkpoint),

@@ -270,6 +270,16 @@ def test_twice_the_speed_is_unusual_where_nothing_else_tells(town, tmp_path):
     assert "--hz" in found.notes[0].remedy
 
 
+@pytest.mark.parametrize(("hz", "walking"), [(6.25, "0.67"), (25.0, "2.7")])
+def test_half_and_twice_the_speed_are_noted_where_pedestrians_walk(hz, walking, town, tmp_path):
+    columns, road = town
+    path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
+    found = _doubts(path, road, hz=hz)
+    assert found.found == []
+    assert f"pedestrian walks with {walking} m/s" in found.notes[-1].what
+    assert "--hz" in found.notes[-1].remedy
+
+
 @pytest.mark.parametrize(("hz", "value"), [(37.5, 8.9), (50.0, 15)])
 def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
     hz, value, town, tmp_path
