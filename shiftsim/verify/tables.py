@@ -10,6 +10,7 @@ says what holds for the others, and how the report calls the section.
     n_centerline = "number of line"
     centerline_last = ["line[-1, :2]", 1e-6]        # m
     poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
+    "ends[..., 2]" = ["line[-2:, 2]", 1e-6, "angle"]  # rad: of a part, equal up to whole turns
     score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
     planner = "= PDM-Closed *"                      # a text, which may go on in any way
     samples = 41                                    # a number
@@ -23,7 +24,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.verify.files import EXACT, Source, read_arrays, read_json
+from shiftsim.verify.files import EXACT, Source, read_arrays, read_index, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
 
@@ -39,19 +40,34 @@ class Table:
 
     def match(self, theirs: Source, where: str, called: str = "", /, **names: Any) -> bool:
         """Compare ours with the values of all rows; whether all agree."""
-        ours, bounds = {}, {}
+        ours, bounds, angles = {}, {}, []
         for name, row in self.rows.items():
             if name in theirs or not self.about["optional"]:
-                path, atol = row if isinstance(row, list) else (row, self.about["atol"])
+                path, atol, *kind = row if isinstance(row, list) else (row, self.about["atol"])
                 bounds[name] = atol[names["variant"]] if isinstance(atol, dict) else atol
                 ours[name] = _find(path, names, theirs.values.get(name))
-        return theirs.match(where, ours, bounds, quantity=called or self.about["called"])
+                angles += [name] if kind == ["angle"] else []
+        called = called or self.about["called"]
+        return theirs.match(where, ours, bounds, quantity=called, angles=angles)
 
 
-def read_tables(module: str) -> dict[str, Table]:
-    """The sections of the file beside a module, given by the path of the module."""
-    content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
-    return {name: Table(rows) for name, rows in content.items()}
+def read_tables(*modules: str) -> dict[str, Table]:
+    """The sections of the files beside modules, given by their paths; later ones add rows."""
+    sections: dict[str, Any] = {}
+    for module in modules:
+        content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
+        sections = _joined(sections, content)
+    return {name: Table(rows) for name, rows in sections.items()}
+
+
+def _joined(rows: Mapping[str, Row], more: Mapping[str, Row]) -> dict[str, Row]:
+    """Rows and further ones, also within a row that is rows by name."""
+    inner = {
+        name: _joined(rows[name], more[name])
+        for name in more
+        if isinstance(more[name], dict) and name in rows
+    }
+    return {**rows, **more, **inner}
 
 
 def verify_cases(
@@ -104,7 +120,7 @@ def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
     value: Any = names
     for name, index in re.findall(r"(\w+)|\[(.*?)\]", path):
         if index:
-            value = value[_index(index)]
+            value = value[read_index(index)]
         else:
             value = value[name] if isinstance(value, Mapping) else getattr(value, name)
     if kind == "number":
@@ -113,10 +129,3 @@ def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
         return value
     ids = names["tracks"].tokens if kind == "tracks" else getattr(names["road"], kind).ids
     return [ids[i] for i in value] if np.ndim(value) else ids[value]
-
-
-def _index(text: str) -> Any:
-    """The index that `-1` or `:, 0` stands for."""
-    parts = [[int(n) if n.strip() else None for n in part.split(":")] for part in text.split(",")]
-    keys = tuple(slice(*part) if len(part) > 1 else part[0] for part in parts)
-    return keys if len(keys) > 1 else keys[0]
