@@ -97,8 +97,7 @@ def _compare_calls(
         TABLES["step"].match(row, at, **names)
         row.match(at, {"best_score": theirs["score"].max()}, TOLERANCE, quantity="PDM")
         TABLES["ends"].match(theirs, at, ends=step.driven.states[:, -1])
-        choice = (int(row["best"]), bool(row["braked"]))
-        if compare_scores(at, seen.ego[index], sight, step, theirs, choice):
+        if compare_scores(at, seen.ego[index], sight, step, theirs, row):
             file.report.compare("PDM plan", at, step.poses, plan, atol=PLAN_TOLERANCES)
         if f"proposals_{index}" in file:
             ids = [*road.edges.ids, *road.car_parks.ids]
