@@ -6,10 +6,12 @@ covered. `match` compares values of ours with those of the same names.
 """
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -171,17 +173,7 @@ def read_index(text: str) -> Any:
     return tuple(keys) if len(keys) > 1 else keys[0]
 
 
-def fields_of(thing: Any, paths: Mapping[str, str]) -> dict[str, Any]:
-    """What paths of `compared.toml` lead to; objects with an id are named by it."""
-    return {name: _follow(thing, path) for name, path in paths.items()}
-
-
-def _follow(thing: Any, path: str) -> Any:
-    for step in path.split("."):
-        thing = thing[int(step)] if step.isdecimal() else getattr(thing, step)
-        thing = thing() if callable(thing) else thing
-    several = isinstance(thing, (list, tuple))
-    return [getattr(x, "id", x) for x in thing] if several else getattr(thing, "id", thing)
+Compare: TypeAlias = Callable[[Source, str], object]  # of a file or case, and what it is called
 
 
 def read_arrays(path: Path, report: Report, name: str = "") -> Source:
@@ -201,8 +193,10 @@ def read_table(path: Path, report: Report) -> Source:
 
 
 def read_fields(path: Path, report: Report, name: str = "") -> Source:
-    """The fields of a `.json` that holds one object; `name` is another name for it."""
-    return Source(name or path.stem, "field", read_json(path), report)
+    """The fields of a `.json`, a list as the field `rows`; `name` is another name for it."""
+    content = read_json(path)
+    fields = {"rows": content} if isinstance(content, list) else content
+    return Source(name or path.stem, "field", fields, report)
 
 
 def read_json(path: Path) -> Any:
@@ -274,16 +268,34 @@ def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
     }
 
 
+def verify_file(compare: Compare, path: Path, report: Report) -> None:
+    """`compare` the values of a file; those that it does not use are not covered.
+
+    The file is named without the number that its name may end with.
+    """
+    read = {".npz": read_arrays, ".parquet": read_table}.get(path.suffix, read_fields)
+    file = replace(read(path, report), name=re.sub(r"_\d+$", "", path.stem))
+    compare(file, path.stem)
+    file.finish()
+
+
 def verify_files(
-    folder: Path, report: Report, parts: Mapping[str, Callable[[Path], object] | None]
+    folder: Path,
+    report: Report,
+    parts: Mapping[str, Callable[[Path], object] | None],
+    files: Mapping[str, Compare] | None = None,
 ) -> None:
     """Give every file of a folder to the part whose pattern is the first to match its name.
 
     A part compares such a file or sub-folder, and what it raises is a mismatch; it is None where
-    nothing need be compared. A file that no pattern matches is not covered, but for `README*`.
+    nothing need be compared. `files` are parts that compare the values of a file. A file that no
+    pattern matches is not covered, but for `README*`.
     """
+    known = dict(parts)
+    for pattern, compare in (files or {}).items():
+        known[pattern] = partial(verify_file, compare, report=report)
     for path in sorted(folder.iterdir()):
-        found = [part for pattern, part in parts.items() if fnmatch(path.name, pattern)]
+        found = [part for pattern, part in known.items() if fnmatch(path.name, pattern)]
         if found and (part := found[0]):
             with report.attempt(path.stem, path.name):
                 part(path)

@@ -1,6 +1,5 @@
 """Worlds in plain JSON, scored by the official metric classes: the metrics without any importer."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.files import COMPARED, TOLERANCE, Source, read_fields, verify_files
+from shiftsim.verify.files import COMPARED, Source, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
@@ -23,7 +22,7 @@ TABLES = read_tables(__file__)
 
 def verify_metric_worlds(folder: Path, report: Report) -> None:
     """Compare every world of the folder, under both threshold profiles."""
-    verify_files(folder, report, {"*.json": partial(_verify_world, report)})
+    verify_files(folder, report, {}, {"*.json": _compare})
 
 
 def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
@@ -46,10 +45,9 @@ def _read(world: Source) -> tuple[SimulationLog, VectorMap]:
     return recorded_log(make_scenario(token, road, time_us, expert, tracks), ego), road
 
 
-def _verify_world(report: Report, path: Path) -> None:
-    world, where = read_fields(path, report, "metric_world"), path.stem
+def _compare(world: Source, where: str) -> None:
+    report, (log, road) = world.report, _read(world)
     world.note("label", "world", "kind")
-    log, road = _read(world)
     # a connector lies in a roadblock connector, a lane in a roadblock
     kinds = road.block_of >= road.num_roadblocks
     is_connector = np.arange(len(road.edges)) >= road.num_lanes
@@ -62,25 +60,20 @@ def _verify_world(report: Report, path: Path) -> None:
     expected.match(where, {"comfort_flag_order": order}, quantity="")
     series = expected.each("series")[0]
     TABLES["series"].match(series, where, **_series(measured, result, road))
+    statistics = {one.name: one.value for one in result.statistics}
     progress = series.each("progress_statistics")[0]
-    progress.match(where, _progress(result), TOLERANCE, quantity="progress_statistics")
+    TABLES["progress"].match(progress, where, found=statistics)
     contacts, found = series.each("collisions"), measured.collisions
     report.compare("number of collisions", where, len(found), len(contacts))
     for ours, theirs in zip(found, contacts, strict=False):
         kind = f"{ours.collision_type.upper()}_COLLISION"
         TABLES["collisions"].match(theirs, f"{where} {ours.token}", contact=ours, kind=kind)
-    world.finish()
 
 
 def known_scores(result: MetricResult) -> dict[str, float]:
     """Scores by metric, and the whole `score`; without those that have no value."""
     scores = {**result.scores, "score": result.score}
     return {name: score for name, score in scores.items() if score is not None}
-
-
-def _progress(result: MetricResult) -> dict[str, float]:
-    ends = "_total_progress_along_route", "_expert_progress_along_route_ratio"
-    return {s.name: s.value for s in result.statistics if s.name.endswith(ends)}
 
 
 def _series(measured: Measurements, result: MetricResult, road: VectorMap) -> dict[str, Any]:

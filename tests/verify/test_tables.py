@@ -10,6 +10,14 @@ from shiftsim.verify.files import Source
 from shiftsim.verify.report import ERRORS, Report
 from shiftsim.verify.tables import Table, read_tables, verify_cases
 
+
+class Lane:
+    edges = (SimpleNamespace(id="E1", ends=[1, 2]), None)
+
+    def roadblock(self):
+        return SimpleNamespace(id="B7")
+
+
 ROAD = SimpleNamespace(blocks=SimpleNamespace(ids=["B0", "B1", "B2"]))
 NAMES = {
     "road": ROAD,
@@ -17,6 +25,7 @@ NAMES = {
     "step": SimpleNamespace(best=2, poses=np.arange(6.0).reshape(2, 3)),
     "made": {"lanes": [4, 5, 6]},
     "chosen": np.array([2, 0]),
+    "lane": Lane(),
 }
 
 
@@ -38,6 +47,10 @@ def compared(rows, theirs, **names):
         ("blocks of step.best", "B2", "B1"),
         ("blocks of chosen", ["B2", "B0"], ["B0", "B2"]),
         ("tracks of made.lanes[:0]", [], ["t0"]),
+        ("lane.edges[:1][*].ends", [[1, 2]], [[1, 3]]),
+        ("lane.edges[:1][*].ends[*]", [1, 2], [2, 1]),
+        ("ids of lane.edges", ["E1", None], ["E1", "E2"]),
+        ("ids of lane.roadblock", "B7", "B8"),
         ("= planner {step.best}", "planner 2", "planner 3"),
         ("= planner *", "planner of somebody", "a planner"),
         ("= *", "anything", 7),
@@ -63,6 +76,24 @@ def test_a_tolerance_may_depend_on_the_variant():
     rows = {"x": ["step.poses[0, 1]", {"base": 1e-3, "drive": 1e-1}]}
     assert compared(rows, {"x": 1.01}, variant="base").mismatches
     assert compared(rows, {"x": 1.01}, variant="drive").mismatches == []
+
+
+def test_a_tolerance_may_be_computed():
+    rows = {"x": ["step.poses[0]", "gap"]}
+    gap = np.array([0.1, 0.1, 0.0])
+    assert compared(rows, {"x": [0.05, 1.05, 2.0]}, gap=gap).mismatches == []
+    assert compared(rows, {"x": [0.05, 1.05, 2.05]}, gap=gap).mismatches
+
+
+def test_values_may_be_angles_and_lists_without_an_order():
+    rows = {
+        "*": {"angles": ["turn"], "unordered": ["lanes"], "atol": 1e-9},
+        "turn": "turn",
+        "lanes": "made.lanes",
+    }
+    theirs = {"turn": 0.5 - 2.0 * np.pi, "lanes": [6, 5, 4]}
+    assert compared(rows, theirs, turn=0.5).mismatches == []
+    assert len(compared(rows, theirs | {"lanes": [6, 5, 5]}, turn=0.6).mismatches) == 2
 
 
 def test_rows_of_an_optional_section_may_be_missing_and_not_differ():
@@ -101,6 +132,18 @@ def test_an_array_with_fewer_rows_is_a_mismatch_and_one_that_nothing_reads_is_na
     )
     assert len(report.mismatches) == 1
     assert list(report.not_covered) == ["file: array 'more'"]
+
+
+def test_rows_between_two_numbers_of_a_pointer_are_one_case(tmp_path):
+    lines = np.arange(5.0)
+    np.savez(tmp_path / "file.npz", x=[1.0, 9.0], line_ptr=[0, 2, 5], line_x=lines)
+    report = cases_of(
+        tmp_path / "file.npz", lambda case, where: case.match(where, {"x": case["line_x"].sum()})
+    )
+    assert (report.num_cases, report.mismatches, report.not_covered) == (2, [], {})
+    np.savez(tmp_path / "file.npz", x=[1.0, 9.0], line_ptr=[0, 2, 4], line_x=lines)
+    with pytest.raises(ERRORS, match="has 5 rows, which are not those of 2 cases"):
+        cases_of(tmp_path / "file.npz", lambda case, where: None)
 
 
 def test_an_array_without_a_number_among_those_with_one_is_refused(tmp_path):
