@@ -135,9 +135,9 @@ class PdmClosed:
     def step_in(
         self, seen: Seen, ego: FloatArray, limit: float, vehicle: VehicleParameters
     ) -> Step:
-        """One planning step in what an ego (11,) sees; `limit` is NaN where the lane has none [m/s].
+        """One planning step in what an ego (11,) sees; what it touches is ignored from now on.
 
-        What the ego touches is ignored from now on.
+        `limit` is the speed limit of the lane, NaN where it has none [m/s].
         """
         size, params = ego_box(vehicle), self.parameters
         center = center_poses(ego[:3], vehicle)

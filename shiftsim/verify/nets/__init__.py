@@ -3,6 +3,7 @@
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,12 @@ from shiftsim.verify.files import read_arrays, read_fields, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
-PARTS = {  # sub-folder → module with `FILES`: by glob pattern what is called with file and scenes
-    "carl": "carl",
-    "diffusion_planner": "diffusion",
-    "plantf": "plantf",
-    "pluto": "pluto",
-    "route_correction": "routes",
+PARTS = {  # sub-folder → module with `FILES`: what compares a file, by glob pattern
+    "carl": "nets.carl",
+    "diffusion_planner": "nets.diffusion",
+    "plantf": "nets.plantf",
+    "pluto": "nets.pluto",
+    "route_correction": "calls",
 }
 
 
@@ -47,16 +48,16 @@ def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None
     if find_spec("torch") is None and part != "route_correction":
         report.skip(f"{part}: torch is not installed")
         return
-    files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
+    files = import_module(f"shiftsim.verify.{PARTS[part]}").FILES
     verify_files(folder, report, {p: partial(_verify, files[p], report, scenes) for p in files})
 
 
 def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:
-    """Compare one file, if its scene is at hand."""
+    """Compare one file, with its scenes if it asks for them and has one that is at hand."""
     file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
     scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
     if scene is not None and scene not in scenes:
         report.skip(f"{path.name}: scene {scene}, which is not at hand")
-    else:
-        compare(file, scenes)
-        file.finish()
+        return
+    compare(file, *([scenes] if "scenes" in signature(compare).parameters else []))
+    file.finish()

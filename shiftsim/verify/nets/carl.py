@@ -9,24 +9,22 @@ from shiftsim.planners.learned.carl.planner import Carl, command_of
 from shiftsim.planners.learned.carl.view import CHANNELS, in_picture, picture_frame
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.verify.files import TOLERANCE, Source
-from shiftsim.verify.nets import networks
-from shiftsim.verify.nets.loops import FILE_COLUMNS, Loop, verify_loop
-from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.tables import read_tables
+from shiftsim.verify.nets import common
+from shiftsim.verify.nets.common import Loop
+from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
 
 NAME, TABLES = Carl.name, read_tables(__file__)
-COMMAND = 1e-4  # m/s^2, rad/s, from our action: ten steering actions a second, in radians
 _TOLD = np.ones((1, 4), np.float32)  # what the critic is told at inference
 
 
-def _verify_forward(file: Source, scenes: Scenes) -> None:
+def _verify_forward(file: Source) -> None:
     """The network on stored inputs, with each variant of the weights."""
     names = ("bev_semantics", "measurements", "value_measurements")
     inputs = [file[f"in.{name}"][None] for name in names]
-    for variant in networks.match_case(file, NAME):
-        says = _outputs(networks.make_network(NAME, variant), *inputs)
+    for variant in common.match_case(file, NAME):
+        says = _outputs(common.make_network(NAME, variant), *inputs)
         where = f"{file.name} {variant}"
         TABLES["encoder"].match(file.below("out."), where, NAME, **says)
         TABLES["heads"].match(file.below(f"out.{variant}."), where, NAME, **says)
@@ -51,17 +49,16 @@ def _outputs(network: Any, pictures: Any, measured: Any, told: Any) -> dict[str,
         }
 
 
-def _verify_decoding(file: Source, scenes: Scenes) -> None:
+def _verify_decoding(file: Source) -> None:
     """The command of an action, and the next state."""
-    networks.match_meta(file, NAME, columns=list(FILE_COLUMNS), dt=0.1)
-    states = file.take("in.state", -1, NUM_STATE)
-    after, commands = np.empty(states.shape), np.empty((len(states), 2))
-    for row, (ego, action) in enumerate(zip(states, file["in.action"], strict=True)):
-        command = command_of(action, ego)
-        commands[row] = command.acceleration, command.steering_rate
-        step_bicycle(ego, *commands[row], WHEEL_BASE, 0.1, after[row])
-    ours = {"command": commands, "next_state": after}
-    file.below("out.").match_rows(ours, TOLERANCE, where=file.name)
+    common.match_meta(file, NAME, columns=list(common.FILE_COLUMNS), dt=0.1)
+    for number, case in enumerate(rows_of(file)):
+        ego, after = case.take("in.state", NUM_STATE), np.empty(NUM_STATE)
+        command = command_of(case["in.action"], ego)
+        numbers = command.acceleration, command.steering_rate
+        step_bicycle(ego, *numbers, WHEEL_BASE, 0.1, after)
+        ours = {"command": numbers, "next_state": after}
+        case.below("out.").match(f"{file.name} {number}", ours, TOLERANCE)
 
 
 def _compare(loop: Loop) -> None:
@@ -72,14 +69,12 @@ def _compare(loop: Loop) -> None:
     for label, drawn, channel in zip(CHANNELS, pictures, theirs, strict=True):
         loop.compare(f"picture {label}", drawn, channel)
     says = _outputs(loop.planner.networks[0], pictures[None], measured[None], _TOLD)
-    loop.match(TABLES["loop"], loop.row, measured=measured, **says)
+    loop.match("iteration", loop.row, measured=measured, **says)
     # the next step goes on from their action: standing still, each step multiplies a difference
     decoded = loop.planner.decode(loop.row["action"], loop.seen)
-    for whose, command, atol in (("our", loop.answer, COMMAND), ("their", decoded, TOLERANCE)):
-        numbers = (command.acceleration, command.steering_rate)
-        loop.compare(f"command of {whose} action", numbers, loop.row["command"], atol)
+    loop.match("decoded", loop.row, "decoded", decoded=decoded)
     if list(cache := loop.stored.below("cache/")):
-        loop.match(TABLES["drawn"], cache, **_drawn(loop))
+        loop.match("drawn", cache, **_drawn(loop))
 
 
 def _drawn(loop: Loop) -> dict[str, Any]:
@@ -105,8 +100,8 @@ def _drawn(loop: Loop) -> dict[str, Any]:
 
 
 FILES = {
-    "state_dict.json": partial(networks.verify_manifest, NAME, TABLES),
+    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
     "forward_*.npz": _verify_forward,
     "action_decode.npz": _verify_decoding,
-    "closed_loop_*.npz": partial(verify_loop, Carl, _compare),
+    "closed_loop_*.npz": partial(common.verify_loop, Carl, TABLES, _compare),
 }

@@ -17,10 +17,9 @@ from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.loops import Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, match_case, match_meta, verify_manifest
+from shiftsim.verify.nets import common
+from shiftsim.verify.nets.common import Loop, make_network, match_meta
 from shiftsim.verify.nuplan.metrics import tracks_of
-from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
@@ -46,7 +45,7 @@ class KeyedPlanner(DiffusionPlanner):
         return replace(super().features(observation), noise=noise)
 
 
-def _verify_args(file: Source, scenes: Scenes) -> None:
+def _verify_args(file: Source) -> None:
     """The bundled settings must be those of the file; both normalisers too."""
     from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS
 
@@ -56,7 +55,7 @@ def _verify_args(file: Source, scenes: Scenes) -> None:
     file.match(file.name, ours, quantity=f"{NAME} args")
 
 
-def _verify_sampler(file: Source, scenes: Scenes) -> None:
+def _verify_sampler(file: Source) -> None:
     from shiftsim.planners.learned.diffusion.network import sampler
 
     numbers = np.arange(sampler.STEPS) + 1
@@ -68,7 +67,7 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
     TABLES["steps"].match(listed, file.name, f"{NAME} sampler", **names)
 
 
-def _verify_forward(file: Source, scenes: Scenes) -> None:
+def _verify_forward(file: Source) -> None:
     """The network on stored inputs, and all calls of the sampler by variant of the weights."""
     import torch
 
@@ -85,7 +84,7 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
         encoding, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
         encoded = {"encoding": encoding, "route": route}
         TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
-        for variant in match_case(file, NAME):
+        for variant in common.match_case(file, NAME):
             stored = file.below(f"out.{variant}.")
             says = _sampled(variant, scene, inputs, given["noise"])
             for table in ("sampled", "guided"):
@@ -124,17 +123,17 @@ def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
     import torch
 
-    loop.match(TABLES["iteration"], loop.row)
+    loop.match("iteration", loop.row)
     if list(loop.stored):
-        loop.match(TABLES["stored"], loop.stored, route=loop.features.route or ())
+        loop.match("stored", loop.stored, route=loop.features.route or ())
     if "encoding" in loop.stored:
         with torch.inference_mode():
             network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
             encoding = network.encode(network.normalise(inputs))[0]
-        loop.match(TABLES["encoding"], loop.stored, encoding=encoding)
+        loop.match("encoding", loop.stored, encoding=encoding)
 
 
-def _verify_agents(file: Source, scenes: Scenes) -> None:
+def _verify_agents(file: Source) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
     match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
     if f"in.frame{kernels.SAMPLES:02d}" in file:
@@ -158,11 +157,13 @@ def _tracks(file: Source) -> Tracks:
         (last, _STATIC[kind], f"static {number}", np.nan, np.nan, heading, width, length, x, y)
         for number, (kind, (x, y, heading, width, length)) in enumerate(static)
     ]
-    columns = zip(("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows)), strict=True)
+    columns = zip(
+        ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True)), strict=True
+    )
     return tracks_of(Source(file.name, "column", dict(columns), file.report), last + 1)
 
 
-def _verify_lanes(file: Source, scenes: Scenes) -> None:
+def _verify_lanes(file: Source) -> None:
     """Which lanes and route lanes are kept where there are too many, and their rows."""
     match_meta(file, NAME, light="green, yellow, red, unknown")
     anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
@@ -197,9 +198,9 @@ def _lines(file: Source, name: str) -> Polylines:
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(verify_manifest, NAME, TABLES),
+    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
     "forward_*.npz": _verify_forward,
-    "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare),
+    "closed_loop_*.npz": partial(common.verify_loop, KeyedPlanner, TABLES, _compare),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,
 }

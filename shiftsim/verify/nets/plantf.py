@@ -12,9 +12,7 @@ from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.loops import Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, verify_manifest
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.nets.common import Loop, make_network, verify_loop, verify_manifest
 from shiftsim.verify.tables import Table, read_tables
 
 Outputs: TypeAlias = Callable[[Any, Any], dict[str, Any]]  # of a network, from its inputs
@@ -25,9 +23,7 @@ LAYERS = np.array(["LANE", "LANE_CONNECTOR", "CROSSWALK"])
 CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
 
 
-def compare_features(
-    loop: Loop, tables: Mapping[str, Table], agents: Any, road: Any, route: Any, **names: Any
-) -> None:
+def compare_features(loop: Loop, agents: Any, road: Any, route: Any, **names: Any) -> None:
     """Compare what is stored of one iteration that is made before the network.
 
     `route` are blocks of the corrected route; `names` are further ones of the tables.
@@ -41,16 +37,16 @@ def compare_features(
         "targets": np.zeros((len(agents.valid), 0, 3)),
         "sides": np.tile(np.arange(3), (len(road.kind), 1)),
     }
-    loop.match(tables["ids"], loop.stored, **ours)
-    loop.match(tables["features"], loop.stored.below("feature/"), **ours, **names)
+    loop.match("ids", loop.stored, **ours)
+    loop.match("features", loop.stored.below("feature/"), **ours, **names)
 
 
-def compare_network(loop: Loop, outputs: Outputs, batch: Any, *tables: Table) -> None:
+def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) -> None:
     """Compare what is stored of the network's outputs for one iteration."""
     made = _without_grad(outputs, loop.planner.network, batch)
     ours = {name: value[0] for name, value in made.items()}
-    for table in tables:
-        loop.match(table, loop.stored.below("net/"), f"({loop.variant})", **ours)
+    for section in sections:
+        loop.match(section, loop.stored.below("net/"), f"({loop.variant})", **ours)
 
 
 def verify_forward(
@@ -59,7 +55,6 @@ def verify_forward(
     outputs: Outputs,
     radius: float,
     file: Source,
-    scenes: Scenes,
 ) -> None:
     """Compare the network alone, on synthetic inputs as the official code batched them.
 
@@ -155,20 +150,20 @@ def _compare(loop: Loop) -> None:
     """Compare features, raw outputs and plan of one iteration."""
     recorded = loop.row["trajectory"][1:, :3]
     again = plan_of_poses(recorded, loop.seen.history)
-    loop.match(TABLES["iteration"], loop.row)
-    loop.match(TABLES["motion"], loop.row, "recorded", again=again)
+    loop.match("iteration", loop.row)
+    loop.match("motion", loop.row, "recorded", again=again)
     if list(loop.stored):
         agents, road, state, route = loop.features
         # the official code gives every agent the category of the ego at inference
         others = {"state": state, "category": np.zeros(len(agents.valid), np.int64)}
-        compare_features(loop, TABLES, agents, road, route, **others)
+        compare_features(loop, agents, road, route, **others)
         batch = plantf.make_batch([loop.features], "cpu")
-        compare_network(loop, _outputs, batch, TABLES["outputs"], TABLES["large"])
+        compare_network(loop, _outputs, batch, "outputs", "large")
 
 
 MANIFEST = partial(verify_manifest, builder=builder, history=2.0, future=builder.PLAN_POSES * STEP)
 FILES = {
     "state_dict.json": partial(MANIFEST, NAME, TABLES, planner=plantf),
     "forward_*.npz": partial(verify_forward, NAME, TABLES, _outputs, plantf.RADIUS),
-    "closed_loop_*.npz": partial(verify_loop, plantf.PlanTF, _compare),
+    "closed_loop_*.npz": partial(verify_loop, plantf.PlanTF, TABLES, _compare),
 }

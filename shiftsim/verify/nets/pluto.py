@@ -12,10 +12,9 @@ from shiftsim.planners.learned.pluto.brake import brake, must_brake
 from shiftsim.planners.learned.pluto.inputs import stack
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets import loops, plantf
-from shiftsim.verify.nets.loops import Loop, verify_loop
-from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.tables import read_tables
+from shiftsim.verify.nets import common, plantf
+from shiftsim.verify.nets.common import Loop
+from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
 NAME, TABLES = pluto.Pluto.name, read_tables(plantf.__file__, __file__)
@@ -23,17 +22,17 @@ NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may di
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
 
 
-def _verify_brake(file: Source, scenes: Scenes) -> None:
+def _verify_brake(file: Source) -> None:
     """Unit cases of the emergency brake."""
-    egos, poses, times = file.take("ego", -1, NUM_STATE), file["candidate"], file["fault_time"]
-    speeds = np.hypot(egos[:, VX], egos[:, VY])
-    must = [must_brake(*pair) for pair in zip(speeds.tolist(), times.tolist(), strict=True)]
-    states = np.full((len(egos), 81, NUM_STATE), np.nan)
-    for case in np.flatnonzero(must).tolist():
-        states[case] = brake(poses[case], egos[case], float(times[case]), PACIFICA)
-    file.match("file", {"columns": list(loops.FILE_COLUMNS)})
-    ours = {"speed": speeds, "braked": must, "states": states}
-    file.match_rows(ours, {"speed": LINE, "": loops.STATE})
+    file.match("file", {"columns": list(common.FILE_COLUMNS)})
+    for number, case in enumerate(rows_of(file)):
+        ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
+        speed = float(np.hypot(ego[VX], ego[VY]))
+        braked, states = must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
+        if braked:
+            states = brake(case["candidate"], ego, time, PACIFICA)
+        ours = {"speed": speed, "braked": braked, "states": states}
+        case.match(f"case {number}", ours, {"speed": LINE, "": common.STATE})
 
 
 def _outputs(network: Any, inputs: Any) -> dict[str, Any]:
@@ -58,14 +57,14 @@ def _compare(loop: Loop) -> None:
     from shiftsim.planners.learned.pluto.network import Inputs
 
     choice, stored = loop.planner.choice, loop.stored.below("post/")
-    loop.match(TABLES["choice"], stored, choice=choice)
+    loop.match("choice", stored, choice=choice)
     parts = (stored["multi"], stored["weighted"], stored["progress"])
     progress, rule = scoring.aggregate(*parts)
-    loop.match(TABLES["aggregated"], stored, "aggregated", progress=progress, rule=rule)
+    loop.match("aggregated", stored, "aggregated", progress=progress, rule=rule)
     if "agent_tokens" in loop.stored:  # one of the iterations stored in full
         _compare_sight(loop)
         batch = Inputs(*stack([loop.features], "cpu"))
-        plantf.compare_network(loop, _outputs, batch, TABLES["outputs"])
+        plantf.compare_network(loop, _outputs, batch, "outputs")
         _compare_from_stored(loop, stored)
     best, total = int(loop.row["best_index"]), stored["rule"] + 0.3 * stored["lscore"]
     first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
@@ -73,7 +72,7 @@ def _compare(loop: Loop) -> None:
         what = f"proposal {choice.best} instead of {best}, scores {first:.6f} and {second:.6f}"
         loop.file.report.note(f"{loop.name} {loop.where}: near-tie, {what}")
     else:
-        loop.match(TABLES["iteration"], loop.row, choice=choice)
+        loop.match("iteration", loop.row, choice=choice)
 
 
 def _compare_sight(loop: Loop) -> None:
@@ -87,7 +86,7 @@ def _compare_sight(loop: Loop) -> None:
     made = {"blocks": np.array(blocks, np.int64), "projection": np.zeros((len(lines), 8, 2))}
     made |= {"inputs": inputs, "state": inputs.current_state, "category": inputs.category}
     route = loop.planner.route.blocks
-    plantf.compare_features(loop, TABLES, sight.agents, near, route, **made)
+    plantf.compare_features(loop, sight.agents, near, route, **made)
     stored = loop.stored.below("reference_line_")
     loop.compare("reference lines", len(lines), len(list(stored)))
     numbered = {str(number): line for number, line in enumerate(lines)}
@@ -96,7 +95,7 @@ def _compare_sight(loop: Loop) -> None:
     theirs, pose = loop.stored.below("feature/static_objects."), inputs.object_pose
     order, their_order = _by_place(pose[:, :2]), _by_place(theirs["position"])
     ours = {name: value[order] for name, value in inputs._asdict().items() if "object" in name}
-    loop.match(TABLES["static_objects"], theirs.at(their_order), "static_objects", **ours)
+    loop.match("static_objects", theirs.at(their_order), "static_objects", **ours)
 
 
 def _by_place(positions: Any) -> Any:
@@ -113,13 +112,13 @@ def _compare_from_stored(loop: Loop, stored: Source) -> None:
     place = scoring.Place(sight.drivable, loop.road.edges.polygons, line)
     proposals = np.ascontiguousarray(stored["cand"])
     scores = scoring.score(proposals, stored["lscore"], ego, world, place, PACIFICA)
-    loop.match(TABLES["from_sight"], stored, line=line, sight=sight)
-    loop.match(TABLES["from_stored"], stored, "stored proposals'", scores=scores)
+    loop.match("from_sight", stored, line=line, sight=sight)
+    loop.match("from_stored", stored, "stored proposals'", scores=scores)
 
 
 FILES = {
     "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=pluto),
     "forward_*.npz": partial(plantf.verify_forward, NAME, TABLES, _outputs, pluto.RADIUS),
-    "closed_loop_*.npz": partial(verify_loop, pluto.Pluto, _compare),
+    "closed_loop_*.npz": partial(common.verify_loop, pluto.Pluto, TABLES, _compare),
     "emergency_brake.npz": _verify_brake,
 }

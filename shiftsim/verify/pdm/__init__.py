@@ -4,11 +4,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from shiftsim.verify.calls import verify_idm_calls, verify_routes
 from shiftsim.verify.files import verify_files
-from shiftsim.verify.pdm.idm_calls import verify_idm_calls
 from shiftsim.verify.pdm.kernels import verify_kernels
 from shiftsim.verify.pdm.loops import verify_loops
-from shiftsim.verify.pdm.routes import verify_routes
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
