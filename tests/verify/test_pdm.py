@@ -12,7 +12,7 @@ import pytest
 from shiftsim.verify import verify
 from shiftsim.verify.calls import verify_routes
 from shiftsim.verify.pdm.kernels import verify_kernels
-from shiftsim.verify.pdm.loops import verify_calls
+from shiftsim.verify.pdm.steps import verify_calls
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 

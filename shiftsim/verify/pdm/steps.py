@@ -1,5 +1,6 @@
-"""Planning steps of PDM-Closed: those recorded with all their inputs, and how any is compared."""
+"""Planning steps of PDM-Closed: recorded with all their inputs, and as calls in closed loops."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,26 @@ from shiftsim.planners.proposals.contacts import Others
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
-from shiftsim.verify.files import Source, read_arrays, read_fields, read_json
+from shiftsim.sim.planner import scene_info
+from shiftsim.verify.files import Groups, Source, read_arrays, read_fields, read_json
+from shiftsim.verify.nuplan import runs
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
 from shiftsim.world.layers import make_layer, make_polygons
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, PACIFICA, center_poses
 
 TABLES = read_tables(__file__)
 UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
+STORED = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: plans stored as 32 bit floats
+FILES = [  # of a folder of closed loops
+    f"{name}.parquet"
+    for name in (
+        *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects"),
+        *("ego", "steps", "proposals"),
+    )
+]
 ASIDE = np.array([1e-6, 3e-6])  # m, moves what is exactly ahead or behind to a side
 
 
@@ -144,3 +156,68 @@ def _in_line(states: FloatArray, others: Others) -> BoolArray:
         aside = np.abs(cos * away[..., 1] - sin * away[..., 0])
         out |= (aside < UNSTABLE_BEARING * np.linalg.norm(away, axis=-1)).any(axis=(0, 1))
     return out
+
+
+def verify_calls(
+    folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
+) -> None:
+    """Make every planning call of closed loops (of one mode) again from the recorded ego state."""
+    egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
+    steps, proposals = (
+        Groups(folder / f"{name}.parquet", report, ("scene", "challenge"))
+        for name in ("steps", "proposals")
+    )
+    static = read_fields(folder / "static.json", report, "static.json")
+    for key in egos:
+        call, where = key[:2], " ".join(key[:2])
+        if mode in (None, key[1]):
+            with report.attempt("PDM loop", where):
+                seen = runs.Seen(scenes[key[0]], egos[key], objects[key], key[1])
+                file = read_arrays(folder / f"{'_'.join(call)}.npz", report, "PDM")
+                names = {"road": seen.scenario.map, "scenario": seen.scenario}
+                names["planner"] = _compare_calls(where, seen, steps[call], proposals[call], file)
+                facts = static.each(key[0])[0].each(key[1])[0]
+                TABLES["facts"].match(facts, where, nothing=None, **names)
+    for table in (steps, proposals):
+        table.finish(mode)
+    if mode is None:
+        static.finish()
+    known = {"static.json", *FILES, *(f"{'_'.join(key[:2])}.npz" for key in egos)}
+    for name in sorted({path.name for path in folder.iterdir()} - known):
+        report.skip(f"file loop/{name}")
+
+
+def _compare_calls(
+    where: str, seen: runs.Seen, steps: Source, proposals: Source, file: Source
+) -> PdmClosed:
+    """Compare every call; the planner after the last one."""
+    planner, road = PdmClosed(), seen.scenario.map
+    planner.reset(scene_info(seen.scenario, planner=planner))
+    count, per_call = len(seen.ego), proposals.num_rows // len(seen.ego)
+    calls, numbers = np.arange(count), np.arange(per_call)
+    steps.match(where, {"iteration": calls})
+    rows = {"proposal": np.tile(numbers, count), "iteration": np.repeat(calls, per_call)}
+    proposals.match(where, rows)
+    times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
+    file.match(where, {"trajectory_time_us": times})
+    plans = file.take("trajectory", count, STEPS + 1, 3).astype(np.float64)
+    plans[:, :, :2] += file.take("trajectory_origin", 3)[:2]
+    for index, plan in enumerate(plans):
+        at, observation = f"{where} iteration {index}", seen.at(index)
+        step, sight = planner.step(observation), planner.seen
+        assert sight is not None
+        row, theirs = steps.at(index), proposals.at(numbers + index * per_call)
+        names = {"road": road, "seen": observation, "sight": sight}
+        names |= {"limit": road.speed_limits[sight.lane], "collided": ",".join(planner.collided)}
+        names["best_score"] = theirs["score"].max()
+        TABLES["call"].match(row, at, **names)
+        TABLES["ends"].match(theirs, at, ends=step.driven.states[:, -1])
+        if compare_scores(at, seen.ego[index], sight, step, theirs, row):
+            file.report.compare("PDM plan", at, step.poses, plan, atol=STORED)
+        if f"proposals_{index}" in file:
+            ids = [*road.edges.ids, *road.car_parks.ids]
+            areas = [ids[area] for area in sight.place.selected.tolist()]
+            arrays = {"map_tokens": sight.tokens, "drivable_tokens": areas, **step_arrays(step)}
+            file.match(at, {f"{name}_{index}": arrays[name] for name in arrays}, 1e-6)
+    file.finish()
+    return planner
