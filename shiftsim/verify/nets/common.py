@@ -113,22 +113,18 @@ class Loop:
     def __init__(
         self, file: Source, planner: Any, tables: Mapping[str, Table], scenario: Scenario
     ) -> None:
-        self.file, self.tables, self.scenario = file, {**TABLES, **tables}, scenario
+        self.file, self.tables, self.where = file, {**TABLES, **tables}, file.name
+        self.scenario, self.road, self.tracks = scenario, scenario.map, scenario.tracks
         self.planner, self.name = planner, planner.name  # the planner after this iteration
-        self.road, self.tracks = self.scenario.map, self.scenario.tracks
         self.variant = str(file["meta/variant"])  # of its weights
-        self.rollout = Rollout(self.scenario, planner)
-        self.step(0)
+        self.rollout = Rollout(scenario, planner)
 
     def step(self, number: int) -> None:
-        """Look at an iteration, which must be that of the rollout."""
+        """Look at an iteration, which must be that of the rollout, and make its plan again."""
         self.where = f"{self.file.name} iteration {number}"
         self.stored = self.file.below(f"it{number:02d}/")  # what is stored of it alone
         self.row = self.file.below("out/").at(number)  # of the arrays of the whole loop
         self.seen = self.rollout.observe()  # what the planner saw
-
-    def plan(self) -> None:
-        """Make again what the planner makes of what it saw."""
         self.features = self.planner.features(self.seen)
         (self.output,) = self.planner.infer([self.features])
         self.answer = self.planner.decode(self.output, self.seen)
@@ -177,7 +173,6 @@ def verify_loop(
     for number, ego in enumerate(egos):
         loop.step(number)
         loop.compare("driven ego", loop.seen.history.ego[-1], ego, STATE)
-        loop.plan()
         # where the official planner failed, ours says that its answer is a fallback
         loop.compare("fallback", bool(loop.planner.degraded), number == counts[0])
         if number < counts[0]:
