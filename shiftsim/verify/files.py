@@ -219,6 +219,10 @@ class Groups(dict[tuple[str, ...], Source]):
         self._asked.add(key)
         return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
+    def of_mode(self, mode: str | None) -> list[tuple[str, ...]]:
+        """Keys of the runs of one mode, or all."""
+        return [key for key in self if mode is None or mode in key]
+
     def match(
         self,
         key: tuple[str, ...],
@@ -237,8 +241,8 @@ class Groups(dict[tuple[str, ...], Source]):
 
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
-        for key in self:
-            if key not in self._asked and (mode is None or mode in key):
+        for key in self.of_mode(mode):
+            if key not in self._asked:
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
         if self._asked & set(self):
             self.table.finish()
@@ -262,7 +266,8 @@ def verify_file(compare: Compare, path: Path, report: Report) -> None:
     read = {".npz": read_arrays, ".parquet": read_table}.get(path.suffix, read_fields)
     file = replace(read(path, report), name=re.sub(r"_\d+$", "", path.stem))
     compare(file, path.stem)
-    file.finish()
+    if file.what != "column" or file.num_rows:
+        file.finish()
 
 
 def verify_files(

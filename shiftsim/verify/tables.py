@@ -15,6 +15,7 @@ calls the section; it may also name `angles` and `unordered` values (`Source.mat
     poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
     score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
     x = ["line.x", "gap"]                           # what the module calls `gap`
+    roads = "counts[road with trams]"               # an item by name
     planner = "= PDM-Closed *"                      # a text, which may go on in any way
     samples = 41                                    # a number
 """
@@ -162,7 +163,9 @@ def _member(thing: Any, name: str) -> Any:
 
 
 def _index(text: str) -> Any:
-    """The index that `-1` or `:, 0` stands for."""
+    """The index that `-1` or `:, 0` stands for; any other text is a key."""
+    if not set(text) <= set("-:, 0123456789"):
+        return text
     parts = [[int(n) if n.strip() else None for n in part.split(":")] for part in text.split(",")]
     keys = tuple(slice(*part) if len(part) > 1 else part[0] for part in parts)
     return keys if len(keys) > 1 else keys[0]

@@ -99,7 +99,6 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
     also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
     """
     blocks = world["roadblocks"] if "roadblocks" in world else {}
-
     road = build_map(
         "world",
         edges=[
@@ -113,11 +112,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
             for edge in world.each("edges")
         ],
         blocks=[
-            BlockSpec(
-                id=name,
-                is_connector=_IS_CONNECTOR[block["kind"]],
-                polygon=shapely.Polygon(block["polygon"]),
-            )
+            BlockSpec(name, _IS_CONNECTOR[block["kind"]], shapely.Polygon(block["polygon"]))
             for name, block in blocks.items()
         ],
         intersections=_areas(enumerate(world["intersections"])),
