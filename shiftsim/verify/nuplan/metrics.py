@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import Measurements, MetricResult, judge, measure
+from shiftsim.metrics import MetricResult, judge, measure
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify import worlds
 from shiftsim.verify.files import COMPARED, EXACT, Groups, Source, open_tables
-from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
+from shiftsim.verify.metric_worlds import SCORE_TOLERANCES, found_along
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
@@ -53,7 +53,10 @@ def verify_nuplan_metrics(
             columns |= {name: worlds.ego_columns(log.ego)[name] for name in RECORDED}
             tables["ego"].match(run, columns, RECORDED, quantity="recorded")
             measured = measure(log, road)
-            names = _found(measured, road)
+            contacts, names = measured.collisions, found_along(measured, road)
+            names["samples"] = np.arange(len(measured.time_us))
+            names["kinds"] = [AgentKind(one.kind).name for one in contacts]
+            names["is_time"] = [one.time_us in measured.at_fault_times for one in contacts]
             for name, rows in TABLES.items():
                 rows.match(tables[name][run], " ".join(run), **names)
             for thresholds, profile in PROFILES.items():
@@ -89,21 +92,6 @@ def tracks_of(rows: Source, count: int) -> Tracks:
     values = np.column_stack([rows[name].astype(np.float64) for name in worlds.BOX_COLUMNS])
     where = iteration, np.array(track, np.int64)
     return worlds.make_tracks((count, len(kinds)), where, values, list(kinds.values()), list(kinds))
-
-
-def _found(measured: Measurements, road: VectorMap) -> dict[str, Any]:
-    """What `metrics.toml` speaks of."""
-    samples, found = range(len(measured.time_us)), measured.collisions
-    return {
-        **{"measured": measured, "samples": samples},
-        "center": [",".join(measured.route.ids(road, i)) for i in samples],
-        "corners": [
-            [",".join(measured.corners.ids(road, i, c)) for i in samples] for c in range(4)
-        ],
-        "kinds": [AgentKind(contact.kind).name for contact in found],
-        "types": [f"{contact.collision_type.upper()}_COLLISION" for contact in found],
-        "at_fault_times": [contact.time_us in measured.at_fault_times for contact in found],
-    }
 
 
 def _compare_profile(
