@@ -8,7 +8,7 @@ from shiftsim.errors import DataError
 from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.files import Source
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, make_scenario, read_map, read_objects
+from shiftsim.verify.worlds import EGO_COLUMNS, ego_states, read_map, read_scenario
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights
 
@@ -48,17 +48,12 @@ def compare_idm_world(world: Source, name: str) -> None:
 
 def _make_scenario(world: Source) -> Scenario:
     road = read_map(world, "has_traffic_lights", "stop_lines", stop_lines=world["stop_lines"])
-    time_us = np.array(world["time_us"], np.int64)
-    frames = np.transpose(world["ego"])
-    things = world.each("objects")
-    counts = {len(world["lights"]), frames.shape[1], *(len(thing["frames"]) for thing in things)}
-    if counts != {len(time_us)}:
-        raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
-    ego = ego_states(dict(zip(EGO_COLUMNS[: VY + 1], frames, strict=True)))
-    tracks = read_objects(sorted(things, key=lambda o: AgentKind[o["type"]]), len(time_us))
-    out = make_scenario(str(world.values["world"]), road, time_us, ego, tracks)
-    ids = tuple(sorted({name for row in world["lights"] for name in row}))
+    columns = zip(EGO_COLUMNS[: VY + 1], np.transpose(world["ego"]), strict=True)
+    out, lights = read_scenario(world, road, ego_states(dict(columns))), world["lights"]
+    ids = tuple(sorted({name for row in lights for name in row}))
     if lost := set(ids) - set(road.edges.ids):
         raise DataError(f"lights are on lanes that the map does not have: {sorted(lost)}")
-    status = [[LightStatus[row.get(name, "ABSENT")] for name in ids] for row in world["lights"]]
+    if len(lights) != out.num_iterations:
+        raise DataError(f"{len(lights)} lists of lights for {out.num_iterations} time stamps")
+    status = [[LightStatus[row.get(name, "ABSENT")] for name in ids] for row in lights]
     return replace(out, traffic_lights=TrafficLights(ids, np.array(status, np.int8)))

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import DataError
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
@@ -13,7 +12,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.files import COMPARED, Source, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
+from shiftsim.verify.worlds import ego_states, read_map, read_scenario, recorded_log
 from shiftsim.world.map import VectorMap
 
 SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
@@ -32,17 +31,11 @@ def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
 
 def _read(world: Source) -> tuple[SimulationLog, VectorMap]:
     road = read_map(world.each("map")[0], "incoming")
-    time_us = np.array(world["time_us"], np.int64)
     ego, expert = (
         ego_states(dict(zip(world["state_columns"], np.transpose(world[name]), strict=True)))
         for name in ("ego", "expert")
     )
-    things = world.each("objects")
-    if len(time_us) != len(expert) or any(len(o["frames"]) != len(time_us) for o in things):
-        raise DataError(f"{len(time_us)} time stamps, other numbers of expert states or of frames")
-    token = f"world {world.values.get('world')}"
-    tracks = read_objects(things, len(time_us))
-    return recorded_log(make_scenario(token, road, time_us, expert, tracks), ego), road
+    return recorded_log(read_scenario(world, road, expert), ego), road
 
 
 def _compare(world: Source, where: str) -> None:

@@ -81,17 +81,6 @@ def make_tracks(
     )
 
 
-def read_objects(objects: Sequence[Source], count: int) -> Tracks:
-    """Tracks of objects that list x, y, heading, vx, vy per frame, of which `count` are read."""
-    values = np.full((count, len(objects), 7), np.nan)
-    for column, thing in enumerate(objects):
-        for row, frame in enumerate(thing["frames"][:count]):
-            if frame is not None:
-                values[row, column] = [*frame, thing["length"], thing["width"]]
-    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
-    return make_tracks(values.shape[:2], ..., values, kinds, tokens)
-
-
 def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
     """The map of a world; `DataError` if an id names nothing.
 
@@ -150,6 +139,26 @@ def make_scenario(
         mission_goal=None,
         mapping=(10.0, 0.0, 1.0),
     )
+
+
+def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
+    """The scenario of a world from its map and its ego states (T, 11).
+
+    The world also holds `time_us` and `objects`, which list x, y, heading, vx, vy per frame.
+    """
+    time_us = np.array(world["time_us"], np.int64)
+    objects = sorted(world.each("objects"), key=lambda thing: AgentKind[thing["type"].upper()])
+    counts = {len(ego), *(len(thing["frames"]) for thing in objects)}
+    if counts != {len(time_us)}:
+        raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
+    values = np.full((len(time_us), len(objects), 7), np.nan)
+    for column, thing in enumerate(objects):
+        for row, frame in enumerate(thing["frames"]):
+            if frame is not None:
+                values[row, column] = [*frame, thing["length"], thing["width"]]
+    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
+    tracks = make_tracks(values.shape[:2], ..., values, kinds, tokens)
+    return make_scenario(f"world {world.values.get('world')}", road, time_us, ego, tracks)
 
 
 def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -95,7 +94,7 @@ def tracks_of(rows: Source, count: int) -> Tracks:
 
 
 def _compare_profile(
-    key: tuple[str, ...], result: MetricResult, entry: dict[str, Any], tables: dict[str, Groups]
+    key: tuple[str, ...], result: MetricResult, entry: Source, tables: dict[str, Groups]
 ) -> None:
     """Compare scores and statistics under one threshold set."""
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}

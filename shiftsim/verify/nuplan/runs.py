@@ -94,11 +94,9 @@ def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
     Heights, which shiftsim does not keep, are of vehicles as in the first frame of the log, of
     others as in the same one.
     """
-    logged = zip(replayed["iteration"].tolist(), replayed["track_token"].tolist(), strict=True)
-    heights, ours = (
-        dict(zip(logged, replayed["height"].tolist(), strict=True)),
-        observed_columns(log.tracks, "R"),
-    )
+    logged = zip(*(replayed[name].tolist() for name in ("iteration", "track_token")), strict=True)
+    heights = dict(zip(logged, replayed["height"].tolist(), strict=True))
+    ours = observed_columns(log.tracks, "R")
     is_vehicle = np.array(ours["type"]) == AgentKind.VEHICLE.name
     first = np.where(is_vehicle, 0, ours["iteration"]).tolist()
     pairs = zip(first, ours["track_token"], strict=True)
