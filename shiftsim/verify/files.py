@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
-# keys and tolerances of files, and what of ours their fields are
+# keys and tolerances of tables, and how folders are recognised
 COMPARED: dict[str, Any] = tomllib.loads(
     (Path(__file__).parent / "compared.toml").read_text("utf-8")
 )
@@ -251,11 +251,7 @@ class Groups(dict[tuple[str, ...], Source]):
 def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
     """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`."""
     paths = {name: folder / f"{name}.parquet" for name in names}
-    known = ("key", "atol")
-    return {
-        name: Groups(path, report, **{k: v for k, v in COMPARED[path.name].items() if k in known})
-        for name, path in paths.items()
-    }
+    return {name: Groups(path, report, **COMPARED[path.name]) for name, path in paths.items()}
 
 
 def verify_file(compare: Compare, path: Path, report: Report) -> None:

@@ -1,6 +1,6 @@
 """The OpenDRIVE reader against sampled reference lines, lanes, links and counts of real maps."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -152,14 +152,14 @@ def _summarize(od: OpenDrive) -> dict[str, Any]:
     gap, turn = np.concatenate([np.zeros((2, 1)), *joints], axis=1).max(axis=1)
     cubics = [g for road in roads for g in road.geometries if g.kind == "paramPoly3"]
     driving = [pair for pair in links if {lanes[key].type for key in pair} == {"driving"}]
-    tallies: dict[str, Counter[str]] = defaultdict(Counter)
+    tallies: dict[str, dict[str, int]] = {kind: {} for kind in _TALLIES}
     for name, count in od.counts.items():
         for kind in (kind for kind in _TALLIES if name.startswith(f"{kind} ")):
             tallies[kind][name.removeprefix(f"{kind} ")] = count
-    num_driving = tallies["lane type"]["driving"]
+    num_driving = tallies["lane type"].get("driving", 0)
     return {
         **{"counts": Counter(od.counts), "tallies": tallies, "links": links, "driving": driving},
-        "num_lanes": tallies["lane type"].total(),
+        "num_lanes": sum(tallies["lane type"].values()),
         "num_driving": num_driving,
         "num_ends": num_driving - len({start for start, _ in driving}),
         "crosswalks": [thing for road in roads for thing in road.objects if is_crosswalk(thing)],

@@ -19,9 +19,8 @@ from shiftsim.world.state import AgentKind, Tracks
 
 TABLES = read_tables(__file__)
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
-RECORDED = COMPARED["ego.parquet"]["recorded"]
 # how the devkit files each metric, and the units of scores that have one
-CATEGORIES, UNITS = (COMPARED["metrics.parquet"][what] for what in ("category", "unit"))
+RECORDED, CATEGORIES, UNITS = (COMPARED[what] for what in ("recorded", "category", "unit"))
 _TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 
 
