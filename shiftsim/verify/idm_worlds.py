@@ -47,7 +47,7 @@ def compare_idm_world(world: Source, name: str) -> None:
 
 
 def _make_scenario(world: Source) -> Scenario:
-    road = read_map(world, "has_traffic_lights", "stop_lines", stop_lines=world["stop_lines"])
+    road = read_map(world, "has_traffic_lights", "stop_lines")
     columns = zip(EGO_COLUMNS[: VY + 1], np.transpose(world["ego"]), strict=True)
     out, lights = read_scenario(world, road, ego_states(dict(columns))), world["lights"]
     ids = tuple(sorted({name for row in lights for name in row}))

@@ -81,13 +81,13 @@ def make_tracks(
     )
 
 
-def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
+def read_map(world: Source, *fields: str) -> VectorMap:
     """The map of a world; `DataError` if an id names nothing.
 
-    The world holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`; its edges
-    also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
+    The world holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`, perhaps
+    `stop_lines`; its edges also hold the `fields`, named as in `EdgeSpec`.
     """
-    blocks = world["roadblocks"] if "roadblocks" in world else {}
+    blocks, stops = (world[n] if n in world else {} for n in ("roadblocks", "stop_lines"))
     road = build_map(
         "world",
         edges=[
@@ -106,7 +106,7 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
         ],
         intersections=_areas(enumerate(world["intersections"])),
         drivable_areas=_areas(enumerate(world["drivable_area"])) if blocks else (),
-        stop_polygons=_areas((stop_lines or {}).items()),
+        stop_polygons=_areas(stops.items()),
     )
     # an edge of a map without blocks is in none
     lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
