@@ -50,17 +50,22 @@ class Source:
     _parts: "dict[str, list[Source]]" = field(init=False, default_factory=dict)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.values
+        return name.partition("[")[0] in self.values
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.values)
 
     def __getitem__(self, name: str) -> Any:
-        """A value, which is used from now on; a `DataError` if there is none."""
+        """A value, which is used from now on, or a part of one, as in `poses[:, :2]`.
+
+        A `DataError` if there is none.
+        """
+        name, _, index = name.rstrip("]").partition("[")
         if name not in self.values:
             raise DataError(f"{self.name}: {self.what} {name!r} is missing")
         self.used.add(self.prefix + name)
-        return self.values[name] if self.rows is None else self.values[name][self.rows]
+        value = self.values[name] if self.rows is None else self.values[name][self.rows]
+        return value[read_index(index)] if index else value
 
     def take(self, name: str, *shape: int) -> Any:
         """An array of a given shape, contiguous; -1 is any length."""
@@ -157,6 +162,17 @@ class Source:
                 self.report.skip(f"{self.name}: {self.what} {name!r}")
         for part in (part for parts in self._parts.values() for part in parts):
             part.finish()
+
+
+def read_index(text: str) -> Any:
+    """The index that `-1`, `:, 0` or `..., :2` stands for; any other text is a key."""
+    if not set(text) <= set("-:., 0123456789"):
+        return text
+    keys: list[Any] = []
+    for part in text.split(","):
+        numbers = [int(n) if n.strip() else None for n in part.split(":") if part.strip() != "..."]
+        keys.append(slice(*numbers) if len(numbers) > 1 else numbers[0] if numbers else ...)
+    return tuple(keys) if len(keys) > 1 else keys[0]
 
 
 Compare: TypeAlias = Callable[[Source, str], object]  # of a file or case, and what it is called

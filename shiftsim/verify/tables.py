@@ -14,6 +14,7 @@ calls the section; it may also name `angles` and `unordered` values (`Source.mat
     n_centerline = "number of line"
     centerline_last = ["line[-1, :2]", 1e-6]        # m
     poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
+    "ends[..., :2]" = "line[-2:, :2]"               # a part of a value
     score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
     x = ["line.x", "gap"]                           # what the module calls `gap`
     roads = "counts[road with trams]"               # an item by name
@@ -32,7 +33,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.verify.files import EXACT, Source, read_arrays, read_json
+from shiftsim.verify.files import EXACT, Source, read_arrays, read_index, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
 
@@ -60,10 +61,23 @@ class Table:
         return theirs.match(where, ours, bounds, quantity=called, **self._kinds)
 
 
-def read_tables(module: str) -> dict[str, Table]:
-    """The sections of the file beside a module, given by the path of the module."""
-    content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
-    return {name: Table(rows) for name, rows in content.items()}
+def read_tables(*modules: str) -> dict[str, Table]:
+    """The sections of the files beside modules, given by their paths; later ones add rows."""
+    sections: dict[str, Any] = {}
+    for module in modules:
+        content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
+        sections = _joined(sections, content)
+    return {name: Table(rows) for name, rows in sections.items()}
+
+
+def _joined(rows: Mapping[str, Row], more: Mapping[str, Row]) -> dict[str, Row]:
+    """Rows and further ones, also within a row that is rows by name."""
+    inner = {
+        name: _joined(rows[name], more[name])
+        for name in more
+        if isinstance(more[name], dict) and name in rows
+    }
+    return {**rows, **more, **inner}
 
 
 def verify_cases(
@@ -155,7 +169,7 @@ def _follow(names: Mapping[str, Any], path: str) -> Any:
         if index == "*":
             found = [inner for thing in found for inner in thing]
         else:
-            found = [thing[_index(index)] if index else _member(thing, name) for thing in found]
+            found = [thing[read_index(index)] if index else _member(thing, name) for thing in found]
     return found if "[*]" in path else found[0]
 
 
@@ -163,12 +177,3 @@ def _member(thing: Any, name: str) -> Any:
     """An item of a mapping, an attribute, or what a method returns."""
     value = thing[name] if isinstance(thing, Mapping) else getattr(thing, name)
     return value() if ismethod(value) else value
-
-
-def _index(text: str) -> Any:
-    """The index that `-1` or `:, 0` stands for; any other text is a key."""
-    if not set(text) <= set("-:, 0123456789"):
-        return text
-    parts = [[int(n) if n.strip() else None for n in part.split(":")] for part in text.split(",")]
-    keys = tuple(slice(*part) if len(part) > 1 else part[0] for part in parts)
-    return keys if len(keys) > 1 else keys[0]

@@ -94,9 +94,9 @@ class FeatureBuilder:
             lanes=rows,
             lanes_speed_limit=limits,
             lanes_has_speed_limit=known,
-            route_lanes=_first_rows(rows, on_route),
-            route_lanes_speed_limit=_first_rows(limits, on_route),
-            route_lanes_has_speed_limit=_first_rows(known, on_route),
+            route_lanes=first_rows(rows, on_route),
+            route_lanes_speed_limit=first_rows(limits, on_route),
+            route_lanes_has_speed_limit=first_rows(known, on_route),
             noise=noise,
             edges=edges,
             agents=chosen,
@@ -139,6 +139,13 @@ def lane_features(
     return out
 
 
+def first_rows(array: Any, rows: IntArray) -> Any:
+    """(25, ...) some rows of an array, then zeros."""
+    out = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+    out[: len(rows)] = array[rows]
+    return out
+
+
 def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, IntArray]:
     """Agents (32, 21, 11), static objects (5, 10), and which tracks the agents are."""
     agents = np.zeros((kernels.AGENTS, kernels.SAMPLES, kernels.AGENT_COLUMNS), np.float32)
@@ -172,13 +179,6 @@ def _by_distance(chosen: BoolArray, poses: FloatArray, anchor: FloatArray) -> In
     tracks = np.flatnonzero(chosen)
     dx, dy = (poses[tracks, :2] - anchor[:2]).T
     return tracks[np.argsort(np.sqrt(dx * dx + dy * dy), kind="stable")]
-
-
-def _first_rows(array: Any, rows: IntArray) -> Any:
-    """(25, ...) some rows of an array, then zeros."""
-    out = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
-    out[: len(rows)] = array[rows]
-    return out
 
 
 def _plain(array: Any) -> Any:
