@@ -4,7 +4,6 @@
 of one case.
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,8 +19,8 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
-from shiftsim.verify.files import Source, read_arrays, verify_files
-from shiftsim.verify.idm_worlds import verify_idm_world
+from shiftsim.verify.files import Source, verify_files
+from shiftsim.verify.idm_worlds import compare_idm_world
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.verify.worlds import ego_states
@@ -39,18 +38,17 @@ _POSE = ("x", "y", "heading")
 
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    parts = dict.fromkeys((f"{name}.npz" for name in CHECKS), partial(_verify_cases, report))
-    worlds = {"idm_world_*": partial(verify_idm_world, report=report), "meta.json": None}
-    verify_files(folder, report, {**parts, **worlds})
+    files = dict.fromkeys((f"{name}.npz" for name in CHECKS), _compare_cases)
+    worlds = {"idm_world_*": compare_idm_world}
+    verify_files(folder, report, {"meta.json": None}, {**files, **worlds})
 
 
-def _verify_cases(report: Report, path: Path) -> None:
-    file, table = read_arrays(path, report), TABLES[path.stem]
+def _compare_cases(file: Source, name: str) -> None:
+    table = TABLES[name]
     file.note("label", *table.about["labels"])
-    file.match("file", {name: TABLES["lists"].rows[name] for name in table.about["lists"]})
+    file.match("file", {column: TABLES["lists"].rows[column] for column in table.about["lists"]})
     for number, case in enumerate(rows_of(file)):
-        table.match(case, f"case {number}", **CHECKS[path.stem](case))
-    file.finish()
+        table.match(case, f"case {number}", **CHECKS[name](case))
 
 
 def _stamps(case: Source, name: str) -> IntArray:

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
-# keys and tolerances of files, and what of ours their fields are
+# keys and tolerances of tables, and how folders are recognised
 COMPARED: dict[str, Any] = tomllib.loads(
     (Path(__file__).parent / "compared.toml").read_text("utf-8")
 )
@@ -165,7 +165,9 @@ class Source:
 
 
 def read_index(text: str) -> Any:
-    """The index that `-1`, `:, 0` or `..., :2` stands for."""
+    """The index that `-1`, `:, 0` or `..., :2` stands for; any other text is a key."""
+    if not set(text) <= set("-:., 0123456789"):
+        return text
     keys: list[Any] = []
     for part in text.split(","):
         numbers = [int(n) if n.strip() else None for n in part.split(":") if part.strip() != "..."]
@@ -233,6 +235,10 @@ class Groups(dict[tuple[str, ...], Source]):
         self._asked.add(key)
         return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
+    def of_mode(self, mode: str | None) -> list[tuple[str, ...]]:
+        """Keys of the runs of one mode, or all."""
+        return [key for key in self if mode is None or mode in key]
+
     def match(
         self,
         key: tuple[str, ...],
@@ -251,8 +257,8 @@ class Groups(dict[tuple[str, ...], Source]):
 
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
-        for key in self:
-            if key not in self._asked and (mode is None or mode in key):
+        for key in self.of_mode(mode):
+            if key not in self._asked:
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
         if self._asked & set(self):
             self.table.finish()
@@ -261,11 +267,7 @@ class Groups(dict[tuple[str, ...], Source]):
 def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
     """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`."""
     paths = {name: folder / f"{name}.parquet" for name in names}
-    known = ("key", "atol")
-    return {
-        name: Groups(path, report, **{k: v for k, v in COMPARED[path.name].items() if k in known})
-        for name, path in paths.items()
-    }
+    return {name: Groups(path, report, **COMPARED[path.name]) for name, path in paths.items()}
 
 
 def verify_file(compare: Compare, path: Path, report: Report) -> None:
@@ -276,7 +278,8 @@ def verify_file(compare: Compare, path: Path, report: Report) -> None:
     read = {".npz": read_arrays, ".parquet": read_table}.get(path.suffix, read_fields)
     file = replace(read(path, report), name=re.sub(r"_\d+$", "", path.stem))
     compare(file, path.stem)
-    file.finish()
+    if file.what != "column" or file.num_rows:
+        file.finish()
 
 
 def verify_files(

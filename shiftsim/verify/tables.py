@@ -10,12 +10,14 @@ calls the section; it may also name `angles` and `unordered` values (`Source.mat
     start_block = "blocks of route.start.block"     # ids in a layer of the map `road`, or `tracks`
     type = "contacts[*].kind"                       # of every one
     incoming = "ids of lane.incoming_edges"         # of objects behind nuPlan's map interface
+    route = "text of route"                         # `,` between the words of every item
     n_centerline = "number of line"
     centerline_last = ["line[-1, :2]", 1e-6]        # m
     poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
     "ends[..., :2]" = "line[-2:, :2]"               # a part of a value
     score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
     x = ["line.x", "gap"]                           # what the module calls `gap`
+    roads = "counts[road with trams]"               # an item by name
     planner = "= PDM-Closed *"                      # a text, which may go on in any way
     samples = 41                                    # a number
 """
@@ -149,6 +151,8 @@ def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
     value = _follow(names, path)
     if kind == "number":
         return len(value)
+    if kind == "text":
+        return [",".join(words) for words in value]
     if kind == "ids":
         ids = [getattr(thing, "id", None) for thing in (value if np.iterable(value) else [value])]
         return ids if np.iterable(value) else ids[0]

@@ -23,7 +23,7 @@ NAMES = {
     "road": ROAD,
     "tracks": SimpleNamespace(tokens=("t0", "t1")),
     "step": SimpleNamespace(best=2, poses=np.arange(6.0).reshape(2, 3)),
-    "made": {"lanes": [4, 5, 6]},
+    "made": {"lanes": [4, 5, 6], "lanes in it": 3},
     "chosen": np.array([2, 0]),
     "lane": Lane(),
 }
@@ -39,6 +39,7 @@ def compared(rows, theirs, **names):
     ("row", "value", "other"),
     [
         ("step.best", 2, 3),
+        ("made[lanes in it]", 3, 4),
         ("made.lanes", [4, 5, 6], [4, 5, 7]),
         ("step.poses[1, 2]", 5.0, 5.1),
         ("step.poses[-1]", [3.0, 4.0, 5.0], [3.0, 4.0, 5.1]),
