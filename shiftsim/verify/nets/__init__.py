@@ -1,5 +1,6 @@
 """The nets folder: the learned planners with deterministic weights against the official code."""
 
+from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -45,11 +46,14 @@ def _part_of(folder: Path) -> str:
 
 def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
     """Compare every file of a sub-folder, whose name as in `PARTS` is `part`."""
-    if find_spec("torch") is None and part != "route_correction":
+    is_network = part != "route_correction"
+    if is_network and find_spec("torch") is None:
         report.skip(f"{part}: torch is not installed")
         return
     files = import_module(f"shiftsim.verify.{PARTS[part]}").FILES
-    verify_files(folder, report, {p: partial(_verify, files[p], report, scenes) for p in files})
+    parts = {pattern: partial(_verify, files[pattern], report, scenes) for pattern in files}
+    with import_module("torch").no_grad() if is_network else nullcontext():
+        verify_files(folder, report, parts)
 
 
 def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:

@@ -36,17 +36,16 @@ def _outputs(network: Any, pictures: Any, measured: Any, told: Any) -> dict[str,
     from torch.distributions import Beta
 
     see, feel, tell = (torch.from_numpy(array) for array in (pictures, measured, told))
-    with torch.inference_mode():
-        encoder = network.features_extractor
-        features = encoder(see, feel)
-        policy = network.policy(features)
-        beta: Any = Beta(policy.alpha, policy.beta)
-        return {
-            **{"seen": encoder.see(see), "felt": encoder.feel(feel), "features": features},
-            **{"policy": policy, "value": network.value(features, tell)},
-            "log_prob": beta.log_prob(beta.mean).sum(dim=1),
-            "entropy": beta.entropy().sum(dim=1),
-        }
+    encoder = network.features_extractor
+    features = encoder(see, feel)
+    policy = network.policy(features)
+    beta: Any = Beta(policy.alpha, policy.beta)
+    return {
+        **{"seen": encoder.see(see), "felt": encoder.feel(feel), "features": features},
+        **{"policy": policy, "value": network.value(features, tell)},
+        "log_prob": beta.log_prob(beta.mean).sum(dim=1),
+        "entropy": beta.entropy().sum(dim=1),
+    }
 
 
 def _verify_decoding(file: Source) -> None:

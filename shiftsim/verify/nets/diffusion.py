@@ -75,21 +75,22 @@ def _verify_forward(file: Source) -> None:
     limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
-    with torch.inference_mode():
-        inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
-        network = make_network(NAME, "base")
-        scene = network.normalise(inputs)
-        normalised = {name: scene[name] for name in network.normalisers}
-        file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
-        encoding, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
-        encoded = {"encoding": encoding, "route": route}
-        TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
-        for variant in common.match_case(file, NAME):
-            stored = file.below(f"out.{variant}.")
-            says = _sampled(variant, scene, inputs, given["noise"])
-            for table in ("sampled", "guided"):
-                where = f"{file.name} {variant}"
-                TABLES[table].match(stored, where, NAME, variant=variant, **says)
+    inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
+    network = make_network(NAME, "base")
+    scene = network.normalise(inputs)
+    normalised = {name: scene[name] for name in network.normalisers}
+    file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
+    route = network.dit[0].route_encoder(scene["route_lanes"])
+    encoded = {"encoding": network.encode(scene), "route": route}
+    TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
+    for variant in common.match_case(file, NAME):
+        says, stored = (
+            _sampled(variant, scene, inputs, given["noise"]),
+            file.below(f"out.{variant}."),
+        )
+        for section in ("sampled", "guided"):
+            where = f"{file.name} {variant}"
+            TABLES[section].match(stored, where, NAME, variant=variant, **says)
 
 
 def _sampled(
@@ -121,15 +122,12 @@ def _sampled(
 
 def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
-    import torch
-
     loop.match("iteration", loop.row)
     if list(loop.stored):
         loop.match("stored", loop.stored, route=loop.features.route or ())
     if "encoding" in loop.stored:
-        with torch.inference_mode():
-            network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
-            encoding = network.encode(network.normalise(inputs))[0]
+        network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
+        encoding = network.encode(network.normalise(inputs))[0]
         loop.match("encoding", loop.stored, encoding=encoding)
 
 

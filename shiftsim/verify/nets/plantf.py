@@ -43,8 +43,7 @@ def compare_features(loop: Loop, agents: Any, road: Any, route: Any, **names: An
 
 def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) -> None:
     """Compare what is stored of the network's outputs for one iteration."""
-    made = _without_grad(outputs, loop.planner.network, batch)
-    ours = {name: value[0] for name, value in made.items()}
+    ours = {name: value[0] for name, value in outputs(loop.planner.network, batch).items()}
     for section in sections:
         loop.match(section, loop.stored.below("net/"), f"({loop.variant})", **ours)
 
@@ -68,7 +67,7 @@ def verify_forward(
         tensor = torch.from_numpy(np.ascontiguousarray(array))
         tensors[field] = tensor.long() if field in CODES else tensor
     inputs = network_module(planner).Inputs(**tensors)
-    ours = _without_grad(outputs, make_network(planner, variant), inputs)
+    ours = outputs(make_network(planner, variant), inputs)
     for table in (tables["outputs"], tables["large"]):
         called = f"{planner} ({variant})"
         table.match(file.below("out/"), file.name, called, variant=variant, **ours)
@@ -76,13 +75,6 @@ def verify_forward(
     _compare_inputs(stored, planner, radius, {*codes, "map.polygon_road_block_id"})
     file.note("the network does not read them", "in/origin", "in/angle")
     file.note("the network does not read the yaw rate, the last value of in/current_state")
-
-
-def _without_grad(outputs: Outputs, network: Any, inputs: Any) -> dict[str, Any]:
-    import torch
-
-    with torch.inference_mode():
-        return outputs(network, inputs)
 
 
 def _compare_inputs(stored: Source, planner: str, radius: float, codes: set[str]) -> None:

@@ -6,10 +6,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.planners.learned.map_features import CROSSWALK
-from shiftsim.planners.learned.pluto import planner as pluto
-from shiftsim.planners.learned.pluto import scoring
-from shiftsim.planners.learned.pluto.brake import brake, must_brake
-from shiftsim.planners.learned.pluto.inputs import stack
+from shiftsim.planners.learned.pluto import brake, inputs, planner, scoring
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common, plantf
@@ -17,7 +14,7 @@ from shiftsim.verify.nets.common import Loop
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
-NAME, TABLES = pluto.Pluto.name, read_tables(plantf.__file__, __file__)
+NAME, TABLES = planner.Pluto.name, read_tables(plantf.__file__, __file__)
 NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
 
@@ -28,20 +25,20 @@ def _verify_brake(file: Source) -> None:
     for number, case in enumerate(rows_of(file)):
         ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
         speed = float(np.hypot(ego[VX], ego[VY]))
-        braked, states = must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
+        braked, states = brake.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
         if braked:
-            states = brake(case["candidate"], ego, time, PACIFICA)
+            states = brake.brake(case["candidate"], ego, time, PACIFICA)
         ours = {"speed": speed, "braked": braked, "states": states}
         case.match(f"case {number}", ours, {"speed": LINE, "": common.STATE})
 
 
-def _outputs(network: Any, inputs: Any) -> dict[str, Any]:
+def _outputs(network: Any, batch: Any) -> dict[str, Any]:
     """What the network says of a batch, and poses that the official code makes of that."""
     # the official code masks the agents of a batch in the wrong order (nuPlan rule 307)
     network.planning_decoder.misordered_masks = True
-    out = network(inputs)
+    out = network(batch)
     made = {name: value.numpy() for name, value in out._asdict().items()}
-    present = np.concatenate([inputs.position[:, 1:, -1], inputs.heading[:, 1:, -1:]], axis=-1)
+    present = np.concatenate([batch.position[:, 1:, -1], batch.heading[:, 1:, -1:]], axis=-1)
     return {
         **made,
         "hidden": network.hidden_proj(out.ego),
@@ -63,7 +60,7 @@ def _compare(loop: Loop) -> None:
     loop.match("aggregated", stored, "aggregated", progress=progress, rule=rule)
     if "agent_tokens" in loop.stored:  # one of the iterations stored in full
         _compare_sight(loop)
-        batch = Inputs(*stack([loop.features], "cpu"))
+        batch = Inputs(*inputs.stack([loop.features], "cpu"))
         plantf.compare_network(loop, _outputs, batch, "outputs")
         _compare_from_stored(loop, stored)
     best, total = int(loop.row["best_index"]), stored["rule"] + 0.3 * stored["lscore"]
@@ -77,14 +74,14 @@ def _compare(loop: Loop) -> None:
 
 def _compare_sight(loop: Loop) -> None:
     """Compare what was made before the network."""
-    sight, inputs, road = loop.planner.sight, loop.features, loop.road
+    sight, given, road = loop.planner.sight, loop.features, loop.road
     near, lines = sight.road, sight.lines
     blocks = [
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
     ]
     made = {"blocks": np.array(blocks, np.int64), "projection": np.zeros((len(lines), 8, 2))}
-    made |= {"inputs": inputs, "state": inputs.current_state, "category": inputs.category}
+    made |= {"inputs": given, "state": given.current_state, "category": given.category}
     route = loop.planner.route.blocks
     plantf.compare_features(loop, sight.agents, near, route, **made)
     stored = loop.stored.below("reference_line_")
@@ -92,9 +89,9 @@ def _compare_sight(loop: Loop) -> None:
     numbered = {str(number): line for number, line in enumerate(lines)}
     stored.match(loop.where, numbered, LINE, quantity=f"{loop.name} reference line")
     # the official code takes static objects out of a set: their order means nothing
-    theirs, pose = loop.stored.below("feature/static_objects."), inputs.object_pose
+    theirs, pose = loop.stored.below("feature/static_objects."), given.object_pose
     order, their_order = _by_place(pose[:, :2]), _by_place(theirs["position"])
-    ours = {name: value[order] for name, value in inputs._asdict().items() if "object" in name}
+    ours = {name: value[order] for name, value in given._asdict().items() if "object" in name}
     loop.match("static_objects", theirs.at(their_order), "static_objects", **ours)
 
 
@@ -105,20 +102,18 @@ def _by_place(positions: Any) -> Any:
 
 def _compare_from_stored(loop: Loop, stored: Source) -> None:
     """Compare what the scores of the stored proposals are, against the stored predictions."""
-    sight, ego = loop.planner.sight, loop.seen.history.ego[-1]
-    line = scoring.nearest_line(sight.lines, ego)
     motion = {"poses": stored["agents_pred"], "speeds": stored["agents_vel"]}
-    world = loop.planner.world_of(loop.seen, loop.planner.choice.agents._replace(**motion))
-    place = scoring.Place(sight.drivable, loop.road.edges.polygons, line)
+    agents = loop.planner.choice.agents._replace(**motion)
     proposals = np.ascontiguousarray(stored["cand"])
-    scores = scoring.score(proposals, stored["lscore"], ego, world, place, PACIFICA)
-    loop.match("from_sight", stored, line=line, sight=sight)
-    loop.match("from_stored", stored, "stored proposals'", scores=scores)
+    again = loop.planner.rate(loop.seen, proposals, stored["lscore"], agents)
+    line = scoring.nearest_line(loop.planner.sight.lines, loop.seen.history.ego[-1])
+    loop.match("from_sight", stored, line=line)
+    loop.match("from_stored", stored, "stored proposals'", scores=again.scores)
 
 
 FILES = {
-    "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=pluto),
-    "forward_*.npz": partial(plantf.verify_forward, NAME, TABLES, _outputs, pluto.RADIUS),
-    "closed_loop_*.npz": partial(common.verify_loop, pluto.Pluto, TABLES, _compare),
+    "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=planner),
+    "forward_*.npz": partial(plantf.verify_forward, NAME, TABLES, _outputs, planner.RADIUS),
+    "closed_loop_*.npz": partial(common.verify_loop, planner.Pluto, TABLES, _compare),
     "emergency_brake.npz": _verify_brake,
 }
