@@ -103,6 +103,28 @@ def test_rows_of_an_optional_section_may_be_missing_and_not_differ():
     assert [line.split(":")[0] for line in report.mismatches] == ["PDM y"]
 
 
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("x[:, :2]", "step.poses[:, :2]"),
+        ("x[..., 2]", "step.poses[..., 2]"),
+        ("x[1]", "step.poses[1]"),
+    ],
+)
+def test_a_row_may_be_of_a_part_of_a_value(name, path):
+    theirs = np.arange(6.0).reshape(2, 3)
+    assert compared({name: path}, {"x": theirs}).mismatches == []
+    report = compared({name: path}, {"x": theirs + 1.0})
+    assert list(report.quantities) == [f"file {name}"]
+    assert len(report.mismatches) == 1
+    assert compared({name: path}, {}).mismatches
+
+
+def test_what_is_beside_the_compared_part_is_not_compared():
+    theirs = np.arange(6.0).reshape(2, 3) + np.array([0.0, 0.0, 1.0])
+    assert compared({"x[:, :2]": "step.poses[:, :2]"}, {"x": theirs}).mismatches == []
+
+
 def cases_of(path, compare):
     report = Report()
     verify_cases(compare, path, report)
@@ -167,3 +189,12 @@ def test_a_table_is_read_from_beside_the_module(tmp_path):
     tables = read_tables(str(tmp_path / "part.py"))
     assert tables["ends"].rows == {"a/b": "line[-1]"}
     assert tables["ends"].about["atol"] == 1e-9
+
+
+def test_a_later_table_adds_rows_and_replaces_those_of_the_same_name(tmp_path):
+    (tmp_path / "first.toml").write_text('[a]\n"*" = { atol = 1.0 }\nx = "p"\ny = { u = 1 }\n')
+    (tmp_path / "second.toml").write_text('[a]\nx = "q"\ny = { v = 2 }\n[b]\nz = "r"\n')
+    tables = read_tables(str(tmp_path / "first.py"), str(tmp_path / "second.py"))
+    assert tables["a"].rows == {"x": "q", "y": {"u": 1, "v": 2}}
+    assert tables["a"].about["atol"] == 1.0
+    assert tables["b"].rows == {"z": "r"}
