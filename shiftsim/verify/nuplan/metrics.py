@@ -21,7 +21,7 @@ TABLES = read_tables(__file__)
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 # how the devkit files each metric, and the units of scores that have one
 RECORDED, CATEGORIES, UNITS = (COMPARED[what] for what in ("recorded", "category", "unit"))
-_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
+RUN_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 
 
 def verify_nuplan_metrics(
@@ -36,7 +36,7 @@ def verify_nuplan_metrics(
 
     `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
-    tables = open_tables(expected, report, *_TABLES)
+    tables = open_tables(expected, report, *RUN_TABLES)
     replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
     experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
     tables["objects"].table.note("no metric reads it", "height")

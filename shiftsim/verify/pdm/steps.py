@@ -22,6 +22,7 @@ from shiftsim.planners.routes.lights import red_lights
 from shiftsim.sim.planner import scene_info
 from shiftsim.verify.files import Groups, Source, read_arrays, read_fields, read_json
 from shiftsim.verify.nuplan import runs
+from shiftsim.verify.nuplan.metrics import RUN_TABLES
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
@@ -32,13 +33,7 @@ from shiftsim.world.state import HEADING, PACIFICA, center_poses
 TABLES = read_tables(__file__)
 UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
 STORED = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: plans stored as 32 bit floats
-FILES = [  # of a folder of closed loops
-    f"{name}.parquet"
-    for name in (
-        *("metrics", "statistics", "time_series", "route", "collisions", "scores", "objects"),
-        *("ego", "steps", "proposals"),
-    )
-]
+ROLLED = 1e-6  # m, rad, m/s, …: arrays of a step
 ASIDE = np.array([1e-6, 3e-6])  # m, moves what is exactly ahead or behind to a side
 
 
@@ -182,7 +177,8 @@ def verify_calls(
         table.finish(mode)
     if mode is None:
         static.finish()
-    known = {"static.json", *FILES, *(f"{'_'.join(key[:2])}.npz" for key in egos)}
+    known = {f"{name}.parquet" for name in (*RUN_TABLES, "steps", "proposals")}
+    known |= {"static.json", *(f"{'_'.join(key[:2])}.npz" for key in egos)}
     for name in sorted({path.name for path in folder.iterdir()} - known):
         report.skip(f"file loop/{name}")
 
@@ -218,6 +214,6 @@ def _compare_calls(
             ids = [*road.edges.ids, *road.car_parks.ids]
             areas = [ids[area] for area in sight.place.selected.tolist()]
             arrays = {"map_tokens": sight.tokens, "drivable_tokens": areas, **step_arrays(step)}
-            file.match(at, {f"{name}_{index}": arrays[name] for name in arrays}, 1e-6)
+            file.match(at, {f"{name}_{index}": arrays[name] for name in arrays}, ROLLED)
     file.finish()
     return planner
