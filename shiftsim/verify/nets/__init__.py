@@ -26,12 +26,11 @@ def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> 
 
     `scenes` holds the logs and maps, by default `nuplan` beside `nets`.
     """
-    home, part = folder.resolve(), _part_of(folder)
+    home, part = folder.resolve().parent, _part_of(folder)
+    known = Scenes(scenes or (home.parent if part in PARTS else home) / "nuplan")
     if part in PARTS:
-        known = Scenes(scenes or home.parent.parent / "nuplan")
         verify_part(part, folder, report, known)
     else:
-        known = Scenes(scenes or home.parent / "nuplan")
         parts = {name: partial(verify_part, name, report=report, scenes=known) for name in PARTS}
         verify_files(folder, report, parts)
 

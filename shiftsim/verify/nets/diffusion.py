@@ -178,11 +178,8 @@ def _verify_lanes(file: Source) -> None:
     lights = file.take("in.light", len(owner), 4)
     once = np.ones(len(owner), np.int64)
     file.report.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
-    made = builder.lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, builder.LANES)
     route = [index.get(name, -1) for name in file["in.route"].tolist()]
-    on_route = builder.lanes_on_route(blocks[edges], route)
-    ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), made, strict=True))
-    ours |= {f"route_{name}": builder.first_rows(ours[name], on_route) for name in ours}
+    ours = builder.lane_inputs(lanes, edges, lights.argmax(axis=1)[edges], anchor, route)
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
 
