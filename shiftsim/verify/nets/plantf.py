@@ -49,11 +49,7 @@ def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) ->
 
 
 def verify_forward(
-    planner: str,
-    tables: Mapping[str, Table],
-    outputs: Outputs,
-    radius: float,
-    file: Source,
+    planner: str, tables: Mapping[str, Table], outputs: Outputs, radius: float, file: Source
 ) -> None:
     """Compare the network alone, on synthetic inputs as the official code batched them.
 

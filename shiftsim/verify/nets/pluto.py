@@ -54,7 +54,7 @@ def _compare(loop: Loop) -> None:
     from shiftsim.planners.learned.pluto.network import Inputs
 
     choice, stored = loop.planner.choice, loop.stored.below("post/")
-    loop.match("choice", stored, choice=choice)
+    loop.match("choice", stored)
     parts = (stored["multi"], stored["weighted"], stored["progress"])
     progress, rule = scoring.aggregate(*parts)
     loop.match("aggregated", stored, "aggregated", progress=progress, rule=rule)
@@ -69,7 +69,7 @@ def _compare(loop: Loop) -> None:
         what = f"proposal {choice.best} instead of {best}, scores {first:.6f} and {second:.6f}"
         loop.file.report.note(f"{loop.name} {loop.where}: near-tie, {what}")
     else:
-        loop.match("iteration", loop.row, choice=choice)
+        loop.match("iteration", loop.row)
 
 
 def _compare_sight(loop: Loop) -> None:
