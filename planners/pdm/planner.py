@@ -34,7 +34,7 @@ from shiftsim.planners.routes.graph import centerline
 from shiftsim.planners.routes.lights import LightWatch
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import NUM_STATE, Trajectory
+from shiftsim.world.state import NUM_STATE, Trajectory, VehicleParameters, center_poses
 
 
 class Seen(NamedTuple):
@@ -84,7 +84,7 @@ class PdmClosed:
             map_radius=map_radius,
         )
         self._scene: SceneInfo | None = None
-        self._paths: list[Path] = []
+        self.paths: list[Path] = []
         self._lights: LightWatch | None = None
         self.collided: list[str] = []
         self.route: Route | None = None
@@ -99,7 +99,7 @@ class PdmClosed:
         """
         known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
-        self._paths, self.collided = [], []
+        self.paths, self.collided = [], []
         self.route = self.centerline = self.seen = self._lights = None
 
     def plan(self, observation: Observation) -> Trajectory:
@@ -119,22 +119,36 @@ class PdmClosed:
             self.route = start_route(scene.map, scene.route, ego, scene.token)
         route = self.route
         selected = select_areas(scene.map, center[0], center[1], params.map_radius)
-        size = ego_box(vehicle)
-        lane = current_lane(scene.map, route, selected, ego, center, size)
-        if not self._paths:
-            self._follow(scene.map, route, lane)
+        lane = current_lane(scene.map, route, selected, ego, center, ego_box(vehicle))
+        if not self.paths:
+            self.follow(centerline(scene.map, follow_route(scene.map, route.corrected, lane).path))
         forecast, tokens = self._forecast(scene.map, route, observation)
-        footprint = boxes_to_corners(center, np.array([size.length, size.width]))
-        self.collided += [tokens[i] for i in touched(forecast, footprint)]
-        if self.collided:
-            forecast.ignored[:] = [token in self.collided for token in tokens]
-        limit = float(scene.map.speed_limits[lane])
-        limit = params.fallback_velocity if np.isnan(limit) else limit
-        place = Place(route.areas, selected, scene.map.intersections.polygons, self._paths[0])
+        place = Place(route.areas, selected, scene.map.intersections.polygons, self.paths[0])
         self.seen = Seen(forecast, tokens, place, lane)
+        return self.step_in(self.seen, ego, float(scene.map.speed_limits[lane]), vehicle)
+
+    def follow(self, line: FloatArray) -> None:
+        """Lay the centerline (K, 3) and the paths beside it, once per scenario."""
+        self.centerline, offsets = line, self.parameters.lateral_offsets
+        self.paths = [make_path(line), *(make_path(offset_poses(line, by)) for by in offsets)]
+
+    def step_in(
+        self, seen: Seen, ego: FloatArray, limit: float, vehicle: VehicleParameters
+    ) -> Step:
+        """One planning step in what an ego (11,) sees; what it touches is ignored from now on.
+
+        `limit` is the speed limit of the lane, NaN where it has none [m/s].
+        """
+        size, params = ego_box(vehicle), self.parameters
+        center = center_poses(ego[:3], vehicle)
+        footprint = boxes_to_corners(center, np.array([size.length, size.width]))
+        self.collided += [seen.tokens[i] for i in touched(seen.forecast, footprint)]
+        if self.collided:
+            seen.forecast.ignored[:] = [token in self.collided for token in seen.tokens]
+        limit = params.fallback_velocity if np.isnan(limit) else limit
         targets = limit * np.array(params.speed_fractions)
-        around = Scene(self._paths, forecast, size, params.following)
-        return plan_step(ego, targets, around, place, vehicle, params)
+        around = Scene(self.paths, seen.forecast, size, params.following)
+        return plan_step(ego, targets, around, seen.place, vehicle, params)
 
     def _forecast(
         self, road: VectorMap, route: Route, observation: Observation
@@ -148,13 +162,6 @@ class PdmClosed:
         tokens = [tracks.tokens[i] for i in chosen.tolist()]
         tokens += [LIGHT_TOKEN + road.edges.ids[i] for i in red.lanes]
         return make_forecast(tracks, chosen, red), tokens
-
-    def _follow(self, road: VectorMap, route: Route, lane: int) -> None:
-        """Lay the centerline and the paths beside it, once per scenario."""
-        line = centerline(road, follow_route(road, route.corrected, lane).path)
-        self.centerline = line
-        offsets = self.parameters.lateral_offsets
-        self._paths = [make_path(line), *(make_path(offset_poses(line, by)) for by in offsets)]
 
 
 def _floats(name: str, value: Sequence[float] | str) -> tuple[float, ...]:

@@ -69,8 +69,13 @@ def plan_step(
     poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)
     driven = drive_proposals(poses, ego, vehicle)
     scores = score(driven.states, place, scene.forecast.others, scene.size, params)
-    best = int(np.argmax(scores.total))  # the first one on ties
-    is_near = DT * scores.collision_index[best] <= params.brake_time
-    braked = bool(is_near and np.hypot(ego[VX], ego[VY]) <= params.brake_speed)
+    best, braked = choose(scores, ego, params)
     plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, best)
     return Step(plan, best, braked, proposals, driven, scores)
+
+
+def choose(scores: Scores, ego: FloatArray, params: PdmParameters) -> tuple[int, bool]:
+    """Number of the best proposal, and whether the emergency brake replaces it."""
+    best = int(np.argmax(scores.total))  # the first one on ties
+    is_near = DT * scores.collision_index[best] <= params.brake_time
+    return best, bool(is_near and np.hypot(ego[VX], ego[VY]) <= params.brake_speed)

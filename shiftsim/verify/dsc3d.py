@@ -21,13 +21,7 @@ from shiftsim.data.opendrive.map import Origin, build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
-from shiftsim.verify.files import (
-    Source,
-    open_tables,
-    read_fields,
-    read_table,
-    verify_files,
-)
+from shiftsim.verify.files import Compare, Source, open_tables, read_table, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.world.map import VectorMap
@@ -89,41 +83,31 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
         report.skip("recordings beyond the first", len(site.recordings) - 1)
     recording, local = read_recording(site, site.recordings[0]), LocalMap(find_map(site))
     keys = [local.keys_at(x, y) for x, y in recording.bottom[:, :2].tolist()]
-
-    def rows(path: Path) -> None:
-        theirs = read_table(path, report)
-        theirs = theirs.at(np.lexsort((theirs["frame_id"], theirs["track_id"])))
-        FACTS["rows"].match(theirs, "recording", **_rows(site, recording, keys))
-        theirs.finish()
-
-    def samples(path: Path) -> None:
-        theirs = read_table(path, report)
-        FACTS["samples"].match(theirs, "recording", **_samples(recording))
-        theirs.finish()
-
-    parts: dict[str, Callable[[Path], object]] = {
-        "data": lambda path: report.note(_DERIVED),
-        "expected_rows.parquet": rows,
-        "expected_20hz.parquet": samples,
-        "expected.json": lambda p: _verify_summary(read_fields(p, report), site, recording, keys),
+    files: dict[str, Compare] = {
+        "expected_rows.parquet": lambda file, _: _compare_rows(file, site, recording, keys),
+        "expected_20hz.parquet": lambda file, _: _compare_samples(file, recording),
+        "expected.json": lambda file, _: _compare_summary(file, site, recording, keys),
     }
-    verify_files(folder, report, parts)
+    verify_files(folder, report, {"data": lambda path: report.note(_DERIVED)}, files)
 
 
-def _rows(site: Site, recording: Annotations, keys: list[list[LaneKey]]) -> dict[str, Any]:
+def _compare_rows(
+    file: Source, site: Site, recording: Annotations, keys: list[list[LaneKey]]
+) -> None:
     """All boxes as recorded, by track and frame."""
     utm = recording.bottom[:, :2] + site.offset[:2]
     lanes = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
-    return {
-        **{"recording": recording, "utm": utm, "lanes": [key.lane for key in lanes]},
-        "frames": recording.frame * site.frame_distance,
-        "ids": recording.track_ids[recording.track],
-        "roads": [key.road for key in lanes],
-        "degrees": pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T),
-    }
+    FACTS["rows"].match(
+        file.at(np.lexsort((file["frame_id"], file["track_id"]))),
+        "recording",
+        **{"recording": recording, "utm": utm, "lanes": lanes},
+        frames=recording.frame * site.frame_distance,
+        ids=recording.track_ids[recording.track],
+        degrees=pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T),
+    )
 
 
-def _samples(recording: Annotations) -> dict[str, Any]:
+def _compare_samples(file: Source, recording: Annotations) -> None:
     """The bottoms of all boxes at 20 Hz, by track and time."""
     recording = replace(recording, centers=recording.bottom)
     runs = find_runs(recording, ConversionConfig().max_hole_s)
@@ -132,11 +116,12 @@ def _samples(recording: Annotations) -> dict[str, Any]:
     steps = [np.arange(*span) for span in zip(first, last + 1, strict=True)]
     run, step = np.repeat(np.arange(len(steps)), [*map(len, steps)]), np.concatenate(steps)
     ids, time = recording.track_ids[runs.track[run]], step * _STEP_S
+    ours = {"ids": ids, "steps": step.astype(np.int64), "time": time}
     samples = sample_runs(recording, runs, run, time)
-    return {"ids": ids, "steps": step.astype(np.int64), "time": time, "samples": samples}
+    FACTS["samples"].match(file, "recording", samples=samples, **ours)
 
 
-def _verify_summary(
+def _compare_summary(
     expected: Source, site: Site, recording: Annotations, keys: list[list[LaneKey]]
 ) -> None:
     report, folder = expected.report, site.folder / "annotations" / recording.name
@@ -169,7 +154,6 @@ def _verify_summary(
             "lanes": [list(lane) for lane in sorted(lanes)],
         }
         FACTS["track"].match(track, where, **facts)
-    expected.finish()
 
 
 def _tracks(expected: Source, recording: Annotations) -> Iterator[tuple[int, str, Source]]:
@@ -191,45 +175,21 @@ def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> N
         for path in folder.glob("*/expected.json")
     }
     if (folder / "expected.json").is_file():
-        parts = {
-            "data": lambda path: report.note(_DERIVED),
-            "expected.json": lambda path: _verify_scripted(read_fields(path, report), folder, maps),
-            "expected_ego_20hz.parquet": lambda path: None,  # with `expected.json`
-        }
-    verify_files(folder, report, parts)
+        parts = {"data": lambda path: report.note(_DERIVED)}
+        parts["expected_ego_20hz.parquet"] = lambda path: None  # with `expected.json`
+    scripted = partial(_compare_scripted, folder=folder, maps=maps)
+    verify_files(folder, report, parts, {"expected.json": scripted})
 
 
-def _verify_scripted(expected: Source, folder: Path, maps: Path | None) -> None:
+def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | None) -> None:
     report, name, config = expected.report, folder.name, ConversionConfig()
     site = open_site(folder / "data")
     recording = read_recording(site, site.recordings[0])
     FACTS["recording"].match(expected, name, recording=recording, rate=1.0 / recording.period)
     for number, where, track in _tracks(expected, recording):
-        own: dict[str, Any] = {
-            "category": recording.categories[number],
-            "size": recording.sizes[number],
-        }
-        FACTS["scripted"].match(track, where, **own)
-    windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
-    wanted, lanes = expected.each("windows"), dict[tuple[str, str], Any]()
-    ids = recording.track_ids.tolist()
-    report.compare("windows", name, len(windows), len(wanted))
-    for window, theirs in zip(windows, wanted, strict=False):
-        where, given = f"{name} window {window.span.start_s:g} s", theirs["verdict"]
-        verdicts = {
-            str(ids[number]): verdict if partner < 0 else f"{verdict} with {ids[partner]}"
-            for number, verdict, partner in zip(
-                window.tracks, window.verdicts, window.partners, strict=True
-            )
-        }
-        own = {"start_s": window.span.start_s}
-        own["egos"] = [int(name) for name, verdict in verdicts.items() if verdict == EGO]
-        theirs.match(where, own, quantity="window", unordered={"egos"})
-        report.compare("tracks seen", where, sorted(verdicts), sorted(given))
-        for seen in sorted(set(verdicts) & set(given)):
-            report.compare("verdict", f"{where} track {seen}", verdicts[seen], given[seen])
-        begin = f"{theirs['start_s']:.1f}"
-        lanes |= {(begin, ego): way for ego, way in theirs["lanes_from_t0"].items()}
+        kind, size = recording.categories[number], recording.sizes[number]
+        FACTS["scripted"].match(track, where, category=kind, size=size)
+    lanes = _compare_windows(expected, recording, config, name)
     expected.used.add("note")
     places = [maps / expected["map"]] if maps is not None else []
     places += [folder / "data/map/map.xodr"]
@@ -240,7 +200,32 @@ def _verify_scripted(expected: Source, folder: Path, maps: Path | None) -> None:
         _verify_scenarios(folder, made, site.offset[:2], local, lanes, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
-    expected.finish()
+
+
+def _compare_windows(
+    expected: Source, recording: Annotations, config: ConversionConfig, name: str
+) -> dict[tuple[str, ...], list[list[Any]]]:
+    """Compare windows and verdicts; what the file says of lanes, by window and ego."""
+    report, ids = expected.report, recording.track_ids.tolist()
+    lanes: dict[tuple[str, ...], list[list[Any]]] = {}
+    windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
+    wanted = expected.each("windows")
+    report.compare("windows", name, len(windows), len(wanted))
+    for window, theirs in zip(windows, wanted, strict=False):
+        where, given = f"{name} window {window.span.start_s:g} s", theirs["verdict"]
+        judged = zip(window.tracks, window.verdicts, window.partners, strict=True)
+        verdicts = {
+            str(ids[number]): verdict if partner < 0 else f"{verdict} with {ids[partner]}"
+            for number, verdict, partner in judged
+        }
+        egos = [int(name) for name, verdict in verdicts.items() if verdict == EGO]
+        FACTS["window"].match(theirs, where, window=window, egos=egos)
+        report.compare("tracks seen", where, sorted(verdicts), sorted(given))
+        for seen in sorted(set(verdicts) & set(given)):
+            report.compare("verdict", f"{where} track {seen}", verdicts[seen], given[seen])
+        begin = f"{theirs['start_s']:.1f}"
+        lanes |= {(begin, ego): way for ego, way in theirs["lanes_from_t0"].items()}
+    return lanes
 
 
 def _verify_scenarios(
@@ -248,7 +233,7 @@ def _verify_scenarios(
     made: Converted,
     offset: FloatArray,
     local: LocalMap,
-    lanes: dict[tuple[str, str], Any],
+    lanes: dict[tuple[str, ...], list[list[Any]]],
     report: Report,
 ) -> None:
     """Poses and lanes of the converted scenarios, brought back to the local frame."""

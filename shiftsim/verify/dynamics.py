@@ -1,11 +1,9 @@
 """Compares vehicle dynamics, tracker, noise, interpolation, comfort and IDM steps with nuPlan's.
 
-`CHECKS` has a function for each file, which computes the arrays of one case from the others; names
-of columns, labels and tolerances stand in `compared.toml`.
+`CHECKS` has a function for each file, which computes what `dynamics.toml` speaks of from the arrays
+of one case.
 """
 
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,15 +19,17 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
-from shiftsim.verify.files import COMPARED, Source, read_arrays, verify_files
-from shiftsim.verify.idm_worlds import verify_idm_world
+from shiftsim.verify.files import Source, verify_files
+from shiftsim.verify.idm_worlds import compare_idm_world
 from shiftsim.verify.report import Report
+from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.verify.worlds import ego_states
 from shiftsim.world import state
 from shiftsim.world.state import NUM_STATE, PACIFICA, STEERING, VX
 
-Arrays: TypeAlias = dict[str, Any]
+Names: TypeAlias = dict[str, Any]
 
+TABLES = read_tables(__file__)
 GIVEN_STEERING = 0.1  # rad, of all states made from centres; not among their inputs
 LONGEST_PLAN_US = 3_600_000_000  # us, longer ones are broken input
 WINDOW_KNOTS = 81  # knots of the plan in closed loops of mode `window`
@@ -38,35 +38,17 @@ _POSE = ("x", "y", "heading")
 
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    parts = dict.fromkeys(CHECKS, partial(_verify_file, report))
-    worlds = {"idm_world_*": partial(verify_idm_world, report=report), "meta.json": None}
-    verify_files(folder, report, {**parts, **worlds})
+    files = dict.fromkeys((f"{name}.npz" for name in CHECKS), _compare_cases)
+    worlds = {"idm_world_*": compare_idm_world}
+    verify_files(folder, report, {"meta.json": None}, {**files, **worlds})
 
 
-def _verify_file(report: Report, path: Path) -> None:
-    file, lists = read_arrays(path, report), COMPARED[path.name]["lists"]
-    file.note("label", *COMPARED[path.name]["labels"])
-    file.match("file", {name: COMPARED["dynamics"]["lists"][name] for name in lists})
-    for number, case in enumerate(_cases(file, lists)):
-        case.match(f"case {number}", CHECKS[path.name](case), COMPARED["dynamics"]["atol"])
-    file.finish()
-
-
-def _cases(file: Source, lists: list[str]) -> Iterator[Source]:
-    """The arrays of each case: a row of every array, or what `<prefix>_ptr` gives it of others."""
-    count, given = len(file["case"]), {n: v for n, v in file.values.items() if n not in lists}
-    ends = {name.removesuffix("ptr"): name for name in given if name.endswith("_ptr")}
-    divided = {prefix: file.take(name, count + 1) for prefix, name in ends.items()}
-    rows = {}
-    for name in set(given) - set(ends.values()):
-        ptr = next((divided[p] for p in divided if name.startswith(p)), np.arange(count + 1))
-        size = len(given[name])
-        if ptr[0] or ptr[-1] != size or (np.diff(ptr) < 0).any():
-            raise DataError(f"array {name!r} has {size} rows, which are not those of {count} cases")
-        rows[name] = np.split(given[name], ptr[1:-1]) if name.startswith((*ends,)) else given[name]
-    for case in range(count):
-        values = {name: array[case] for name, array in rows.items()}
-        yield Source(file.name, file.what, values, file.report, file.used)
+def _compare_cases(file: Source, name: str) -> None:
+    table = TABLES[name]
+    file.note("label", *table.about["labels"])
+    file.match("file", {column: TABLES["lists"].rows[column] for column in table.about["lists"]})
+    for number, case in enumerate(rows_of(file)):
+        table.match(case, f"case {number}", **CHECKS[name](case))
 
 
 def _stamps(case: Source, name: str) -> IntArray:
@@ -86,7 +68,7 @@ def _centers(states: FloatArray) -> FloatArray:
     return np.concatenate([state.center_poses(states[..., :3]), *moves, *sizes], axis=-1)
 
 
-def _bicycle(case: Source) -> Arrays:
+def _bicycle(case: Source) -> Names:
     """A step, or a rollout, which has an axis of time."""
     before, dt_us = case.take("in_state", NUM_STATE), case["dt_us"]
     commands = case.take("cmd", *dt_us.shape, 2).reshape(-1, 2)
@@ -96,49 +78,38 @@ def _bicycle(case: Source) -> Arrays:
         step_bicycle(before, accel, rate, WHEEL_BASE, dt, out[step])
         before = out[step]
     out, times = out.reshape(*dt_us.shape, NUM_STATE), case["in_time_us"] + np.cumsum(dt_us)
-    ours = {"out_state": out, "out_time_us": times.reshape(dt_us.shape)}
-    return ours if dt_us.shape else {**ours, "out_centre": _centers(out)}
+    return {"states": out, "times": times.reshape(dt_us.shape), "centers": _centers(out)}
 
 
-def _lqr_commands(case: Source) -> Arrays:
+def _lqr_commands(case: Source) -> Names:
     now, initial = int(case["now_us"]), case.take("ego_state", NUM_STATE)
-    time_us = _stamps(case, "traj_time_us")
+    time_us, speed = _stamps(case, "traj_time_us"), initial[VX]
     plan = now, initial, time_us, ego_states({name: case[f"traj_{name}"] for name in _POSE})
     ref = lqr.reference(*plan, lqr.NUPLAN)
     lqr.raise_for_status(ref.status, now, time_us)
-    _, accel, rate = lqr.track(*plan, lqr.NUPLAN)
-    speed, curvature = lqr.fit_profiles(*plan[2:], lqr.NUPLAN)
+    speeds, curvatures = lqr.fit_profiles(*plan[2:], lqr.NUPLAN)
+    times = (time_us[0] + np.arange(len(speeds)) * lqr.NUPLAN.step_us) / 1e6
     return {
-        "lat_error": ref.lateral_error,
-        "heading_error": ref.heading_error,
-        "v0": initial[VX],
-        "v_ref": ref.speed,
-        "kappa_ref": ref.curvature,
-        "stop_mode": lqr.is_stopping(initial[VX], ref.speed, lqr.NUPLAN),
-        "accel_cmd": accel,
-        "steer_rate_cmd": rate,
-        "ego_time_us": now,
-        "profile_time_s": (time_us[0] + np.arange(len(speed)) * lqr.NUPLAN.step_us) / 1e6,
-        "profile_speed": speed,
-        "profile_curvature": curvature,
+        **{"now": now, "speed": speed, "ref": ref, "command": lqr.track(*plan, lqr.NUPLAN)[1:]},
+        **{"times": times, "speeds": speeds, "curvatures": curvatures},
+        "is_stopping": lqr.is_stopping(speed, ref.speed, lqr.NUPLAN),
     }
 
 
-def _closed_loop(case: Source) -> Arrays:
+def _closed_loop(case: Source) -> Names:
     if case["mode"] not in ("full", "window"):
         raise DataError(f"mode {str(case['mode'])!r} is neither 'full' nor 'window'")
     jitter = (np.diff(case["iter_time_us"]) != lqr.NUPLAN.step_us).any()
-    driven = _drive(case, case["mode"] == "full", np.zeros(case["cmd"].shape))
-    return {"jitter": jitter, **driven}
+    return {"jitter": jitter, **_drive(case, case["mode"] == "full", 0.0 * case["cmd"])}
 
 
-def _closed_loop_noise(case: Source) -> Arrays:
+def _closed_loop_noise(case: Source) -> Names:
     noise = noise_from_normals(parse_noise(f"{case['process']}-{case['level']}"), case["eps"])
-    driven = _drive(case, False, case["noise"])
-    return {"noise": noise, "cmd_applied": case["cmd"] + case["noise"], **driven}
+    applied = case["cmd"] + case["noise"]
+    return {"noise": noise, "applied": applied, **_drive(case, False, case["noise"])}
 
 
-def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Arrays:
+def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Names:
     """A closed loop; the tracker sees the whole plan, or a window that moves on with it."""
     plan, states = case.take("ref_pose", -1, 3), case.take("state", -1, NUM_STATE)
     ref_time, iter_time = _stamps(case, "ref_time_us"), _stamps(case, "iter_time_us")
@@ -155,64 +126,53 @@ def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Arrays:
             *(*added, driven[step + 1], commands[step]),
         )
         lqr.raise_for_status(status, now, ref_time[knots])
-    return {
-        "state": driven,
-        "cmd": commands,
-        "centre": _centers(states),
-        "state_time_us": iter_time,
-        "ref_time_us": ref_time[0] + lqr.NUPLAN.step_us * np.arange(len(ref_time)),
-    }
+    plan_times = ref_time[0] + lqr.NUPLAN.step_us * np.arange(len(ref_time))
+    ours = {"driven": driven, "commands": commands, "centers": _centers(states)}
+    return {**ours, "times": iter_time, "plan_times": plan_times}
 
 
-def _trajectory_interpolation(case: Source) -> Arrays:
+def _trajectory_interpolation(case: Source) -> Names:
     stamps, states = _stamps(case, "knot_time_us"), case.take("knot_state", -1, NUM_STATE)
     queries = case["query_time_us"]
     out = np.empty((len(queries), NUM_STATE))
     for row, now in enumerate(queries.tolist()):
         if not interpolate(stamps, states, now, out[row]):
             raise DataError(f"query {now} is outside the trajectory")
-    return {"query_out_state": out, "query_out_time_us": queries}
+    return {"states": out, "times": queries}
 
 
-def _ego_frames(case: Source) -> Arrays:
+def _ego_frames(case: Source) -> Names:
     states, given = case.take("rear_state", NUM_STATE), case["from_centre_in"]
     size, built = np.array([PACIFICA.length, PACIFICA.width]), np.zeros(NUM_STATE)
     built[:7], built[[state.YAW_RATE, state.YAW_ACCEL]] = given[:7], given[7:]
     built[STEERING] = GIVEN_STEERING
-    return {
-        "centre": _centers(states),
-        "corners": boxes_to_corners(state.center_poses(states[:3]), size),
-        "from_centre_rear_state": state.rear_states(built),
-    }
+    corners = boxes_to_corners(state.center_poses(states[:3]), size)
+    return {"centers": _centers(states), "corners": corners, "rear": state.rear_states(built)}
 
 
-def _comfort_signals(case: Source) -> Arrays:
+def _comfort_signals(case: Source) -> Names:
     names = ("heading", "vx", "ax", "ay", "omega", "alpha")
     states = ego_states({name: case[f"sig_in_{name}"] for name in names})
     signals = comfort_signals(case.take("sig_in_time_us", -1), states)
-    ours: Arrays = {f"sig_{name}": values for name, values in signals._asdict().items()}
-    for array, profile in (("within_default", "nuplan"), ("within_deepplan", "deepplan")):
-        within = within_bounds(signals, PROFILES[profile])
-        ours[array] = [*within, all(within)]
-    return ours
+    within = {name: within_bounds(signals, profile) for name, profile in PROFILES.items()}
+    return {"signals": signals, **{name: [*flags, all(flags)] for name, flags in within.items()}}
 
 
-def _idm_steps(case: Source) -> Arrays:
+def _idm_steps(case: Source) -> Names:
     (progress, speed), (lead, lead_speed, rear) = case["agent"].tolist(), case["lead"].tolist()
     given = speed, lead - progress - rear, lead_speed, *case.take("params", 5).tolist()
     distance, after = idm_step(*given, float(case["dt_s"]))
-    euler = [progress + distance, after]
-    return {"accel_unclipped": idm_acceleration(*given), "forward_euler": euler}
+    return {"acceleration": idm_acceleration(*given), "after": [progress + distance, after]}
 
 
 CHECKS = {
-    "bicycle_rollouts.npz": _bicycle,
-    "bicycle_steps.npz": _bicycle,
-    "closed_loop.npz": _closed_loop,
-    "closed_loop_noise.npz": _closed_loop_noise,
-    "comfort_signals.npz": _comfort_signals,
-    "ego_state_frames.npz": _ego_frames,
-    "idm_steps.npz": _idm_steps,
-    "lqr_commands.npz": _lqr_commands,
-    "trajectory_interpolation.npz": _trajectory_interpolation,
+    "bicycle_rollouts": _bicycle,
+    "bicycle_steps": _bicycle,
+    "closed_loop": _closed_loop,
+    "closed_loop_noise": _closed_loop_noise,
+    "comfort_signals": _comfort_signals,
+    "ego_state_frames": _ego_frames,
+    "idm_steps": _idm_steps,
+    "lqr_commands": _lqr_commands,
+    "trajectory_interpolation": _trajectory_interpolation,
 }

@@ -6,10 +6,12 @@ covered. `match` compares values of ours with those of the same names.
 """
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,7 +23,7 @@ from numpy.typing import ArrayLike
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 
-# keys and tolerances of files, and what of ours their fields are
+# keys and tolerances of tables, and how folders are recognised
 COMPARED: dict[str, Any] = tomllib.loads(
     (Path(__file__).parent / "compared.toml").read_text("utf-8")
 )
@@ -48,17 +50,22 @@ class Source:
     _parts: "dict[str, list[Source]]" = field(init=False, default_factory=dict)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.values
+        return name.partition("[")[0] in self.values
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.values)
 
     def __getitem__(self, name: str) -> Any:
-        """A value, which is used from now on; a `DataError` if there is none."""
+        """A value, which is used from now on, or a part of one, as in `poses[:, :2]`.
+
+        A `DataError` if there is none.
+        """
+        name, _, index = name.rstrip("]").partition("[")
         if name not in self.values:
             raise DataError(f"{self.name}: {self.what} {name!r} is missing")
         self.used.add(self.prefix + name)
-        return self.values[name] if self.rows is None else self.values[name][self.rows]
+        value = self.values[name] if self.rows is None else self.values[name][self.rows]
+        return value[read_index(index)] if index else value
 
     def take(self, name: str, *shape: int) -> Any:
         """An array of a given shape, contiguous; -1 is any length."""
@@ -157,17 +164,18 @@ class Source:
             part.finish()
 
 
-def fields_of(thing: Any, paths: Mapping[str, str]) -> dict[str, Any]:
-    """What paths of `compared.toml` lead to; objects with an id are named by it."""
-    return {name: _follow(thing, path) for name, path in paths.items()}
+def read_index(text: str) -> Any:
+    """The index that `-1`, `:, 0` or `..., :2` stands for; any other text is a key."""
+    if not set(text) <= set("-:., 0123456789"):
+        return text
+    keys: list[Any] = []
+    for part in text.split(","):
+        numbers = [int(n) if n.strip() else None for n in part.split(":") if part.strip() != "..."]
+        keys.append(slice(*numbers) if len(numbers) > 1 else numbers[0] if numbers else ...)
+    return tuple(keys) if len(keys) > 1 else keys[0]
 
 
-def _follow(thing: Any, path: str) -> Any:
-    for step in path.split("."):
-        thing = thing[int(step)] if step.isdecimal() else getattr(thing, step)
-        thing = thing() if callable(thing) else thing
-    several = isinstance(thing, (list, tuple))
-    return [getattr(x, "id", x) for x in thing] if several else getattr(thing, "id", thing)
+Compare: TypeAlias = Callable[[Source, str], object]  # of a file or case, and what it is called
 
 
 def read_arrays(path: Path, report: Report, name: str = "") -> Source:
@@ -187,8 +195,10 @@ def read_table(path: Path, report: Report) -> Source:
 
 
 def read_fields(path: Path, report: Report, name: str = "") -> Source:
-    """The fields of a `.json` that holds one object; `name` is another name for it."""
-    return Source(name or path.stem, "field", read_json(path), report)
+    """The fields of a `.json`, a list as the field `rows`; `name` is another name for it."""
+    content = read_json(path)
+    fields = {"rows": content} if isinstance(content, list) else content
+    return Source(name or path.stem, "field", fields, report)
 
 
 def read_json(path: Path) -> Any:
@@ -225,6 +235,10 @@ class Groups(dict[tuple[str, ...], Source]):
         self._asked.add(key)
         return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
+    def of_mode(self, mode: str | None) -> list[tuple[str, ...]]:
+        """Keys of the runs of one mode, or all."""
+        return [key for key in self if mode is None or mode in key]
+
     def match(
         self,
         key: tuple[str, ...],
@@ -243,8 +257,8 @@ class Groups(dict[tuple[str, ...], Source]):
 
     def finish(self, mode: str | None = None) -> None:
         """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
-        for key in self:
-            if key not in self._asked and (mode is None or mode in key):
+        for key in self.of_mode(mode):
+            if key not in self._asked:
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
         if self._asked & set(self):
             self.table.finish()
@@ -253,23 +267,38 @@ class Groups(dict[tuple[str, ...], Source]):
 def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
     """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`."""
     paths = {name: folder / f"{name}.parquet" for name in names}
-    known = ("key", "atol")
-    return {
-        name: Groups(path, report, **{k: v for k, v in COMPARED[path.name].items() if k in known})
-        for name, path in paths.items()
-    }
+    return {name: Groups(path, report, **COMPARED[path.name]) for name, path in paths.items()}
+
+
+def verify_file(compare: Compare, path: Path, report: Report) -> None:
+    """`compare` the values of a file; those that it does not use are not covered.
+
+    The file is named without the number that its name may end with.
+    """
+    read = {".npz": read_arrays, ".parquet": read_table}.get(path.suffix, read_fields)
+    file = replace(read(path, report), name=re.sub(r"_\d+$", "", path.stem))
+    compare(file, path.stem)
+    if file.what != "column" or file.num_rows:
+        file.finish()
 
 
 def verify_files(
-    folder: Path, report: Report, parts: Mapping[str, Callable[[Path], object] | None]
+    folder: Path,
+    report: Report,
+    parts: Mapping[str, Callable[[Path], object] | None],
+    files: Mapping[str, Compare] | None = None,
 ) -> None:
     """Give every file of a folder to the part whose pattern is the first to match its name.
 
     A part compares such a file or sub-folder, and what it raises is a mismatch; it is None where
-    nothing need be compared. A file that no pattern matches is not covered, but for `README*`.
+    nothing need be compared. `files` are parts that compare the values of a file. A file that no
+    pattern matches is not covered, but for `README*`.
     """
+    known = dict(parts)
+    for pattern, compare in (files or {}).items():
+        known[pattern] = partial(verify_file, compare, report=report)
     for path in sorted(folder.iterdir()):
-        found = [part for pattern, part in parts.items() if fnmatch(path.name, pattern)]
+        found = [part for pattern, part in known.items() if fnmatch(path.name, pattern)]
         if found and (part := found[0]):
             with report.attempt(path.stem, path.name):
                 part(path)

@@ -1,20 +1,18 @@
 """Worlds in plain JSON, scored by the official metric classes: the metrics without any importer."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import DataError
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.files import COMPARED, TOLERANCE, Source, read_fields, verify_files
+from shiftsim.verify.files import COMPARED, Source, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import ego_states, make_scenario, read_map, read_objects, recorded_log
+from shiftsim.verify.worlds import ego_states, read_map, read_scenario, recorded_log
 from shiftsim.world.map import VectorMap
 
 SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
@@ -23,7 +21,7 @@ TABLES = read_tables(__file__)
 
 def verify_metric_worlds(folder: Path, report: Report) -> None:
     """Compare every world of the folder, under both threshold profiles."""
-    verify_files(folder, report, {"*.json": partial(_verify_world, report)})
+    verify_files(folder, report, {}, {"*.json": _compare})
 
 
 def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
@@ -33,23 +31,16 @@ def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
 
 def _read(world: Source) -> tuple[SimulationLog, VectorMap]:
     road = read_map(world.each("map")[0], "incoming")
-    time_us = np.array(world["time_us"], np.int64)
     ego, expert = (
         ego_states(dict(zip(world["state_columns"], np.transpose(world[name]), strict=True)))
         for name in ("ego", "expert")
     )
-    things = world.each("objects")
-    if len(time_us) != len(expert) or any(len(o["frames"]) != len(time_us) for o in things):
-        raise DataError(f"{len(time_us)} time stamps, other numbers of expert states or of frames")
-    token = f"world {world.values.get('world')}"
-    tracks = read_objects(things, len(time_us))
-    return recorded_log(make_scenario(token, road, time_us, expert, tracks), ego), road
+    return recorded_log(read_scenario(world, road, expert), ego), road
 
 
-def _verify_world(report: Report, path: Path) -> None:
-    world, where = read_fields(path, report, "metric_world"), path.stem
+def _compare(world: Source, where: str) -> None:
+    report, (log, road) = world.report, _read(world)
     world.note("label", "world", "kind")
-    log, road = _read(world)
     # a connector lies in a roadblock connector, a lane in a roadblock
     kinds = road.block_of >= road.num_roadblocks
     is_connector = np.arange(len(road.edges)) >= road.num_lanes
@@ -60,16 +51,22 @@ def _verify_world(report: Report, path: Path) -> None:
         scores.match(f"{where} {name}", known_scores(result), SCORE_TOLERANCES, quantity="score")
     order = list(BOUNDED_SIGNALS.values())
     expected.match(where, {"comfort_flag_order": order}, quantity="")
-    series = expected.each("series")[0]
-    TABLES["series"].match(series, where, **_series(measured, result, road))
-    progress = series.each("progress_statistics")[0]
-    progress.match(where, _progress(result), TOLERANCE, quantity="progress_statistics")
-    contacts, found = series.each("collisions"), measured.collisions
-    report.compare("number of collisions", where, len(found), len(contacts))
-    for ours, theirs in zip(found, contacts, strict=False):
-        kind = f"{ours.collision_type.upper()}_COLLISION"
-        TABLES["collisions"].match(theirs, f"{where} {ours.token}", contact=ours, kind=kind)
-    world.finish()
+    series, found = expected.each("series")[0], found_along(measured, road)
+    names = {
+        **{"result": result, "counts": at_fault_counts(measured.collisions)},
+        "inside": ~measured.drivable.outside.any(axis=1),
+        "ttc": np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values),
+        "flags": within_bounds(measured.comfort, NUPLAN),
+        "deepplan": within_bounds(measured.comfort, DEEPPLAN),
+        "statistics": {one.name: one.value for one in result.statistics},
+    }
+    TABLES["series"].match(series, where, **found, **names)
+    TABLES["progress"].match(series.each("progress_statistics")[0], where, **names)
+    contacts = series.each("collisions")
+    report.compare("number of collisions", where, len(found["types"]), len(contacts))
+    ours = zip(measured.collisions, found["types"], contacts, strict=False)
+    for contact, kind, theirs in ours:
+        TABLES["collisions"].match(theirs, f"{where} {contact.token}", contact=contact, kind=kind)
 
 
 def known_scores(result: MetricResult) -> dict[str, float]:
@@ -78,23 +75,12 @@ def known_scores(result: MetricResult) -> dict[str, float]:
     return {name: score for name, score in scores.items() if score is not None}
 
 
-def _progress(result: MetricResult) -> dict[str, float]:
-    ends = "_total_progress_along_route", "_expert_progress_along_route_ratio"
-    return {s.name: s.value for s in result.statistics if s.name.endswith(ends)}
-
-
-def _series(measured: Measurements, result: MetricResult, road: VectorMap) -> dict[str, Any]:
-    """What `metric_worlds.toml` speaks of."""
-    samples, corners, ttc = range(len(measured.time_us)), measured.corners, measured.ttc.values
+def found_along(measured: Measurements, road: VectorMap) -> dict[str, Any]:
+    """What tables say of the way of a rollout: roadblocks at every sample, and collisions."""
+    samples, corners = range(len(measured.time_us)), measured.corners
     return {
-        **{"measured": measured, "result": result},
+        "measured": measured,
         "route": [measured.route.ids(road, i) for i in samples],
         "corners": [[corners.ids(road, i, corner) for corner in range(4)] for i in samples],
-        "common": measured.is_common.astype(np.int64),
-        "inside": (~measured.drivable.outside.any(axis=1)).astype(np.int64),
-        "at_fault": np.array(measured.at_fault_times, np.int64),
-        "counts": at_fault_counts(measured.collisions),
-        "ttc": np.where(np.isinf(ttc), np.nan, ttc),
-        "flags": within_bounds(measured.comfort, NUPLAN),
-        "deepplan": within_bounds(measured.comfort, DEEPPLAN),
+        "types": [f"{one.collision_type.upper()}_COLLISION" for one in measured.collisions],
     }

@@ -155,7 +155,4 @@ def _array(value: Any) -> np.ndarray[Any, Any]:
     try:
         return np.asarray(value)
     except ValueError:  # lists of several lengths
-        out = np.empty(len(value), np.object_)
-        for index, item in enumerate(value):
-            out[index] = item
-        return out
+        return np.fromiter(value, np.object_, len(value))

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from shiftsim.data.nuplan.mapping import Mapping as LogMapping
 from shiftsim.data.nuplan.scenarios import find_maps, load_map, read_scenario
 from shiftsim.errors import DataError
-from shiftsim.verify.files import read_json
+from shiftsim.verify.files import Source, read_json
+from shiftsim.verify.report import Report
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -20,18 +20,15 @@ class Scenes(Mapping[str, Scenario]):
 
     Attributes:
         folder: Holds `scenes.json`, `logs` and `maps`; without `scenes.json` there are no scenes.
-        entries: What `scenes.json` says, by scene name.
+        entries: What `scenes.json` says, by scene name; `report` takes what is compared with it.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.entries: dict[str, dict[str, Any]] = {}
+    def __init__(self, folder: Path, report: Report | None = None) -> None:
+        path, used = folder / "scenes.json", report or Report()
+        listed = read_json(path) if path.is_file() else []
+        entries = [Source("scenes.json", "field", entry, used) for entry in listed]
+        self.folder, self.entries = folder, {entry["scene"]: entry for entry in entries}
         self._read: dict[str, Scenario] = {}
-        path = folder / "scenes.json"
-        for entry in read_json(path) if path.is_file() else []:
-            if missing := {"scene", "db", "map", "token"} - set(entry):
-                raise DataError(f"{path}: a scene has no {min(missing)!r}")
-            self.entries[entry["scene"]] = entry
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)

@@ -1,16 +1,23 @@
 """Tables of what is compared with what: a TOML file beside the module that makes our side.
 
 A section has a row for every value of a reference: its name there, and where ours is, as a path
-among the names that the module hands over. A row with its own tolerance is a list; the row `"*"`
-says what holds for the others, and how the report calls the section.
+among the names that the module hands over: through attributes, items and results of methods. A row
+with its own tolerance is a list; the row `"*"` says what holds for the others, and how the report
+calls the section; it may also name `angles` and `unordered` values (`Source.match`).
 
     [routes]                                        # a case of routes.json
     "*" = { called = "PDM", atol = 1e-9, optional = false }
     start_block = "blocks of route.start.block"     # ids in a layer of the map `road`, or `tracks`
+    type = "contacts[*].kind"                       # of every one
+    incoming = "ids of lane.incoming_edges"         # of objects behind nuPlan's map interface
+    route = "text of route"                         # `,` between the words of every item
     n_centerline = "number of line"
     centerline_last = ["line[-1, :2]", 1e-6]        # m
     poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
+    "ends[..., :2]" = "line[-2:, :2]"               # a part of a value
     score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
+    x = ["line.x", "gap"]                           # what the module calls `gap`
+    roads = "counts[road with trams]"               # an item by name
     planner = "= PDM-Closed *"                      # a text, which may go on in any way
     samples = 41                                    # a number
 """
@@ -18,12 +25,15 @@ says what holds for the others, and how the report calls the section.
 import re
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from inspect import ismethod
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.verify.files import EXACT, Source, read_arrays, read_json
+from shiftsim.errors import DataError
+from shiftsim.verify.files import EXACT, Source, read_arrays, read_index, read_json
 from shiftsim.verify.report import Report
 from shiftsim.world.scenario import Scenario
 
@@ -36,6 +46,7 @@ class Table:
     def __init__(self, rows: Mapping[str, Row]) -> None:
         self.about = {"called": None, "atol": EXACT, "optional": False, **rows.get("*", {})}
         self.rows = {name: row for name, row in rows.items() if name != "*"}
+        self._kinds = {kind: self.about.get(kind, ()) for kind in ("angles", "unordered")}
 
     def match(self, theirs: Source, where: str, called: str = "", /, **names: Any) -> bool:
         """Compare ours with the values of all rows; whether all agree."""
@@ -43,15 +54,30 @@ class Table:
         for name, row in self.rows.items():
             if name in theirs or not self.about["optional"]:
                 path, atol = row if isinstance(row, list) else (row, self.about["atol"])
+                atol = names[atol] if isinstance(atol, str) else atol
                 bounds[name] = atol[names["variant"]] if isinstance(atol, dict) else atol
                 ours[name] = _find(path, names, theirs.values.get(name))
-        return theirs.match(where, ours, bounds, quantity=called or self.about["called"])
+        called = called or self.about["called"]
+        return theirs.match(where, ours, bounds, quantity=called, **self._kinds)
 
 
-def read_tables(module: str) -> dict[str, Table]:
-    """The sections of the file beside a module, given by the path of the module."""
-    content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
-    return {name: Table(rows) for name, rows in content.items()}
+def read_tables(*modules: str) -> dict[str, Table]:
+    """The sections of the files beside modules, given by their paths; later ones add rows."""
+    sections: dict[str, Any] = {}
+    for module in modules:
+        content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
+        sections = _joined(sections, content)
+    return {name: Table(rows) for name, rows in sections.items()}
+
+
+def _joined(rows: Mapping[str, Row], more: Mapping[str, Row]) -> dict[str, Row]:
+    """Rows and further ones, also within a row that is rows by name."""
+    inner = {
+        name: _joined(rows[name], more[name])
+        for name in more
+        if isinstance(more[name], dict) and name in rows
+    }
+    return {**rows, **more, **inner}
 
 
 def verify_cases(
@@ -85,8 +111,29 @@ def _read_cases(path: Path, report: Report) -> list[Source]:
     if next(iter(file))[0].isdigit():
         numbers = sorted({int(name.split("_")[0]) for name in file})
         return [file.below(f"{number}_") for number in numbers]
+    return rows_of(file)
+
+
+def rows_of(file: Source) -> list[Source]:
+    """The rows of all arrays as parts, as many as those have that nothing has used yet.
+
+    `<prefix>_ptr` says which rows of the arrays `<prefix>_…` belong together: from a number in it
+    to the next one. A `DataError` if these are not all rows.
+    """
+    arrays, counted = dict(file.values), file.values.keys() - file.used
+    for ends in [name for name in arrays if name.endswith("_ptr")]:
+        begins = file.take(ends, -1)
+        for name in arrays:
+            if name.startswith(ends.removesuffix("ptr")) and name != ends:
+                size = len(arrays[name])
+                if begins[0] or begins[-1] != size or (np.diff(begins) < 0).any():
+                    where = f"which are not those of {len(begins) - 1} cases"
+                    raise DataError(f"{file.name}: array {name!r} has {size} rows, {where}")
+                arrays[name] = np.split(arrays[name], begins[1:-1])
+        arrays[ends] = begins[:-1]
     # a shorter array fails where it is read; one that nothing reads is named as such
-    return [file.at(row) for row in range(max(map(len, file.values.values())))]
+    count = max(len(arrays[name]) for name in counted)
+    return [replace(file, values=arrays, rows=row) for row in range(count)]
 
 
 def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
@@ -101,22 +148,32 @@ def _find(row: Row, names: Mapping[str, Any], theirs: Any = None) -> Any:
         is_open = text.endswith("*") and isinstance(theirs, str)
         return theirs if is_open and theirs.startswith(text[:-1]) else text
     kind, _, path = row.rpartition(" of ")
-    value: Any = names
-    for name, index in re.findall(r"(\w+)|\[(.*?)\]", path):
-        if index:
-            value = value[_index(index)]
-        else:
-            value = value[name] if isinstance(value, Mapping) else getattr(value, name)
+    value = _follow(names, path)
     if kind == "number":
         return len(value)
+    if kind == "text":
+        return [",".join(words) for words in value]
+    if kind == "ids":
+        ids = [getattr(thing, "id", None) for thing in (value if np.iterable(value) else [value])]
+        return ids if np.iterable(value) else ids[0]
     if not kind:
         return value
-    ids = names["tracks"].tokens if kind == "tracks" else getattr(names["road"], kind).ids
-    return [ids[i] for i in value] if np.ndim(value) else ids[value]
+    known = names["tracks"].tokens if kind == "tracks" else getattr(names["road"], kind).ids
+    return [known[i] for i in value] if np.ndim(value) else known[value]
 
 
-def _index(text: str) -> Any:
-    """The index that `-1` or `:, 0` stands for."""
-    parts = [[int(n) if n.strip() else None for n in part.split(":")] for part in text.split(",")]
-    keys = tuple(slice(*part) if len(part) > 1 else part[0] for part in parts)
-    return keys if len(keys) > 1 else keys[0]
+def _follow(names: Mapping[str, Any], path: str) -> Any:
+    """What a path leads to; behind `[*]` a list of what it leads to from every one."""
+    found: list[Any] = [names]
+    for name, index in re.findall(r"(\w+)|\[(.*?)\]", path):
+        if index == "*":
+            found = [inner for thing in found for inner in thing]
+        else:
+            found = [thing[read_index(index)] if index else _member(thing, name) for thing in found]
+    return found if "[*]" in path else found[0]
+
+
+def _member(thing: Any, name: str) -> Any:
+    """An item of a mapping, an attribute, or what a method returns."""
+    value = thing[name] if isinstance(thing, Mapping) else getattr(thing, name)
+    return value() if ismethod(value) else value

@@ -81,25 +81,13 @@ def make_tracks(
     )
 
 
-def read_objects(objects: Sequence[Source], count: int) -> Tracks:
-    """Tracks of objects that list x, y, heading, vx, vy per frame, of which `count` are read."""
-    values = np.full((count, len(objects), 7), np.nan)
-    for column, thing in enumerate(objects):
-        for row, frame in enumerate(thing["frames"][:count]):
-            if frame is not None:
-                values[row, column] = [*frame, thing["length"], thing["width"]]
-    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
-    return make_tracks(values.shape[:2], ..., values, kinds, tokens)
-
-
-def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None = None) -> VectorMap:
+def read_map(world: Source, *fields: str) -> VectorMap:
     """The map of a world; `DataError` if an id names nothing.
 
-    The world holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`; its edges
-    also hold the `fields`, named as in `EdgeSpec`. `stop_lines` are polygons by id.
+    The world holds `edges` and `intersections`, perhaps `roadblocks` and `drivable_area`, perhaps
+    `stop_lines`; its edges also hold the `fields`, named as in `EdgeSpec`.
     """
-    blocks = world["roadblocks"] if "roadblocks" in world else {}
-
+    blocks, stops = (world[n] if n in world else {} for n in ("roadblocks", "stop_lines"))
     road = build_map(
         "world",
         edges=[
@@ -113,16 +101,12 @@ def read_map(world: Source, *fields: str, stop_lines: Mapping[str, Any] | None =
             for edge in world.each("edges")
         ],
         blocks=[
-            BlockSpec(
-                id=name,
-                is_connector=_IS_CONNECTOR[block["kind"]],
-                polygon=shapely.Polygon(block["polygon"]),
-            )
+            BlockSpec(name, _IS_CONNECTOR[block["kind"]], shapely.Polygon(block["polygon"]))
             for name, block in blocks.items()
         ],
         intersections=_areas(enumerate(world["intersections"])),
         drivable_areas=_areas(enumerate(world["drivable_area"])) if blocks else (),
-        stop_polygons=_areas((stop_lines or {}).items()),
+        stop_polygons=_areas(stops.items()),
     )
     # an edge of a map without blocks is in none
     lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
@@ -155,6 +139,26 @@ def make_scenario(
         mission_goal=None,
         mapping=(10.0, 0.0, 1.0),
     )
+
+
+def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
+    """The scenario of a world from its map and its ego states (T, 11).
+
+    The world also holds `time_us` and `objects`, which list x, y, heading, vx, vy per frame.
+    """
+    time_us = np.array(world["time_us"], np.int64)
+    objects = sorted(world.each("objects"), key=lambda thing: AgentKind[thing["type"].upper()])
+    counts = {len(ego), *(len(thing["frames"]) for thing in objects)}
+    if counts != {len(time_us)}:
+        raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
+    values = np.full((len(time_us), len(objects), 7), np.nan)
+    for column, thing in enumerate(objects):
+        for row, frame in enumerate(thing["frames"]):
+            if frame is not None:
+                values[row, column] = [*frame, thing["length"], thing["width"]]
+    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
+    tracks = make_tracks(values.shape[:2], ..., values, kinds, tokens)
+    return make_scenario(f"world {world.values.get('world')}", road, time_us, ego, tracks)
 
 
 def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:

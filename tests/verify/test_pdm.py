@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify import verify
+from shiftsim.verify.calls import verify_routes
 from shiftsim.verify.pdm.kernels import verify_kernels
-from shiftsim.verify.pdm.loops import verify_calls
-from shiftsim.verify.pdm.routes import verify_routes
+from shiftsim.verify.pdm.steps import verify_calls
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 
@@ -55,7 +55,7 @@ def test_every_kernel_and_step_is_equal(scenes):
     report = check_kernels(GOLDEN, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
-    assert report.quantities["PDM choice"].cases == 5
+    assert report.quantities["PDM best"].cases == 5
     assert report.quantities["tracker_sim simulated_states"].cases == 2
     assert report.quantities["lane_dijkstra path"].cases == 30
 
@@ -71,7 +71,7 @@ def test_every_recorded_call_is_made_alike(scenes):
     report = check_calls(GOLDEN, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
-    assert report.quantities["PDM choice"].cases == 8
+    assert report.quantities["PDM best"].cases == 8
 
 
 def test_the_folder_is_recognised_and_names_what_it_cannot_compare(folder):

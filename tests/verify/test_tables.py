@@ -10,13 +10,22 @@ from shiftsim.verify.files import Source
 from shiftsim.verify.report import ERRORS, Report
 from shiftsim.verify.tables import Table, read_tables, verify_cases
 
+
+class Lane:
+    edges = (SimpleNamespace(id="E1", ends=[1, 2]), None)
+
+    def roadblock(self):
+        return SimpleNamespace(id="B7")
+
+
 ROAD = SimpleNamespace(blocks=SimpleNamespace(ids=["B0", "B1", "B2"]))
 NAMES = {
     "road": ROAD,
     "tracks": SimpleNamespace(tokens=("t0", "t1")),
     "step": SimpleNamespace(best=2, poses=np.arange(6.0).reshape(2, 3)),
-    "made": {"lanes": [4, 5, 6]},
+    "made": {"lanes": [4, 5, 6], "lanes in it": 3},
     "chosen": np.array([2, 0]),
+    "lane": Lane(),
 }
 
 
@@ -30,6 +39,7 @@ def compared(rows, theirs, **names):
     ("row", "value", "other"),
     [
         ("step.best", 2, 3),
+        ("made[lanes in it]", 3, 4),
         ("made.lanes", [4, 5, 6], [4, 5, 7]),
         ("step.poses[1, 2]", 5.0, 5.1),
         ("step.poses[-1]", [3.0, 4.0, 5.0], [3.0, 4.0, 5.1]),
@@ -38,6 +48,10 @@ def compared(rows, theirs, **names):
         ("blocks of step.best", "B2", "B1"),
         ("blocks of chosen", ["B2", "B0"], ["B0", "B2"]),
         ("tracks of made.lanes[:0]", [], ["t0"]),
+        ("lane.edges[:1][*].ends", [[1, 2]], [[1, 3]]),
+        ("lane.edges[:1][*].ends[*]", [1, 2], [2, 1]),
+        ("ids of lane.edges", ["E1", None], ["E1", "E2"]),
+        ("ids of lane.roadblock", "B7", "B8"),
         ("= planner {step.best}", "planner 2", "planner 3"),
         ("= planner *", "planner of somebody", "a planner"),
         ("= *", "anything", 7),
@@ -65,10 +79,50 @@ def test_a_tolerance_may_depend_on_the_variant():
     assert compared(rows, {"x": 1.01}, variant="drive").mismatches == []
 
 
+def test_a_tolerance_may_be_computed():
+    rows = {"x": ["step.poses[0]", "gap"]}
+    gap = np.array([0.1, 0.1, 0.0])
+    assert compared(rows, {"x": [0.05, 1.05, 2.0]}, gap=gap).mismatches == []
+    assert compared(rows, {"x": [0.05, 1.05, 2.05]}, gap=gap).mismatches
+
+
+def test_values_may_be_angles_and_lists_without_an_order():
+    rows = {
+        "*": {"angles": ["turn"], "unordered": ["lanes"], "atol": 1e-9},
+        "turn": "turn",
+        "lanes": "made.lanes",
+    }
+    theirs = {"turn": 0.5 - 2.0 * np.pi, "lanes": [6, 5, 4]}
+    assert compared(rows, theirs, turn=0.5).mismatches == []
+    assert len(compared(rows, theirs | {"lanes": [6, 5, 5]}, turn=0.6).mismatches) == 2
+
+
 def test_rows_of_an_optional_section_may_be_missing_and_not_differ():
     rows = {"*": {"optional": True, "called": "PDM"}, "x": "step.best", "y": "step.best"}
     report = compared(rows, {"y": 3})
     assert [line.split(":")[0] for line in report.mismatches] == ["PDM y"]
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("x[:, :2]", "step.poses[:, :2]"),
+        ("x[..., 2]", "step.poses[..., 2]"),
+        ("x[1]", "step.poses[1]"),
+    ],
+)
+def test_a_row_may_be_of_a_part_of_a_value(name, path):
+    theirs = np.arange(6.0).reshape(2, 3)
+    assert compared({name: path}, {"x": theirs}).mismatches == []
+    report = compared({name: path}, {"x": theirs + 1.0})
+    assert list(report.quantities) == [f"file {name}"]
+    assert len(report.mismatches) == 1
+    assert compared({name: path}, {}).mismatches
+
+
+def test_what_is_beside_the_compared_part_is_not_compared():
+    theirs = np.arange(6.0).reshape(2, 3) + np.array([0.0, 0.0, 1.0])
+    assert compared({"x[:, :2]": "step.poses[:, :2]"}, {"x": theirs}).mismatches == []
 
 
 def cases_of(path, compare):
@@ -103,6 +157,18 @@ def test_an_array_with_fewer_rows_is_a_mismatch_and_one_that_nothing_reads_is_na
     assert list(report.not_covered) == ["file: array 'more'"]
 
 
+def test_rows_between_two_numbers_of_a_pointer_are_one_case(tmp_path):
+    lines = np.arange(5.0)
+    np.savez(tmp_path / "file.npz", x=[1.0, 9.0], line_ptr=[0, 2, 5], line_x=lines)
+    report = cases_of(
+        tmp_path / "file.npz", lambda case, where: case.match(where, {"x": case["line_x"].sum()})
+    )
+    assert (report.num_cases, report.mismatches, report.not_covered) == (2, [], {})
+    np.savez(tmp_path / "file.npz", x=[1.0, 9.0], line_ptr=[0, 2, 4], line_x=lines)
+    with pytest.raises(ERRORS, match="has 5 rows, which are not those of 2 cases"):
+        cases_of(tmp_path / "file.npz", lambda case, where: None)
+
+
 def test_an_array_without_a_number_among_those_with_one_is_refused(tmp_path):
     np.savez(tmp_path / "file.npz", **{"0_x": [1], "y": [1]})
     with pytest.raises(ERRORS, match="invalid literal"):
@@ -123,3 +189,12 @@ def test_a_table_is_read_from_beside_the_module(tmp_path):
     tables = read_tables(str(tmp_path / "part.py"))
     assert tables["ends"].rows == {"a/b": "line[-1]"}
     assert tables["ends"].about["atol"] == 1e-9
+
+
+def test_a_later_table_adds_rows_and_replaces_those_of_the_same_name(tmp_path):
+    (tmp_path / "first.toml").write_text('[a]\n"*" = { atol = 1.0 }\nx = "p"\ny = { u = 1 }\n')
+    (tmp_path / "second.toml").write_text('[a]\nx = "q"\ny = { v = 2 }\n[b]\nz = "r"\n')
+    tables = read_tables(str(tmp_path / "first.py"), str(tmp_path / "second.py"))
+    assert tables["a"].rows == {"x": "q", "y": {"u": 1, "v": 2}}
+    assert tables["a"].about["atol"] == 1.0
+    assert tables["b"].rows == {"z": "r"}

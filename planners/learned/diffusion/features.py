@@ -84,19 +84,12 @@ class FeatureBuilder:
         road = self._road
         edges = lanes_around(road, self._lanes.bounds, anchor)
         route = self._corrector.at(anchor) if self._corrector else None
-        on_route = lanes_on_route(self._lanes.blocks[edges], route or ())
         agents, objects, chosen = agent_features(seen.history.tracks, anchor)
         lights = _LIGHT_COLUMN[self._lights.at(seen.lights)[edges]]
-        rows, limits, known = lane_features(self._lanes, edges, lights, anchor, LANES)
         return Features(
             neighbor_agents_past=agents,
             static_objects=objects,
-            lanes=rows,
-            lanes_speed_limit=limits,
-            lanes_has_speed_limit=known,
-            route_lanes=_first_rows(rows, on_route),
-            route_lanes_speed_limit=_first_rows(limits, on_route),
-            route_lanes_has_speed_limit=_first_rows(known, on_route),
+            **lane_inputs(self._lanes, edges, lights, anchor, route or ()),
             noise=noise,
             edges=edges,
             agents=chosen,
@@ -126,16 +119,32 @@ def lanes_on_route(blocks: IntArray, route: Sequence[int]) -> IntArray:
     return np.array(found[:ROUTE_LANES], np.int64)
 
 
-def lane_features(
-    lanes: kernels.LaneLines, edges: IntArray, lights: IntArray, anchor: FloatArray, count: int
-) -> tuple[Single, Single, BoolArray]:
-    """Rows (count, 20, 12), speed limits (count, 1) and whether known (count, 1)."""
+def lane_inputs(
+    lanes: kernels.LaneLines,
+    edges: IntArray,
+    lights: IntArray,
+    anchor: FloatArray,
+    route: Sequence[int],
+) -> dict[str, Any]:
+    """The fields of `Features` about lanes: of the chosen edges, and of those on a route (blocks).
+
+    `lights` has the one-hot position of the light of each chosen edge, `anchor` is as above.
+    """
     out = (
-        np.zeros((count, kernels.POINTS, kernels.LANE_COLUMNS), np.float32),
-        np.zeros((count, 1), np.float32),
-        np.zeros((count, 1), np.bool_),
+        np.zeros((LANES, kernels.POINTS, kernels.LANE_COLUMNS), np.float32),
+        np.zeros((LANES, 1), np.float32),
+        np.zeros((LANES, 1), np.bool_),
     )
     kernels.fill_lanes(lanes, edges, lights, anchor, out)
+    named = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), out, strict=True))
+    on_route = lanes_on_route(lanes.blocks[edges], route)
+    return {**named, **{f"route_{name}": _first_rows(named[name], on_route) for name in named}}
+
+
+def _first_rows(array: Any, rows: IntArray) -> Any:
+    """(25, ...) some rows of an array, then zeros."""
+    out = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
+    out[: len(rows)] = array[rows]
     return out
 
 
@@ -172,13 +181,6 @@ def _by_distance(chosen: BoolArray, poses: FloatArray, anchor: FloatArray) -> In
     tracks = np.flatnonzero(chosen)
     dx, dy = (poses[tracks, :2] - anchor[:2]).T
     return tracks[np.argsort(np.sqrt(dx * dx + dy * dy), kind="stable")]
-
-
-def _first_rows(array: Any, rows: IntArray) -> Any:
-    """(25, ...) some rows of an array, then zeros."""
-    out = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
-    out[: len(rows)] = array[rows]
-    return out
 
 
 def _plain(array: Any) -> Any:

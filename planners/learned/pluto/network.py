@@ -190,10 +190,8 @@ def _all_counts(seen: Inputs) -> list[list[int]]:
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
-    """The network, without weights; `args` is for tests: `misordered_masks`, as official."""
-    network = PlutoNetwork()
-    network.planning_decoder.misordered_masks = bool(args and args["misordered_masks"])
-    return network
+    """The network, without weights; there is one architecture, and no args belong to it."""
+    return PlutoNetwork()
 
 
 def drive_overrides(state: State) -> None:

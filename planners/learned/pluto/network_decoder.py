@@ -133,7 +133,7 @@ class PlanningDecoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.misordered_masks = False
+        self.misordered_masks = False  # for comparisons with the official network
         self.r_encoder = PointsEncoder(LINE_CHANNELS)
         self.r_pos_emb = FourierEmbedding(3)
         self.q_proj = Linear(2 * DIM, DIM)

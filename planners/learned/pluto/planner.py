@@ -141,8 +141,7 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
     def _choose(self, output: proposals.Output, observation: Observation) -> Choice:
-        scene, sight = self._scene, self.sight
-        assert scene is not None
+        sight = self.sight
         assert sight is not None
         ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         poses, learned = proposals.best_proposals(output, ego[:3])
@@ -151,24 +150,30 @@ class Pluto(LearnedPlanner[SceneInputs, proposals.Output]):
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
         motion = proposals.predicted_agents(output, local, *present, ego[:3])
         agents = world.Agents(*motion, tracks.sizes[-1, rows])
-        others = self.world_of(observation, agents)
+        return self.rate(observation, poses, learned, agents)
+
+    def rate(
+        self, observation: Observation, poses: FloatArray, learned: FloatArray, agents: world.Agents
+    ) -> Choice:
+        """The choice among proposals (P, 81, 3) of the last step, which was of this observation.
+
+        `learned` (P,) are their scores by the network.
+        """
+        scene, sight, route = self._scene, self.sight, self.route
+        assert scene is not None
+        assert sight is not None
+        assert route is not None
+        ego = observation.history.ego[-1].copy()
+        size = np.array([scene.vehicle.length, scene.vehicle.width])
+        footprint = boxes_to_corners(observation.ego.center, size)
+        lights = world.red_lights(scene.map, route, observation)
+        others = world.make_world(sight.static, agents, lights, footprint)
         place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
         scores = score(poses, learned, ego, others, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))
         braked = must_brake(speed, float(scores.fault_times[best]))
         return Choice(poses, learned, agents, scores, best, braked)
-
-    def world_of(self, observation: Observation, agents: world.Agents) -> world.World:
-        """What the proposals of the last step, of this observation, can collide with."""
-        scene, sight, route = self._scene, self.sight, self.route
-        assert scene is not None
-        assert sight is not None
-        assert route is not None
-        size = np.array([scene.vehicle.length, scene.vehicle.width])
-        footprint = boxes_to_corners(observation.ego.center, size)
-        lights = world.red_lights(scene.map, route, observation)
-        return world.make_world(sight.static, agents, lights, footprint)
 
 
 def _plan(poses: FloatArray, observation: Observation) -> Trajectory:

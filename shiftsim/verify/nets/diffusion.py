@@ -17,17 +17,17 @@ from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, DiffusionPlanner
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.loops import FEATURE, PLANS, POSITION, Loop, verify_loop
-from shiftsim.verify.nets.networks import make_network, match_case, match_meta, verify_manifest
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.nets import common
+from shiftsim.verify.nets.common import Loop, make_network, match_meta
+from shiftsim.verify.nuplan.metrics import tracks_of
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import make_tracks
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
 
 NAME, TABLES = DiffusionPlanner.name, read_tables(__file__)
 NORMALISED = 1e-6
-_TRACK_COLUMNS = ["track", "vx", "vy", "heading", "width", "length", "x", "y"]
+FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
+_TRACK_COLUMNS = ["track_token", "vx", "vy", "heading", "width", "length", "x", "y"]
 _STATIC = ("CZONE_SIGN", "BARRIER", "TRAFFIC_CONE", "GENERIC_OBJECT")
 
 
@@ -45,7 +45,7 @@ class KeyedPlanner(DiffusionPlanner):
         return replace(super().features(observation), noise=noise)
 
 
-def _verify_args(file: Source, scenes: Scenes) -> None:
+def _verify_args(file: Source) -> None:
     """The bundled settings must be those of the file; both normalisers too."""
     from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS
 
@@ -55,7 +55,7 @@ def _verify_args(file: Source, scenes: Scenes) -> None:
     file.match(file.name, ours, quantity=f"{NAME} args")
 
 
-def _verify_sampler(file: Source, scenes: Scenes) -> None:
+def _verify_sampler(file: Source) -> None:
     from shiftsim.planners.learned.diffusion.network import sampler
 
     numbers = np.arange(sampler.STEPS) + 1
@@ -67,7 +67,7 @@ def _verify_sampler(file: Source, scenes: Scenes) -> None:
     TABLES["steps"].match(listed, file.name, f"{NAME} sampler", **names)
 
 
-def _verify_forward(file: Source, scenes: Scenes) -> None:
+def _verify_forward(file: Source) -> None:
     """The network on stored inputs, and all calls of the sampler by variant of the weights."""
     import torch
 
@@ -75,21 +75,22 @@ def _verify_forward(file: Source, scenes: Scenes) -> None:
     limits = ("lanes_speed_limit", "route_lanes_speed_limit")  # that of the route is read by nobody
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
-    with torch.inference_mode():
-        inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
-        network = make_network(NAME, "base")
-        scene = network.normalise(inputs)
-        normalised = {name: scene[name] for name in network.normalisers}
-        file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
-        encoding, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
-        encoded = {"encoding": encoding, "route": route}
-        TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
-        for variant in match_case(file, NAME):
-            stored = file.below(f"out.{variant}.")
-            says = _sampled(variant, scene, inputs, given["noise"])
-            for table in ("sampled", "guided"):
-                where = f"{file.name} {variant}"
-                TABLES[table].match(stored, where, NAME, variant=variant, **says)
+    inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
+    network = make_network(NAME, "base")
+    scene = network.normalise(inputs)
+    normalised = {name: scene[name] for name in network.normalisers}
+    file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
+    route = network.dit[0].route_encoder(scene["route_lanes"])
+    encoded = {"encoding": network.encode(scene), "route": route}
+    TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
+    for variant in common.match_case(file, NAME):
+        says, stored = (
+            _sampled(variant, scene, inputs, given["noise"]),
+            file.below(f"out.{variant}."),
+        )
+        for section in ("sampled", "guided"):
+            where = f"{file.name} {variant}"
+            TABLES[section].match(stored, where, NAME, variant=variant, **says)
 
 
 def _sampled(
@@ -121,22 +122,18 @@ def _sampled(
 
 def _compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
-    import torch
-
-    loop.match(TABLES["iteration"], loop.row)
-    loop.compare_plan(POSITION)
+    loop.match("iteration", loop.row)
     if list(loop.stored):
-        loop.match(TABLES["stored"], loop.stored, route=loop.features.route or ())
-        if "encoding" in loop.stored:
-            with torch.inference_mode():
-                network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
-                encoding = network.encode(network.normalise(inputs))[0]
-            loop.match(TABLES["encoding"], loop.stored, encoding=encoding)
+        loop.match("stored", loop.stored, route=loop.features.route or ())
+    if "encoding" in loop.stored:
+        network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
+        encoding = network.encode(network.normalise(inputs))[0]
+        loop.match("encoding", loop.stored, encoding=encoding)
 
 
-def _verify_agents(file: Source, scenes: Scenes) -> None:
+def _verify_agents(file: Source) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
-    match_meta(file, NAME, {"frame_columns": _TRACK_COLUMNS})
+    match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
     if f"in.frame{kernels.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
     made = builder.agent_features(_tracks(file), file.take("in.anchor", 3))
@@ -147,25 +144,26 @@ def _verify_agents(file: Source, scenes: Scenes) -> None:
 def _tracks(file: Source) -> Tracks:
     """The frames as tracks, in the order of the last frame; static objects after them."""
     names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
-    frames = [file.take(name, -1, len(_TRACK_COLUMNS)) for name in names]
-    static, kinds = file.take("in.static", -1, 5), dict[float, int]()
-    for name, frame in zip(names[::-1], frames[::-1], strict=True):
-        for track, kind in zip(frame[:, 0].tolist(), file[f"{name}_type"].tolist(), strict=True):
-            if kinds.setdefault(track, kind) != kind:
-                raise DataError("a track changes its type")
-    column = {track: index for index, track in enumerate(kinds)}
-    values = np.full((len(frames), len(kinds) + len(static), 7), np.nan)
-    for row, frame in zip(values, frames, strict=True):
-        row[[column[track] for track in frame[:, 0].tolist()]] = frame[:, [6, 7, 3, 1, 2, 5, 4]]
-    values[-1, len(kinds) :][:, [0, 1, 2, 6, 5]] = static
-    types = file.take("in.static_type", len(static)).tolist()
-    words = [*(AgentKind(kind).name for kind in kinds.values()), *(_STATIC[t] for t in types)]
-    return make_tracks(values.shape[:2], ..., values, words, tuple(map(str, range(len(words)))))
+    last = len(names) - 1
+    rows = [
+        (row, AgentKind(kind).name, *values)
+        for row in range(last, -1, -1)
+        for kind, values in zip(file[f"{names[row]}_type"], file[names[row]].tolist(), strict=True)
+    ]
+    static = zip(file["in.static_type"], file["in.static"].tolist(), strict=True)
+    rows += [
+        (last, _STATIC[kind], f"static {number}", np.nan, np.nan, heading, width, length, x, y)
+        for number, (kind, (x, y, heading, width, length)) in enumerate(static)
+    ]
+    columns = zip(
+        ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True)), strict=True
+    )
+    return tracks_of(Source(file.name, "column", dict(columns), file.report), last + 1)
 
 
-def _verify_lanes(file: Source, scenes: Scenes) -> None:
+def _verify_lanes(file: Source) -> None:
     """Which lanes and route lanes are kept where there are too many, and their rows."""
-    match_meta(file, NAME, {"light": "green, yellow, red, unknown"})
+    match_meta(file, NAME, light="green, yellow, red, unknown")
     anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
     lines, left, right = (_lines(file, n) for n in ("lane", "left_boundary", "right_boundary"))
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
@@ -180,13 +178,8 @@ def _verify_lanes(file: Source, scenes: Scenes) -> None:
     lights = file.take("in.light", len(owner), 4)
     once = np.ones(len(owner), np.int64)
     file.report.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
-    made = builder.lane_features(lanes, edges, lights.argmax(axis=1)[edges], anchor, builder.LANES)
     route = [index.get(name, -1) for name in file["in.route"].tolist()]
-    on_route = builder.lanes_on_route(lanes.blocks[edges], route)
-    ours = dict(zip(("lanes", "lanes_speed_limit", "lanes_has_speed_limit"), made, strict=True))
-    for name, array in list(ours.items()):
-        ours[f"route_{name}"] = np.zeros((builder.ROUTE_LANES, *array.shape[1:]), array.dtype)
-        ours[f"route_{name}"][: len(on_route)] = array[on_route]
+    ours = builder.lane_inputs(lanes, edges, lights.argmax(axis=1)[edges], anchor, route)
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
 
 
@@ -200,9 +193,9 @@ def _lines(file: Source, name: str) -> Polylines:
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(verify_manifest, NAME, TABLES),
+    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
     "forward_*.npz": _verify_forward,
-    "closed_loop_*.npz": partial(verify_loop, KeyedPlanner, _compare, (*PLANS, "ego_prediction")),
+    "closed_loop_*.npz": partial(common.verify_loop, KeyedPlanner, TABLES, _compare),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,
 }

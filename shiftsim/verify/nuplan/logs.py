@@ -17,7 +17,6 @@ from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import ego_columns, object_columns
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LightStatus
 
 LOG_TOLERANCES: dict[str, float] = COMPARED["log_ego.parquet"]["atol"]
 POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
@@ -34,16 +33,14 @@ _ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples 
 
 def verify_nuplan_import(folder: Path, report: Report) -> None:
     """Compare maps, logged ego states, objects, lights and scene facts with the official ones."""
-    scenes, expected = Scenes(folder), folder / "expected"
+    scenes, expected = Scenes(folder, report), folder / "expected"
     verify_maps(expected, scenes.maps, report)
     tables = open_tables(expected, report, "log_ego", "objects", "traffic_lights")
     ego, objects, lights = tables.values()
     scripts = open_tables(folder, report, "scripted")["scripted"]
-    listed = [Source("scenes.json", "field", entry, report) for entry in scenes.entries.values()]
     path = expected / "scenario_meta.json"
     meta = Source("scenario_meta.json", "scene", read_json(path), report)
-    for entry in listed:
-        name = entry["scene"]
+    for name, entry in scenes.entries.items():
         with report.attempt("importer", name), open_log(folder / entry["db"]) as log:
             scene = scenes[name]
             names = _facts(scene, log)
@@ -64,9 +61,10 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
             lights.match((name,), light_columns(scene))
     ego.finish()
     lights.finish()
-    for source in (meta, *listed):
+    for source in (meta, *scenes.entries.values()):
         source.finish()
-    read_here = {*expected.iterdir(), *(folder / entry["db"] for entry in listed)}
+    logs = (folder / entry["db"] for entry in scenes.entries.values())
+    read_here = {*expected.iterdir(), *logs}
     read_here |= {folder / name for name in ("scenes.json", "scripted.parquet", "RESULTS.md")}
     name_rest(folder, read_here, report)
     report.note("RESULTS.md (for reading; repeats scores.parquet)")
@@ -123,12 +121,11 @@ def _objects(scene: Scenario, log: Log) -> dict[str, Any]:
 
 def light_columns(scene: Scenario) -> dict[str, Any]:
     """Lights of every sample that are listed."""
-    sampled, lights = scene.iteration_rows[:-1], scene.traffic_lights
-    iteration, connector = np.nonzero(lights.status[sampled] != LightStatus.ABSENT)
-    status = lights.status[sampled][iteration, connector]
+    rows, lights = scene.iteration_rows[:-1].tolist(), scene.traffic_lights
+    listed = [(i, *light) for i, row in enumerate(rows) for light in lights.listed(row)]
     return {
-        "iteration": iteration,
-        "lane_connector_id": [int(lights.connector_ids[index]) for index in connector],
-        "status": [LightStatus(code).name for code in status.tolist()],
-        "timestamp": scene.time_us[sampled][iteration],
+        "iteration": [i for i, _, _ in listed],
+        "lane_connector_id": [int(name) for _, name, _ in listed],
+        "status": [status.name for _, _, status in listed],
+        "timestamp": [int(scene.time_us[rows[i]]) for i, _, _ in listed],
     }

@@ -2,27 +2,26 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import Measurements, MetricResult, judge, measure
+from shiftsim.metrics import MetricResult, judge, measure
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify import worlds
 from shiftsim.verify.files import COMPARED, EXACT, Groups, Source, open_tables
-from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
+from shiftsim.verify.metric_worlds import SCORE_TOLERANCES, found_along
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.tables import read_tables
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, Tracks
 
+TABLES = read_tables(__file__)
 PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
-RECORDED = COMPARED["ego.parquet"]["recorded"]
 # how the devkit files each metric, and the units of scores that have one
-CATEGORIES, UNITS = (COMPARED["metrics.parquet"][what] for what in ("category", "unit"))
-_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
-_CORNERS = ("front_left", "rear_left", "rear_right", "front_right")
+RECORDED, CATEGORIES, UNITS = (COMPARED[what] for what in ("recorded", "category", "unit"))
+RUN_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 
 
 def verify_nuplan_metrics(
@@ -37,26 +36,27 @@ def verify_nuplan_metrics(
 
     `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
-    tables = open_tables(expected, report, *_TABLES)
+    tables = open_tables(expected, report, *RUN_TABLES)
     replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
     experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
     tables["objects"].table.note("no metric reads it", "height")
-    for run in tables["ego"]:
+    for run in tables["ego"].of_mode(mode):
         scene, challenge, _ = run
-        if mode not in (None, challenge):
-            continue
         with report.attempt("recorded rollout", " ".join(run)):
             entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
-            is_reactive = challenge == "R"
-            objects = tables["objects"][run] if is_reactive else replayed[scene, "NR", "*"]
-            log = _rollout(tables["ego"][run], experts[scene, "iteration"], objects, road)
+            seen = tables["objects"][run] if challenge == "R" else replayed[scene, "NR", "*"]
+            log = _rollout(tables["ego"][run], experts[scene, "iteration"], seen, road)
             times = log.expert_time_us[: len(log.ego)]
             columns = {"iteration": np.arange(len(times)), "time_us": times}
             columns |= {name: worlds.ego_columns(log.ego)[name] for name in RECORDED}
             tables["ego"].match(run, columns, RECORDED, quantity="recorded")
             measured = measure(log, road)
-            tables["route"].match(run, _route(measured, road))
-            tables["collisions"].match(run, _collisions(measured))
+            contacts, names = measured.collisions, found_along(measured, road)
+            names["samples"] = np.arange(len(measured.time_us))
+            names["kinds"] = [AgentKind(one.kind).name for one in contacts]
+            names["is_time"] = [one.time_us in measured.at_fault_times for one in contacts]
+            for name, rows in TABLES.items():
+                rows.match(tables[name][run], " ".join(run), **names)
             for thresholds, profile in PROFILES.items():
                 result = judge(measured, profile)
                 _compare_profile((*run, thresholds), result, entry, tables)
@@ -92,34 +92,8 @@ def tracks_of(rows: Source, count: int) -> Tracks:
     return worlds.make_tracks((count, len(kinds)), where, values, list(kinds.values()), list(kinds))
 
 
-def _route(measured: Measurements, road: VectorMap) -> dict[str, Any]:
-    samples, corners = range(len(measured.time_us)), enumerate(_CORNERS)
-    return {
-        "iteration": np.arange(len(samples)),
-        "center": [",".join(measured.route.ids(road, i)) for i in samples],
-        "in_common_or_connected": measured.is_common,
-        **{
-            name: [",".join(measured.corners.ids(road, i, c)) for i in samples]
-            for c, name in corners
-        },
-    }
-
-
-def _collisions(measured: Measurements) -> dict[str, Any]:
-    found = measured.collisions
-    return {
-        "time_us": [c.time_us for c in found],
-        "track_token": [c.token for c in found],
-        "type": [AgentKind(c.kind).name for c in found],
-        "collision_type": [f"{c.collision_type.upper()}_COLLISION" for c in found],
-        "delta_v": [c.delta_v for c in found],
-        "at_fault": [c.at_fault for c in found],
-        "timestamp_has_at_fault": [c.time_us in measured.at_fault_times for c in found],
-    }
-
-
 def _compare_profile(
-    key: tuple[str, ...], result: MetricResult, entry: dict[str, Any], tables: dict[str, Groups]
+    key: tuple[str, ...], result: MetricResult, entry: Source, tables: dict[str, Groups]
 ) -> None:
     """Compare scores and statistics under one threshold set."""
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
@@ -142,12 +116,8 @@ def _compare_profile(
 def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -> None:
     times = result.measurements.time_us
     table.match_keys(run, [(metric,) for metric in result.series])
-    for metric, ours in result.series.items():
-        columns = {
-            "unit": [ours.unit or None] * len(times),
-            "index": np.arange(len(times)),
-            "time_us": times,
-            "value": ours.values,
-        }
-        atol = EXACT if ours.unit == "boolean" else None
+    for metric, series in result.series.items():
+        columns = {"unit": [series.unit or None] * len(times), "index": np.arange(len(times))}
+        columns |= {"time_us": times, "value": series.values}
+        atol = EXACT if series.unit == "boolean" else None
         table.match((*run, metric), columns, atol, quantity="series")

@@ -51,10 +51,9 @@ def verify_simulation(
     """
     runs, objects, scores = open_tables(folder, report, "ego", "objects", "scores").values()
     replayed = open_tables(logged, report, "objects")["objects"] if logged else objects
-    for key in dict.fromkeys([*runs, *(key for key in objects if key[1] == "R")]):
+    reactive = [key for key in objects.of_mode(mode) if key[1] == "R"]
+    for key in dict.fromkeys([*runs.of_mode(mode), *reactive]):
         scene, challenge, planner = key
-        if mode not in (None, challenge):
-            continue
         with report.attempt("simulation", " ".join(key)):
             if challenge not in CHALLENGES or scene not in scenes:
                 raise DataError("no such challenge or scene")
@@ -95,9 +94,8 @@ def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
     Heights, which shiftsim does not keep, are of vehicles as in the first frame of the log, of
     others as in the same one.
     """
-    columns = ("iteration", "track_token", "height")
-    logged = zip(*(replayed[name].tolist() for name in columns), strict=True)
-    heights = {(iteration, token): height for iteration, token, height in logged}
+    logged = zip(*(replayed[name].tolist() for name in ("iteration", "track_token")), strict=True)
+    heights = dict(zip(logged, replayed["height"].tolist(), strict=True))
     ours = observed_columns(log.tracks, "R")
     is_vehicle = np.array(ours["type"]) == AgentKind.VEHICLE.name
     first = np.where(is_vehicle, 0, ours["iteration"]).tolist()
@@ -110,9 +108,9 @@ def verify_planners(
 ) -> None:
     """Plan again at every iteration of `trajectories.parquet` (of one mode) and compare states."""
     plans, egos, objects = open_tables(folder, report, "trajectories", "ego", "objects").values()
-    for key in {**dict.fromkeys(egos), **dict.fromkeys(plans)}:
+    for key in dict.fromkeys([*egos.of_mode(mode), *plans.of_mode(mode)]):
         scene, challenge, name = key
-        if name.startswith(_SCRIPTED) or mode not in (None, challenge):
+        if name.startswith(_SCRIPTED):
             continue
         spec = name.replace("_", "-")
         if spec not in PLANNERS or scene not in scenes:

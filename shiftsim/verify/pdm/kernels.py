@@ -9,14 +9,13 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.errors import DataError
 from shiftsim.geometry.polylines import make_path, project, window
 from shiftsim.planners.pdm import rollout, step
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.route import offset_poses
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
-from shiftsim.planners.routes.graph import search_cheapest, search_levels
+from shiftsim.planners.routes.graph import Search, search_cheapest, search_levels
 from shiftsim.verify.files import TOLERANCE, Source, verify_files
 from shiftsim.verify.pdm.steps import verify_step, verify_summary
 from shiftsim.verify.report import Report
@@ -45,10 +44,8 @@ def _idm(case: Source, where: str) -> None:
     limit, after = case["speed_limit_mps"], np.empty(2)
     limit = DEFAULT.fallback_velocity if np.isnan(limit) else limit
     target = DEFAULT.speed_fractions[case["policy_idx"]] * limit
-    before, lead = (
-        case.take("prev_progress_velocity", 2),
-        case.take("lead_progress_velocity_rear", 3),
-    )
+    before = case.take("prev_progress_velocity", 2)
+    lead = case.take("lead_progress_velocity_rear", 3)
     rollout.follow(before, lead, target, DEFAULT.following, after)
     case.match(where, {"next_progress_velocity": after}, TOLERANCE)
 
@@ -95,31 +92,31 @@ def _path(case: Source, where: str) -> None:
 
 
 def _graph_search(case: Source, where: str) -> None:
-    found, nodes = _search(case)
-    ours = {"found": found, "path": [str(node) for node in nodes]}
-    case.match(where, ours, quantity=case["kind"])
-
-
-def _search(case: Source) -> tuple[bool, list[int]]:
     is_forward = case["kind"] != "bfs_roadblock" or case["forward"]
     after: list[list[int]] = [[] for _ in range(case["n"])]
     for edge in case["edges"]:
         start, end = edge if is_forward else edge[::-1]
         after[start].append(end)
-    if case["kind"] == "bfs_roadblock":
-        goals = {int(target) for target in case["targets"]}
-        found = search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
-        return found.found, found.path if is_forward else found.path[::-1]
-    allowed, lengths, blocks = set(map(int, case["candidates"])), case["length"], case["block"]
-    if not len(lengths) == len(blocks) == case["n"]:
-        raise DataError("a lane has no length or no block")
-    found = search_cheapest(
+    search = _search_blocks if case["kind"] == "bfs_roadblock" else _search_lanes
+    found = search(case, after)
+    path = [str(node) for node in (found.path if is_forward else found.path[::-1])]
+    case.match(where, {"found": found.found, "path": path}, quantity=case["kind"])
+
+
+def _search_blocks(case: Source, after: list[list[int]]) -> Search:
+    goals = {int(target) for target in case["targets"]}
+    return search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
+
+
+def _search_lanes(case: Source, after: list[list[int]]) -> Search:
+    allowed = set(map(int, case["candidates"]))
+    lengths, blocks = (case.take(name, case["n"]).tolist() for name in ("length", "block"))
+    return search_cheapest(
         case["start"],
         lambda lane: [n for n in after[lane] if n in allowed],
         lengths.__getitem__,
         lambda lane: blocks[lane] == case["target_block"],
     )
-    return found.found, found.path
 
 
 CHECKS = {

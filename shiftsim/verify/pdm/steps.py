@@ -1,34 +1,39 @@
-"""Planning steps of PDM-Closed: those recorded with all their inputs, and how any is compared."""
+"""Planning steps of PDM-Closed: recorded with all their inputs, and as calls in closed loops."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.polylines import make_path
+from shiftsim.geometry import polylines
 from shiftsim.planners.pdm import forecast as around
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.planner import Seen
-from shiftsim.planners.pdm.rollout import Scene
-from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.pdm.planner import PdmClosed, Seen
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
-from shiftsim.planners.pdm.step import Step, plan_step
+from shiftsim.planners.pdm.step import Step, choose
 from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.contacts import Others
 from shiftsim.planners.proposals.places import ego_box
-from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, STEPS
+from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
-from shiftsim.verify.files import Source, read_arrays, read_fields, read_json
+from shiftsim.sim.planner import scene_info
+from shiftsim.verify.files import Groups, Source, read_arrays, read_fields, read_json
+from shiftsim.verify.nuplan import runs
+from shiftsim.verify.nuplan.metrics import RUN_TABLES
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
-from shiftsim.world.layers import make_polygons
-from shiftsim.world.state import HEADING, PACIFICA, VX, VY, center_poses
+from shiftsim.world.layers import make_layer, make_polygons
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import HEADING, PACIFICA, center_poses
 
 TABLES = read_tables(__file__)
 UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
+STORED = np.array([2e-5, 2e-5, 1e-6])  # m, m, rad: plans stored as 32 bit floats
+ROLLED = 1e-6  # m, rad, m/s, …: arrays of a step
 ASIDE = np.array([1e-6, 3e-6])  # m, moves what is exactly ahead or behind to a side
 
 
@@ -40,31 +45,30 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     """
     inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
-    ego = np.array(inputs["ego_state"], np.float64)
-    seen, collided, step = _plan(inputs, ego)
-    made = {"seen": seen, "collided": collided, "step": step, "arrays": step_arrays(step)}
-    made["boxes"] = seen.forecast.others.boxes[[0, 5, 20]]  # two time indices each
-    made["times"] = int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1)
+    ego, limit, planner = np.array(inputs["ego_state"]), inputs["speed_limit_mps"], PdmClosed()
+    planner.follow(np.array(inputs["centerline"], np.float64))
+    seen = _see(inputs, ego, planner.paths[0])
+    step = planner.step_in(seen, ego, np.nan if limit is None else limit, PACIFICA)
+    facts[where] = made = {
+        **{"seen": seen, "collided": planner.collided, "step": step, "arrays": step_arrays(step)},
+        "boxes": seen.forecast.others.boxes[[0, 5, 20]],  # two time indices each
+        "times": int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1),
+        "best_score": step.scores.total.max(),
+        "objects": inputs["objects"],
+        "red": inputs["red_light_lane_ids"],
+        "zero": np.flatnonzero(step.scores.total == 0.0),
+        "at_fault": np.flatnonzero(np.isfinite(step.scores.collision_index)),
+        "too_near": np.flatnonzero(np.isfinite(step.scores.ttc_index)),
+    }
     TABLES["step"].match(file, where, **made)
     rows = [file["scores"], *file.take("multi", 3, -1), *file.take("weighted", 3, -1)]
     rows += [file[name] for name in ("progress_raw", "collision_idx", "ttc_idx")]
     theirs = Source("PDM", "score", dict(zip(TABLES["scores"].rows, rows, strict=True)), report)
-    choice = (int(file["best"]), bool(file["braked"]))
-    if compare_scores(where, ego, seen, step, theirs, choice):
+    if compare_scores(where, ego, seen, step, theirs, file):
         TABLES["plan"].match(file, where, **made)
     file.note("compared where the same proposal is chosen", "trajectory_rear")
     inputs.finish()
     file.finish()
-    scores = step.scores
-    facts[where] = {
-        **made,
-        "best_score": float(scores.total.max()),
-        "objects": inputs["objects"],
-        "red": inputs["red_light_lane_ids"],
-        "zero": np.flatnonzero(scores.total == 0.0),
-        "at_fault": np.flatnonzero(np.isfinite(scores.collision_index)),
-        "too_near": np.flatnonzero(np.isfinite(scores.ttc_index)),
-    }
 
 
 def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path) -> None:
@@ -77,34 +81,21 @@ def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path)
             theirs.finish()
 
 
-def _plan(inputs: Source, ego: FloatArray) -> tuple[Seen, list[str], Step]:
-    """What is seen, what of it the ego touches at the start, and the step."""
-    center = center_poses(ego[None, :3])[0]
-    things, parts = inputs.each("objects"), inputs.each("drivable")
+def _see(inputs: Source, ego: FloatArray, centerline: polylines.Path) -> Seen:
+    """What is seen in a recorded step."""
+    center, things, parts = center_poses(ego[:3]), inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
     kinds, names = ([thing[name] for thing in things] for name in ("type", "token"))
     tracks = make_tracks((1, len(things)), ..., values.reshape(1, -1, 7), kinds, names)
     chosen = around.select_tracks(tracks, center[0], center[1], set(), DEFAULT)
-    rings = {part["id"]: np.array(part["exterior"], np.float64) for part in parts}
-    reds = {around.LIGHT_TOKEN + name: rings[name] for name in inputs["red_light_lane_ids"]}
-    lights = [ring[:-1] if (ring[0] == ring[-1]).all() else ring for ring in reds.values()]
-    forecast = around.make_forecast(tracks, chosen, red_lights([], lights))
-    tokens = [*(tracks.tokens[i] for i in chosen.tolist()), *reds]
-    size = np.array([PACIFICA.length, PACIFICA.width])
-    hit = around.touched(forecast, boxes_to_corners(center, size))
-    forecast.ignored[hit] = True
-    line = np.array(inputs["centerline"], np.float64)
-    paths = [make_path(line), *(make_path(offset_poses(line, s)) for s in DEFAULT.lateral_offsets)]
+    shapes = [shapely.Polygon(part["exterior"]) for part in parts]
+    drivable, red = make_layer([part["id"] for part in parts], shapes), inputs["red_light_lane_ids"]
+    lights = red_lights([], [drivable.rings(drivable.index[name])[0] for name in red])
+    tokens = [tracks.tokens[i] for i in chosen] + [around.LIGHT_TOKEN + name for name in red]
     crossings = make_polygons([[np.array(r, np.float64)] for r in inputs["intersections"]])
     numbers, on_route = np.arange(len(parts)), np.array([p["on_route"] for p in parts], np.bool_)
-    areas = areas_of(make_polygons([[ring] for ring in rings.values()]), on_route, numbers)
-    place, limit = Place(areas, numbers, crossings, paths[0]), inputs["speed_limit_mps"]
-    limit = DEFAULT.fallback_velocity if limit is None else limit
-    scene = Scene(paths, forecast, ego_box(PACIFICA), DEFAULT.following)
-    step = plan_step(
-        ego, limit * np.array(DEFAULT.speed_fractions), scene, place, PACIFICA, DEFAULT
-    )
-    return Seen(forecast, tokens, place, -1), [tokens[i] for i in hit], step
+    place = Place(areas_of(drivable.polygons, on_route, numbers), numbers, crossings, centerline)
+    return Seen(around.make_forecast(tracks, chosen, lights), tokens, place, -1)
 
 
 def step_arrays(step: Step) -> dict[str, np.ndarray]:
@@ -117,22 +108,14 @@ def step_arrays(step: Step) -> dict[str, np.ndarray]:
 
 
 def compare_scores(
-    where: str,
-    ego: FloatArray,  # (11,) ego state
-    seen: Seen,
-    step: Step,
-    theirs: Source,
-    choice: tuple[int, bool],  # number of the best proposal, whether the emergency brake came
+    where: str, ego: FloatArray, seen: Seen, step: Step, proposals: Source, chosen: Source
 ) -> bool:
-    """Compare scores, choice and brake decision of a step; whether both chose the same plan."""
-    ours, report = _settled(where, seen, step, theirs), theirs.report
-    TABLES["scores"].match(theirs, where, scores=ours)
-    best = int(np.argmax(ours.total))
-    report.compare("PDM choice", where, best, choice[0])
-    is_slow = np.hypot(ego[VX], ego[VY]) <= DEFAULT.brake_speed
-    braked = bool(is_slow and DT * ours.collision_index[best] <= DEFAULT.brake_time)
-    report.compare("PDM brake", where, braked, choice[1])
-    return (step.best, step.braked) == choice
+    """Compare scores, choice and brake decision of an ego (11,); whether the plan is the same."""
+    ours = _settled(where, seen, step, proposals)
+    best, braked = choose(ours, ego, DEFAULT)
+    TABLES["scores"].match(proposals, where, scores=ours)
+    TABLES["choice"].match(chosen, where, best=best, braked=braked)
+    return (step.best, step.braked) == (chosen["best"], chosen["braked"])
 
 
 def _settled(where: str, seen: Seen, step: Step, theirs: Source) -> Scores:
@@ -168,3 +151,69 @@ def _in_line(states: FloatArray, others: Others) -> BoolArray:
         aside = np.abs(cos * away[..., 1] - sin * away[..., 0])
         out |= (aside < UNSTABLE_BEARING * np.linalg.norm(away, axis=-1)).any(axis=(0, 1))
     return out
+
+
+def verify_calls(
+    folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
+) -> None:
+    """Make every planning call of closed loops (of one mode) again from the recorded ego state."""
+    egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
+    steps, proposals = (
+        Groups(folder / f"{name}.parquet", report, ("scene", "challenge"))
+        for name in ("steps", "proposals")
+    )
+    static = read_fields(folder / "static.json", report, "static.json")
+    for key in egos:
+        call, where = key[:2], " ".join(key[:2])
+        if mode in (None, key[1]):
+            with report.attempt("PDM loop", where):
+                seen = runs.Seen(scenes[key[0]], egos[key], objects[key], key[1])
+                file = read_arrays(folder / f"{'_'.join(call)}.npz", report, "PDM")
+                names = {"road": seen.scenario.map, "scenario": seen.scenario}
+                names["planner"] = _compare_calls(where, seen, steps[call], proposals[call], file)
+                facts = static.each(key[0])[0].each(key[1])[0]
+                TABLES["facts"].match(facts, where, nothing=None, **names)
+    for table in (steps, proposals):
+        table.finish(mode)
+    if mode is None:
+        static.finish()
+    known = {f"{name}.parquet" for name in (*RUN_TABLES, "steps", "proposals")}
+    known |= {"static.json", *(f"{'_'.join(key[:2])}.npz" for key in egos)}
+    for name in sorted({path.name for path in folder.iterdir()} - known):
+        report.skip(f"file loop/{name}")
+
+
+def _compare_calls(
+    where: str, seen: runs.Seen, steps: Source, proposals: Source, file: Source
+) -> PdmClosed:
+    """Compare every call; the planner after the last one."""
+    planner, road = PdmClosed(), seen.scenario.map
+    planner.reset(scene_info(seen.scenario, planner=planner))
+    count, per_call = len(seen.ego), proposals.num_rows // len(seen.ego)
+    calls, numbers = np.arange(count), np.arange(per_call)
+    steps.match(where, {"iteration": calls})
+    rows = {"proposal": np.tile(numbers, count), "iteration": np.repeat(calls, per_call)}
+    proposals.match(where, rows)
+    times = steps["time_us"][:, None] + STEP_US * np.arange(STEPS + 1)
+    file.match(where, {"trajectory_time_us": times})
+    plans = file.take("trajectory", count, STEPS + 1, 3).astype(np.float64)
+    plans[:, :, :2] += file.take("trajectory_origin", 3)[:2]
+    for index, plan in enumerate(plans):
+        at, observation = f"{where} iteration {index}", seen.at(index)
+        step, sight = planner.step(observation), planner.seen
+        assert sight is not None
+        row, theirs = steps.at(index), proposals.at(numbers + index * per_call)
+        names = {"road": road, "seen": observation, "sight": sight}
+        names |= {"limit": road.speed_limits[sight.lane], "collided": ",".join(planner.collided)}
+        names["best_score"] = theirs["score"].max()
+        TABLES["call"].match(row, at, **names)
+        TABLES["ends"].match(theirs, at, ends=step.driven.states[:, -1])
+        if compare_scores(at, seen.ego[index], sight, step, theirs, row):
+            file.report.compare("PDM plan", at, step.poses, plan, atol=STORED)
+        if f"proposals_{index}" in file:
+            ids = [*road.edges.ids, *road.car_parks.ids]
+            areas = [ids[area] for area in sight.place.selected.tolist()]
+            arrays = {"map_tokens": sight.tokens, "drivable_tokens": areas, **step_arrays(step)}
+            file.match(at, {f"{name}_{index}": arrays[name] for name in arrays}, ROLLED)
+    file.finish()
+    return planner

@@ -14,7 +14,7 @@ from shiftsim.planners.learned.diffusion import kernels
 from shiftsim.planners.learned.diffusion.features import (
     FeatureBuilder,
     agent_features,
-    lane_features,
+    lane_inputs,
     lane_lines,
     lanes_on_route,
 )
@@ -164,7 +164,7 @@ def test_rows_of_given_lanes_do_not_depend_on_where_the_world_lies(motion):
     there = moved(scenario, angle, np.array(shift))
     edges, lights = np.arange(6), np.full(6, 3)
     rows = [
-        lane_features(lane_lines(one.map), edges, lights, one.expert[0, :3].copy(), 70)[0]
+        lane_inputs(lane_lines(one.map), edges, lights, one.expert[0, :3].copy(), ())["lanes"]
         for one in (scenario, there)
     ]
     np.testing.assert_allclose(rows[1], rows[0], atol=1e-4)

@@ -11,8 +11,8 @@ import pytest
 
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import read_scenario
+from shiftsim.verify.calls import verify_idm_calls
 from shiftsim.verify.nuplan.runs import verify_planners
-from shiftsim.verify.pdm.idm_calls import verify_idm_calls
 from shiftsim.verify.report import Report
 
 GOLDEN = places.GOLDEN / "planners"
@@ -48,7 +48,7 @@ def test_every_recorded_call_of_the_idm_planner_comes_out_again(scenes):
     verify_idm_calls(GOLDEN / "idm_calls.json", report, scenes)
     assert report.mismatches == []
     assert report.not_covered == {}
-    assert report.quantities["IDM plan"].cases == 54
+    assert report.quantities["IDM trajectory"].cases == 54
 
 
 @pytest.fixture

@@ -116,7 +116,8 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
     assert len(two.line_valid) == 2
     of_lines = [name for name in two._fields if name.startswith("line_")]
     one = two._replace(**{name: getattr(two, name)[:1] for name in of_lines})
-    official, ours = build_network({"misordered_masks": True}), build_network()
+    official, ours = build_network(), build_network()
+    official.planning_decoder.misordered_masks = True
     for network in (official, ours):
         network.load_state_dict(rough.network.state_dict())
         network.eval()

@@ -15,7 +15,7 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 from shiftsim.errors import TrafficError
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.idm.scene import IdmParameters
-from shiftsim.verify.idm_worlds import verify_idm_world
+from shiftsim.verify.dynamics import verify_dynamics
 from shiftsim.verify.report import Report
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
@@ -259,11 +259,16 @@ def test_order_of_replayed_objects_does_not_matter(order: list[int]) -> None:
     np.testing.assert_array_equal(usual.poses[:, :3], other.poses[:, :3])
 
 
-@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.json")), ids=lambda path: path.stem)
-def test_small_worlds_are_those_of_nuplan(path: Path) -> None:
+def verified(folder: Path, world: str) -> Report:
     report = Report()
+    (folder / "idm_world_0.json").write_text(world)
+    verify_dynamics(folder, report)
+    return report
 
-    verify_idm_world(path, report)
+
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.json")), ids=lambda path: path.stem)
+def test_small_worlds_are_those_of_nuplan(tmp_path: Path, path: Path) -> None:
+    report = verified(tmp_path, path.read_text())
 
     assert report.exit_code(require_all=True) == 0, report.lines()
     assert report.num_cases > 1000
@@ -324,31 +329,17 @@ def falsify_length(world: dict) -> None:
 def test_a_falsified_world_is_noticed(tmp_path: Path, falsify) -> None:
     world = json.loads((GOLDEN / "idm_world_0.json").read_text())
     falsify(world)
-    path = tmp_path / "idm_world_0.json"
-    path.write_text(json.dumps(world))
-    report = Report()
 
-    verify_idm_world(path, report)
-
-    assert report.exit_code() == 1
+    assert verified(tmp_path, json.dumps(world)).exit_code() == 1
 
 
 def test_an_unknown_field_is_named(tmp_path: Path) -> None:
     world = json.loads((GOLDEN / "idm_world_0.json").read_text())
-    path = tmp_path / "idm_world_0.json"
-    path.write_text(json.dumps(world | {"weather": "rain"}))
-    report = Report()
 
-    verify_idm_world(path, report)
+    report = verified(tmp_path, json.dumps(world | {"weather": "rain"}))
 
     assert report.exit_code(require_all=True) == 3
 
 
 def test_a_broken_world_is_a_mismatch(tmp_path: Path) -> None:
-    path = tmp_path / "idm_world_0.json"
-    path.write_text("{")
-    report = Report()
-
-    verify_idm_world(path, report)
-
-    assert report.exit_code() == 1
+    assert verified(tmp_path, "{").exit_code() == 1

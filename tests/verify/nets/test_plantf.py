@@ -73,9 +73,9 @@ def test_network_and_closed_loop_are_equal(nuplan_reference):
     report = verify(GOLDEN, scenes=nuplan_reference)
     assert report.mismatches == []
     assert report.not_covered == {}
-    assert report.quantities["plantf plan [m]"].cases == 20
+    assert report.quantities["plantf trajectory"].cases == 20
     assert report.quantities["plantf map.point_position"].cases == 3
-    assert report.quantities["plantf trajectory (base)"].cases == 1
+    assert report.quantities["plantf (base) trajectory"].cases == 1
     assert report.quantities["plantf state shape"].cases == 218
 
 

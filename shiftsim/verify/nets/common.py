@@ -1,0 +1,201 @@
+"""What is compared of every learned planner: the manifest of its network, its closed loops.
+
+Weights are deterministic: anybody can make them again from the names of the tensors. In a closed
+loop a rollout of ours is moved by what is recorded; the planner sees it, and what it says is
+compared.
+"""
+
+import hashlib
+import json
+import re
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from shiftsim.planners.learned.checkpoint import load_network
+from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
+from shiftsim.planners.learned.match import network_module
+from shiftsim.sim.loop import Rollout
+from shiftsim.sim.planner import past_rows
+from shiftsim.verify.files import Source
+from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.tables import Table, read_tables
+from shiftsim.world import state
+from shiftsim.world.scenario import Scenario
+
+TABLES = read_tables(__file__)
+STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
+
+# As in state.STATE_COLUMNS, in the words of the files.
+FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_acceleration")
+PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
+# how one official planner fails where it has no reference line; ours falls back there
+FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
+
+
+@cache
+def make_network(planner: str, variant: str) -> Any:
+    """The network of a planner with a variant of the deterministic weights, ready to be called."""
+    return load_network(f"deterministic:{variant}", planner)
+
+
+def match_meta(file: Source, planner: str, **ours: object) -> None:
+    """Compare the JSON text in the array `meta`."""
+    file.report.compare(f"{planner} meta", file.name, ours, json.loads(str(file["meta"])))
+
+
+def match_case(file: Source, planner: str) -> list[str]:
+    """`match_meta` of a forward pass: its name, and the variants of the weights that it has."""
+    variants = sorted({name.split(".")[1] for name in file if name.count(".") > 1})
+    match_meta(file, planner, case=file.name.removeprefix("forward_"), variants=variants)
+    return variants
+
+
+def verify_manifest(
+    planner: str, tables: Mapping[str, Table], file: Source, /, **names: Any
+) -> None:
+    """Compare `state_dict.json`: names, shapes, types, rules and weights, and the other fields.
+
+    Section `manifest` of the tables has these, among `names`; `weights` has by field which weights
+    it counts, as a pattern of their names: the trainable ones if it says so.
+    """
+    report, module = file.report, network_module(planner)
+    network, rules = module.build_network(), getattr(module, "RULES", {})
+    built = {name: value.detach().numpy() for name, value in network.state_dict().items()}
+    trained = {name for name, _ in network.named_parameters()}
+    entries = file.each("keys" if "keys" in file else "entries")
+    listed = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
+    report.compare(f"{planner} state names", file.name, sorted(built), sorted(listed))
+    for name, entry in zip(listed, entries, strict=True):
+        if name not in built:
+            continue
+        ours = {
+            "shape": list(built[name].shape),
+            "dtype": str(built[name].dtype),
+            "kind": "parameter" if name in trained else "buffer",
+            "ckpt_key": module.PREFIXES[0] + name,
+            "rule": rules.get(name) or rule_of(name, built[name].ndim),
+            "value": built[name].tolist(),
+        }
+        ours = {field: value for field, value in ours.items() if field in entry}
+        entry.match(name, ours, quantity=f"{planner} state")
+    (check,) = file.each("selfcheck")
+    if "first3_raw_z" in check:
+        where, shape = check["name"], built[check["name"]].shape
+        firsts = {"shape": shape, "first3_raw_z": keyed_normals(where, shape).ravel()[:3]}
+        check.used.add("note")
+    else:
+        where, weights = "selfcheck", deterministic_state(built, rules)
+        firsts = {name: weights[name].ravel()[:3].astype(float) for name in check}
+    check.match(where, firsts, quantity=f"{planner} selfcheck")
+    heads = {
+        layer: {"C": len(head.gain), **{name: list(v) for name, v in asdict(head).items()}}
+        for layer, head in getattr(module, "DRIVE_HEADS", {}).items()
+    }
+    scales, called = getattr(module, "DRIVE_SCALES", {}), f"{planner} manifest"
+    names |= {"network": module, "heads": heads, "scales": scales}
+    tables["manifest"].match(file, file.name, called, **names)
+    counts = {}
+    for field, pattern in tables["weights"].rows.items():
+        counted = trained if "trainable" in field else built
+        counts[field] = sum(built[name].size for name in counted if re.match(pattern, name))
+    file.match(file.name, counts, quantity=called)
+    file.used.add("planner")
+
+
+class Loop:
+    """One closed-loop file, and its iteration that is compared just now."""
+
+    def __init__(
+        self, file: Source, planner: Any, tables: Mapping[str, Table], scenario: Scenario
+    ) -> None:
+        self.file, self.tables, self.where = file, {**TABLES, **tables}, file.name
+        self.scenario, self.road, self.tracks = scenario, scenario.map, scenario.tracks
+        self.planner, self.name = planner, planner.name  # the planner after this iteration
+        self.variant = str(file["meta/variant"])  # of its weights
+        self.rollout = Rollout(scenario, planner)
+
+    def step(self, number: int) -> None:
+        """Look at an iteration, which must be that of the rollout, and make its plan again."""
+        self.where = f"{self.file.name} iteration {number}"
+        self.stored = self.file.below(f"it{number:02d}/")  # what is stored of it alone
+        self.row = self.file.below("out/").at(number)  # of the arrays of the whole loop
+        self.seen = self.rollout.observe()  # what the planner saw
+        self.features = self.planner.features(self.seen)
+        (self.output,) = self.planner.infer([self.features])
+        self.answer = self.planner.decode(self.output, self.seen)
+
+    def advance(self) -> None:
+        """Go to the next iteration by the recorded plan."""
+        if "command" in self.row:
+            self.rollout.advance(state.Command(*self.row["command"].tolist()))
+        else:
+            plan, time_us = self.row["trajectory"], self.row["trajectory_time_us"]
+            states = np.zeros((len(plan), state.NUM_STATE))
+            states[:, :PLAN_COLUMNS] = plan
+            self.rollout.advance(state.Trajectory(time_us, states))
+
+    def compare(self, quantity: str, ours: object, theirs: object, atol: float = 0.0) -> None:
+        """Compare one quantity of this iteration."""
+        report = self.file.report
+        report.compare(f"{self.name} {quantity}", self.where, ours, theirs, atol=atol)
+
+    def match(self, section: str, theirs: Source, called: str = "", /, **names: Any) -> None:
+        """Compare by a section of the tables, which finds what this object has."""
+        called = f"{self.name} {called}".strip()
+        self.tables[section].match(theirs, self.where, called, **{**vars(self), **names})
+
+
+def verify_loop(
+    make: Callable[[str], Any],
+    tables: Mapping[str, Table],
+    compare: Callable[[Loop], None],
+    file: Source,
+    scenes: Scenes,
+) -> None:
+    """Make every step of a closed loop again, and `compare` it.
+
+    `make` makes the planner from the name of its weights; the arrays of section `iteration` have a
+    row for every plan.
+    """
+    planner = _planner(make, f"deterministic:{file['meta/variant']}")
+    loop = Loop(file, planner, tables, scenes[str(file["meta/scene"])])
+    egos, plans = file["ego/current"], file.below("out/")
+    counts = [len(plans[name.partition("[")[0]]) for name in tables["iteration"].rows]
+    loop.compare("plans", counts, counts[:1] * len(counts))
+    _compare_scene(loop, scenes, len(egos))
+    failure = f"iteration {counts[0]}: {FAILURE}" if counts[0] < len(egos) else ""
+    loop.compare("failure", failure, str(file["meta/error"]))
+    for number, ego in enumerate(egos):
+        loop.step(number)
+        loop.compare("driven ego", loop.seen.history.ego[-1], ego, STATE)
+        # where the official planner failed, ours says that its answer is a fallback
+        loop.compare("fallback", bool(loop.planner.degraded), number == counts[0])
+        if number < counts[0]:
+            compare(loop)
+            loop.advance()
+
+
+def _compare_scene(loop: Loop, scenes: Scenes, count: int) -> None:
+    """Compare what the file says about its scene, and which files that was made from."""
+    rows, paths = past_rows(loop.scenario, 0), scenes.sources(str(loop.file["meta/scene"]))
+    content, meta = [path.read_bytes() for path in paths], loop.file.below("meta/")
+    names = {
+        "md5": [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content],
+        "crc32": [zlib.crc32(data) for data in content],
+        "paths": [path.relative_to(scenes.folder).as_posix() for path in paths],
+        "columns": FILE_COLUMNS,
+        "ego": loop.scenario.ego[rows],
+        "past_us": loop.scenario.time_us[rows],
+        "time_us": loop.scenario.iteration_times[:count],
+    }
+    loop.match("scene", meta, "scene", **names)
+    loop.match("sources", meta, "scene", **names)
+    loop.match("ego", loop.file.below("ego/"), **names)
+
+
+_planner = cache(lambda make, weights: make(weights))  # its network serves all files
