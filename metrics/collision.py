@@ -1,8 +1,7 @@
 """Collisions: first contact with every track, who is at fault, and the score.
 
-In kernels a box is a row (x, y, cos h, sin h, cos(h + pi/2), sin(h + pi/2), half length, half
-width, half diagonal). Most pairs are decided by distances with a margin; the rest exactly, on
-corners.
+In kernels a box is a row (x, y, cos h, sin h, h, half length, half width, half diagonal). Most
+pairs are decided by distances with a margin; the rest exactly, on corners.
 """
 
 from typing import NamedTuple
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import BEHIND, bearing, boxes_to_corners, front_touches
+from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, front_touches
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.metrics.result import (
     Collision,
@@ -33,7 +32,7 @@ NAME = "no_ego_at_fault_collisions"
 COLLISION_TYPES = ("stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral")
 STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
 STOPPED_SPEED = 5e-2  # m/s, nuPlan at-fault collisions
-BOX_SIZE = 9  # numbers that make a box in kernels
+BOX_SIZE = 8  # numbers that make a box in kernels
 _MARGIN = 1e-6  # m, far above rounding: gaps beyond it need no exact test
 GROUPS = {
     "VRUs": (AgentKind.PEDESTRIAN, AgentKind.BICYCLE),
@@ -78,8 +77,8 @@ class Contacts(NamedTuple):
 def flat_ego(states: FloatArray, vehicle: VehicleParameters) -> Ego:
     """The ego of a rollout: (K, 11) states of its rear axle."""
     centers = center_poses(states[:, :3], vehicle)
-    size = np.array([vehicle.length, vehicle.width])
-    corners = boxes_to_corners(centers, np.broadcast_to(size, (len(centers), 2)))
+    size, corners = np.array([vehicle.length, vehicle.width]), np.empty((len(centers), 4, 2))
+    _footprints(centers, size, corners)
     return Ego(np.ascontiguousarray(states), speeds(states), centers, corners, size)
 
 
@@ -180,29 +179,30 @@ def _energies(group: str, values: list[float]) -> list[Statistic]:
 
 
 @lean_kernel
+def _footprints(centers: FloatArray, size: FloatArray, out: FloatArray) -> None:
+    """Write the corners (K, 4, 2) of boxes of one size at poses (K, 3) [m]."""
+    for i in range(len(centers)):
+        box_corners(centers[i, 0], centers[i, 1], centers[i, 2], size[0], size[1], out[i])
+
+
+@lean_kernel
 def set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> None:
-    """Write a box (9,) from its pose (3,) and size [m]."""
-    box[0], box[1] = pose[0], pose[1]
+    """Write a box (8,) from its pose (3,) and size [m]."""
+    box[0], box[1], box[4] = pose[0], pose[1], pose[2]
     box[2], box[3] = np.cos(pose[2]), np.sin(pose[2])
-    box[4], box[5] = np.cos(pose[2] + np.pi / 2.0), np.sin(pose[2] + np.pi / 2.0)
     set_size(box, length, width)
 
 
 @lean_kernel
 def set_size(box: FloatArray, length: float, width: float) -> None:
-    """Write the size of a box (9,) [m]."""
-    box[6], box[7] = 0.5 * length, 0.5 * width
-    box[8] = 0.5 * np.sqrt(length * length + width * width)
+    """Write the size of a box (8,) [m]."""
+    box[5], box[6] = 0.5 * length, 0.5 * width
+    box[7] = 0.5 * np.sqrt(length * length + width * width)
 
 
 @lean_kernel
 def _set_corners(box: FloatArray, out: FloatArray) -> None:
-    for index in range(4):
-        lon = box[6] if index == 0 or index == 3 else -box[6]
-        lat = box[7] if index < 2 else -box[7]
-        # the operations of geometry.box_corners, with the sines and cosines at hand
-        out[index, 0] = box[0] + (lat * box[4] + lon * box[2])
-        out[index, 1] = box[1] + (lat * box[5] + lon * box[3])
+    box_corners(box[0], box[1], box[4], 2.0 * box[5], 2.0 * box[6], out)
 
 
 @lean_kernel
@@ -210,16 +210,16 @@ def _gap(a: FloatArray, b: FloatArray) -> float:
     """Largest gap between two boxes along the axes of `a`; negative where they overlap [m]."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     cos, sin = abs(a[2] * b[2] + a[3] * b[3]), abs(a[2] * b[3] - a[3] * b[2])
-    lon = abs(dx * a[2] + dy * a[3]) - a[6] - b[6] * cos - b[7] * sin
-    lat = abs(dx * a[3] - dy * a[2]) - a[7] - b[6] * sin - b[7] * cos
+    lon = abs(dx * a[2] + dy * a[3]) - a[5] - b[5] * cos - b[6] * sin
+    lat = abs(dx * a[3] - dy * a[2]) - a[6] - b[5] * sin - b[6] * cos
     return max(lon, lat)
 
 
 @lean_kernel
 def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
-    """Whether two boxes (9,) touch; `corners` (2, 4, 2) is scratch."""
+    """Whether two boxes (8,) touch; `corners` (2, 4, 2) is scratch."""
     dx, dy = b[0] - a[0], b[1] - a[1]
-    reach = a[8] + b[8]
+    reach = a[7] + b[7]
     if not dx * dx + dy * dy < reach * reach:
         return False
     gap = max(_gap(a, b), _gap(b, a))
@@ -261,7 +261,7 @@ def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
             if not tracks.valid[i, j] or out.first[j] < num_samples:
                 continue
             dx, dy = poses[i, j, 0] - box[0], poses[i, j, 1] - box[1]
-            reach = box[8] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
+            reach = box[7] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
             if dx * dx + dy * dy > reach * reach:
                 continue
             set_box(other, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])

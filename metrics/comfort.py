@@ -19,6 +19,7 @@ from shiftsim.metrics.result import (
     Series,
     Statistic,
     Thresholds,
+    Violation,
     first_violation,
 )
 from shiftsim.world.state import AX, AY, HEADING, center_accelerations
@@ -95,23 +96,13 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
         at = int(np.flatnonzero(~(steps > 0.0))[0]) + 1
         raise DataError(f"time stamps of the rollout do not increase at sample {at}")
     step = float(np.mean(steps))
-    center = center_accelerations(states)
+    raw, signals = np.empty((4, len(states))), np.empty((7, len(states)))
+    raw[:2] = center_accelerations(states).T
     # nuPlan rule 80: magnitudes are taken at the rear axle, components at the centre
-    magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
-    smooth, jerk, yaw_rate, yaw_accel = filters_of(len(time_us))
-    lon, lat, mag = (
-        _filtered(np.ascontiguousarray(v), smooth, 1.0) for v in (*center.T, magnitude)
-    )
-    heading = _unwrap(states[:, HEADING])
-    return ComfortSignals(
-        lon_accel=lon,
-        lat_accel=lat,
-        mag_accel=mag,
-        lon_jerk=_filtered(lon, jerk, step),
-        mag_jerk=_filtered(mag, jerk, step),
-        yaw_rate=_filtered(heading, yaw_rate, step),
-        yaw_accel=_filtered(heading, yaw_accel, step**2),
-    )
+    raw[2] = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
+    raw[3] = _unwrap(states[:, HEADING])
+    _filter_all(raw, filters_of(len(time_us)), step, step**2, signals)
+    return ComfortSignals(*signals)
 
 
 def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:
@@ -140,49 +131,55 @@ def judge(
     signals: ComfortSignals, time_us: IntArray, thresholds: Thresholds
 ) -> tuple[list[MetricPart], MetricPart]:
     """The six unscored signals in the order of `BOUNDED_SIGNALS`, and the comfort score."""
-    bounded = zip(BOUNDED_SIGNALS.items(), bounds_of(thresholds), strict=True)
-    parts = [
-        _judge_signal(metric, getattr(signals, name), time_us, bounds)
-        for (metric, name), bounds in bounded
-    ]
-    broken = [part.row.violation for part in parts if part.row.violation is not None]
-    score = float(not broken)
-    first = min(broken, key=lambda violation: violation.iteration, default=None)
-    row = MetricRow(NAME, score, float(len(broken)), "count", 0.0, first)
+    series = {metric: getattr(signals, name) for metric, name in BOUNDED_SIGNALS.items()}
+    values, bounds = np.array([*series.values()]), np.array(bounds_of(thresholds))
+    low, high = bounds[:, :1], bounds[:, 1:]
+    broken = ~((low < values) & (values < high))
+    worst = np.argmin(np.minimum(values - low, high - values), axis=1)
+    nearest = values[np.arange(len(values)), worst]
+    extremes = values.max(axis=1), values.min(axis=1)
+    figures = np.array([nearest, *extremes, values.mean(axis=1), _percentiles_90(values)])
+    is_broken: list[bool] = np.logical_or.reduce(broken, axis=1).tolist()
+    parts = []
+    for index, (metric, signal) in enumerate(series.items()):
+        violation = first_violation(broken[index], signal, time_us) if is_broken[index] else None
+        numbers = figures[:, index].tolist()
+        parts.append(_part(metric, signal, bounds[index].tolist(), numbers, violation))
+    violations = [part.row.violation for part in parts if part.row.violation is not None]
+    score = float(not violations)
+    first = min(violations, key=lambda violation: violation.iteration, default=None)
+    row = MetricRow(NAME, score, float(len(violations)), "count", 0.0, first)
     return parts, MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
 
 
-def _judge_signal(
-    metric: str, values: FloatArray, time_us: IntArray, bounds: tuple[float, float]
+def _part(
+    metric: str,
+    values: FloatArray,
+    bounds: list[float],
+    figures: list[float],  # the value nearest to a bound; largest, smallest, mean, 90th percentile
+    violation: Violation | None,
 ) -> MetricPart:
-    low, high = bounds
-    margins = np.minimum(values - low, high - values)
-    broken = ~((low < values) & (values < high))
-    worst = int(np.argmin(margins))
-    violation = first_violation(broken, values, time_us)
-    value = float(values[worst])
+    (low, high), (value, *others), unit = bounds, figures, _UNITS[metric]
     nearest = low if value - low < high - value else high
-    unit = _UNITS[metric]
     row = MetricRow(metric, None, value, unit, nearest, violation)
-    statistics = (
-        Statistic(metric, f"max_{metric}", unit, "MAX", float(values.max())),
-        Statistic(metric, f"min_{metric}", unit, "MIN", float(values.min())),
-        Statistic(metric, f"avg_{metric}", unit, "MEAN", float(np.mean(values))),
-        Statistic(metric, f"p90_{metric}", unit, "P90", _percentile_90(values)),
-        Statistic(
-            metric, f"abs_{metric}_within_bounds", "boolean", "BOOLEAN", float(violation is None)
-        ),
-    )
-    return MetricPart(row, statistics, Series(unit, values))
+    kinds = (("max", "MAX"), ("min", "MIN"), ("avg", "MEAN"), ("p90", "P90"))
+    statistics = [
+        Statistic(metric, f"{name}_{metric}", unit, kind, figure)
+        for (name, kind), figure in zip(kinds, others, strict=True)
+    ]
+    within = f"abs_{metric}_within_bounds"
+    statistics.append(Statistic(metric, within, "boolean", "BOOLEAN", float(violation is None)))
+    return MetricPart(row, tuple(statistics), Series(unit, values))
 
 
-def _percentile_90(values: FloatArray) -> float:
-    """The 90th percentile by numpy's method `closest_observation`, without interpolation."""
-    rank = len(values) * 0.9 - 1.5
+def _percentiles_90(values: FloatArray) -> FloatArray:
+    """The 90th percentile of rows by numpy's method `closest_observation`, not interpolated."""
+    rank = values.shape[1] * 0.9 - 1.5
     below = int(np.floor(rank))
     # nuPlan rule 82: an exact tie goes to the even rank, as in the numpy 1.26 that nuPlan pins
     tie = rank == below and below % 2 == 0
-    return float(np.sort(values)[max(0, below if tie else below + 1)])
+    found: FloatArray = np.sort(values, axis=1)[:, max(0, below if tie else below + 1)]
+    return found
 
 
 def _unwrap(angles: FloatArray) -> FloatArray:
@@ -218,12 +215,6 @@ def _with_interior(fit: FloatArray) -> Filter:
     return Filter(fit[len(fit) // 2].copy(), fit)
 
 
-def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
-    out = np.empty(len(values))
-    filter_signal(values, how, scale, out)
-    return out
-
-
 def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
     """(window, window) that maps samples at unit spacing to derivatives of their fit there."""
     at = np.arange(window) - 0.5 * (window - 1)
@@ -234,6 +225,22 @@ def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
         scale = factorial(power) / factorial(power - order)
         derived[:, power] = scale * at ** (power - order)
     return np.ascontiguousarray(derived @ fit)
+
+
+@lean_kernel
+def _filter_all(
+    raw: FloatArray,  # (4, K) accelerations lon, lat, magnitude [m/s^2], heading, unwrapped [rad]
+    filters: Filters,
+    step: float,  # between samples [s]
+    square: float,  # of the step [s^2]
+    out: FloatArray,  # (7, K) written, in the order of `ComfortSignals`
+) -> None:
+    for index in range(3):
+        filter_signal(raw[index], filters.smooth, 1.0, out[index])
+    filter_signal(out[0], filters.jerk, step, out[3])
+    filter_signal(out[2], filters.jerk, step, out[4])
+    filter_signal(raw[3], filters.yaw_rate, step, out[5])
+    filter_signal(raw[3], filters.yaw_accel, square, out[6])
 
 
 @lean_kernel

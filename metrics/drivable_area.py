@@ -47,13 +47,13 @@ def judge(
     bound = thresholds.max_drivable_area_violation
     far = np.any(area.outside & (area.distances >= bound), axis=1)
     furthest = area.distances.max(axis=1)
-    score = float(not far.any())
     first = first_violation(far, furthest, time_us)
+    score = float(first is None)
     row = MetricRow(NAME, score, float(furthest.max()), "meters", bound, first)
     compliance = MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
     outside = np.any(area.outside, axis=1)
-    inside = float(not outside.any())
     first = first_violation(outside, furthest, time_us)
+    inside = float(first is None)
     corners = MetricPart(
         MetricRow(CORNERS_NAME, None, float(outside.sum()), "count", 0.0, first),
         (Statistic(CORNERS_NAME, CORNERS_NAME, "boolean", "BOOLEAN", inside),),

@@ -121,7 +121,8 @@ def windowed(progress: FloatArray, time_us: IntArray, horizon: float) -> FloatAr
     # nuPlan rule 73: truncated division, then one sample more than that
     steps = int(horizon * 1e6 / float(np.mean(np.diff(time_us))))
     padded = np.concatenate([np.zeros(steps), progress])
-    sums: FloatArray = np.lib.stride_tricks.sliding_window_view(padded, steps + 1).sum(axis=1)
+    windows = np.ndarray((len(progress), steps + 1), padded.dtype, padded, 0, 2 * padded.strides)
+    sums: FloatArray = windows.sum(axis=1)
     return sums
 
 
@@ -179,23 +180,21 @@ def _progress_along(
             previous = along
             continue
         # nuPlan rule 72: the search goes forward only, and where nothing is found the memory stays
-        extra, skipped = 0.0, at
         ahead = at + 1
-        while ahead <= last:
-            edge = chain_edges[ahead]
-            if contains(blocks, chain_blocks[ahead], x, y):
-                current = chain_edges[at]
-                length = lines.arc[lines.ptr[current + 1] - 1]
-                along = project_on_line(lines, edge, x, y)
-                out[i] = (length - previous) + (along - _project_end(lines, edge, current)) + extra
-                at, previous = ahead, along
-                break
-            if ahead < last:
-                after = lines.ptr[chain_edges[ahead + 1]]
-                start = project_on_line(lines, edge, lines.xy[after, 0], lines.xy[after, 1])
-                extra += start - _project_end(lines, edge, chain_edges[skipped])
-            skipped = ahead
+        while ahead <= last and not contains(blocks, chain_blocks[ahead], x, y):
             ahead += 1
+        if ahead > last:
+            continue
+        extra = 0.0
+        for passed in range(at + 1, ahead):
+            edge, after = chain_edges[passed], lines.ptr[chain_edges[passed + 1]]
+            start = project_on_line(lines, edge, lines.xy[after, 0], lines.xy[after, 1])
+            extra += start - _project_end(lines, edge, chain_edges[passed - 1])
+        current, edge = chain_edges[at], chain_edges[ahead]
+        length = lines.arc[lines.ptr[current + 1] - 1]
+        along = project_on_line(lines, edge, x, y)
+        out[i] = (length - previous) + (along - _project_end(lines, edge, current)) + extra
+        at, previous = ahead, along
 
 
 @lean_kernel

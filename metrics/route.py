@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel, part_kernel
 from shiftsim.errors import MapError
 from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
 from shiftsim.world.map import VectorMap
@@ -52,7 +52,7 @@ def lanes_of(map: VectorMap) -> Lanes:
 
 def empty_lists(map: VectorMap, *shape: int) -> EdgeLists:
     """Lists of a given shape with nothing in them, long enough for any point of a map."""
-    capacity = max(2, int(np.diff(map.edges.polygons.cell_ptr).max(initial=0)))
+    capacity = max(2, map.edges.most_at_a_point)
     return EdgeLists(np.zeros((*shape, capacity), np.int64), np.zeros(shape, np.int64))
 
 
@@ -103,7 +103,7 @@ def has(items: IntArray, count: int, value: int) -> bool:
     return False
 
 
-@lean_kernel
+@part_kernel
 def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     """Write the lane that holds a point, else the connectors; how many, or _OVERLAP."""
     found = containing(lanes.polygons, x, y, out)
@@ -114,7 +114,7 @@ def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     return found
 
 
-@lean_kernel
+@part_kernel
 def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: IntArray) -> int:
     """Write which of the first `count` known edges, or the successors of one, hold a point."""
     polygons, outgoing = lanes.polygons, lanes.outgoing

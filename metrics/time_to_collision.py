@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
-from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
+from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing_cosine
+from shiftsim.geometry.rings import SLACK
 from shiftsim.metrics.collision import (
     BOX_SIZE,
     Contacts,
@@ -35,6 +36,8 @@ HORIZON = 3.0  # s
 _NUM_TESTS = 29
 # nuPlan rule 64: the ego stands below a tenth of the speed that counts for collisions
 _STOPPED_SPEED = 5e-3  # m/s
+_AHEAD, _BESIDE, _BEHIND = range(3)
+_WELL_AHEAD = float(np.cos(AHEAD)) + 1e-9  # more than rounding can change a cosine by
 
 
 class TimeToCollision(NamedTuple):
@@ -110,31 +113,31 @@ def _time_to_collision(
         num, beside = 0, 0  # beside: 0 not asked yet, 1 tracks beside count, -1 they do not
         set_box(boxes[0], ego.centers[i], ego.size[0], ego.size[1])
         _set_step(boxes[0], speeds[i], steps[0])
+        _stretch(boxes[0], speeds[i], swept[0])
+        x, y, cos, sin = ego.states[i, 0], ego.states[i, 1], boxes[0, 2], boxes[0, 3]
+        middle_x, middle_y, lon, lat = swept[0, 0], swept[0, 1], swept[0, 5], swept[0, 6]
         for j in range(num_tracks):
             if not tracks.valid[i, j] or first[j] <= i:
                 continue
             vx = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 0]
             vy = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 1]
-            dx, dy = poses[i, j, 0] - boxes[0, 0], poses[i, j, 1] - boxes[0, 1]
-            # generous: elongated boxes further apart than this cannot touch
-            reach = boxes[0, 8] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
-            reach += HORIZON * (speeds[i] + abs(vx) + abs(vy))
-            if dx * dx + dy * dy > reach * reach:
+            # generous: what is elongated and further away than this cannot touch
+            reach = 0.5 * (sizes[i, j, 0] + sizes[i, j, 1]) + HORIZON * (abs(vx) + abs(vy)) + SLACK
+            dx, dy = poses[i, j, 0] - middle_x, poses[i, j, 1] - middle_y
+            if abs(dx * cos + dy * sin) > lon + reach or abs(dx * sin - dy * cos) > lat + reach:
                 continue
-            angle = bearing(ego.states[i], poses[i, j, 0], poses[i, j, 1])
-            if not angle < AHEAD:
-                if angle > BEHIND:
-                    continue
+            place = _place(bearing_cosine(cos, sin, poses[i, j, 0] - x, poses[i, j, 1] - y))
+            if place == _BEHIND:
+                continue
+            if place == _BESIDE:
                 if beside == 0:
                     # nuPlan rule 65: tracks beside the ego count between lanes and in intersections
-                    x, y = ego.states[i, 0], ego.states[i, 1]
                     beside = 1 if not is_common[i] or in_any(intersections, x, y) else -1
                 if beside < 0:
                     continue
             box = boxes[num + 1]
             set_box(box, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])
             speed = np.hypot(vx, vy)
-            _stretch(boxes[0], speeds[i], swept[0])
             _stretch(box, speed, swept[1])
             if collide(swept[0], swept[1], scratch):
                 _set_step(box, speed, steps[num + 1])
@@ -147,6 +150,17 @@ def _time_to_collision(
 
 
 @lean_kernel
+def _place(cosine: float) -> int:
+    """Where a track is whose bearing from the ego has this cosine; beside where it has none."""
+    if _WELL_AHEAD < cosine <= 1.0:  # most often, and without an arc cosine
+        return _AHEAD
+    angle = np.arccos(cosine)
+    if angle < AHEAD:
+        return _AHEAD
+    return _BEHIND if angle > BEHIND else _BESIDE
+
+
+@lean_kernel
 def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
     # nuPlan rule 66: along the heading, whatever the direction of the velocity
     step[0] = box[2] * speed * STEP
@@ -155,13 +169,13 @@ def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
 
 @lean_kernel
 def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
-    """Write the box (9,) that holds another one while it moves through the horizon."""
+    """Write the box (8,) that holds another one while it moves through the horizon."""
     distance = speed * HORIZON
     for index in range(BOX_SIZE):  # a slice assignment takes numba seconds to compile
         out[index] = box[index]
     out[0] += 0.5 * distance * box[2]
     out[1] += 0.5 * distance * box[3]
-    set_size(out, 2.0 * box[6] + distance, 2.0 * box[7])
+    set_size(out, 2.0 * box[5] + distance, 2.0 * box[6])
 
 
 @lean_kernel
@@ -175,6 +189,9 @@ def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tup
             boxes[index, 0] += steps[index, 0]
             boxes[index, 1] += steps[index, 1]
         for index in range(1, len(boxes)):
-            if collide(boxes[0], boxes[index], scratch):
+            dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
+            reach = boxes[0, 7] + boxes[index, 7]
+            # most are too far away, which is told without a call
+            if dx * dx + dy * dy <= reach * reach and collide(boxes[0], boxes[index], scratch):
                 return k, index - 1
     return 0, 0

@@ -22,7 +22,14 @@ LAYERS = (
 LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
 # what may be used of a neighbour in the same layer
 NEIGHBOURS = {
-    "planners": ("sim.dynamics", "sim.loop", "sim.noise", "sim.plan_check", "sim.planner"),
+    "planners": (
+        "sim.dynamics",
+        "sim.execute",
+        "sim.loop",
+        "sim.noise",
+        "sim.plan_check",
+        "sim.planner",
+    ),
     "metrics": ("sim.log",),
     "view": ("report.palette", "report.words"),
     "train": ("env", "report.palette"),

@@ -27,7 +27,7 @@ class MapCheck:
 
     def __init__(self, road: VectorMap) -> None:
         self.road = road
-        self._capacity = max(2, int(np.diff(road.edges.polygons.cell_ptr).max(initial=0)))
+        self._capacity = max(2, road.edges.most_at_a_point)
 
     @cached_property
     def overlaps(self) -> dict[tuple[int, int], tuple[float, FloatArray]]:

@@ -1,5 +1,7 @@
 """The oracle: drives what was recorded."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from shiftsim.errors import PlannerError
@@ -18,10 +20,15 @@ class LogFuture:
     sees_recording = True
     _scenario: Scenario | None = None
     _previous: Trajectory | None = None
+    _first: Sequence[int] = ()  # row of the plan's first state, by iteration
 
     def reset(self, scene: SceneInfo) -> None:
         """Take the recording of the new scenario."""
         self._scenario, self._previous = scene.expert, None
+        if scene.expert is not None:
+            # nuPlan rule 431: on from the first row with that time stamp
+            times = scene.expert.time_us
+            self._first = np.searchsorted(times, scene.expert.iteration_times).tolist()
 
     def plan(self, observation: Observation) -> Trajectory:
         """The recorded state of this iteration and up to 16 later ones, 10 rows apart.
@@ -35,15 +42,13 @@ class LogFuture:
         scenario = self._scenario
         if scenario is None:
             raise PlannerError("log-future: plan() was called before reset()")
-        row = int(scenario.iteration_rows[observation.iteration])
-        # nuPlan rule 431: on from the first row with that time stamp
-        first = int(np.searchsorted(scenario.time_us, scenario.time_us[row]))
-        rows = np.arange(first, first + POSES * ROWS_BETWEEN + 1, ROWS_BETWEEN)
-        rows[0] = row
-        rows = rows[rows < len(scenario.time_us)]
+        first = self._first[observation.iteration]
+        rows = slice(first, first + POSES * ROWS_BETWEEN + 1, ROWS_BETWEEN)
         times = scenario.time_us[rows].copy()
         if len(times) > 1:
-            self._previous = Trajectory(times, scenario.ego[rows].copy())
+            states = scenario.ego[rows].copy()
+            states[0] = scenario.ego[scenario.iteration_rows[observation.iteration]]
+            self._previous = Trajectory(times, states)
         if self._previous is None:
             raise PlannerError(
                 f"log-future: scenario {scenario.token!r} has no recorded state 0.5 s after "

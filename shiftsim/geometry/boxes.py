@@ -37,10 +37,15 @@ def circle_around(box: FloatArray) -> tuple[float, float, float]:
 @lean_kernel
 def bearing(pose: FloatArray, x: float, y: float) -> float:
     """Angle between the heading of a pose (3,) and the direction to a point, in [0, pi] [rad]."""
+    return np.arccos(bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1]))
+
+
+@lean_kernel
+def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
+    """Cosine of a bearing, from that of the heading, its sine, and the way to the point [m]."""
     # nuPlan rule 3: the cosine is not clamped, so the angle may be NaN
-    dx, dy = x - pose[0], y - pose[1]
     distance = np.sqrt(dx * dx + dy * dy)
-    return np.arccos(np.cos(pose[2]) * (dx / distance) + np.sin(pose[2]) * (dy / distance))
+    return cos * (dx / distance) + sin * (dy / distance)
 
 
 @lean_kernel

@@ -29,6 +29,7 @@ CLEAR, HIT, OPEN = 0, 1, 2
 # lie 0.1 % inside the circle; twice that is safe
 BAND = 0.02
 _QUARTER_SEGMENTS = 16  # of the round joins
+_STRIDE = 4  # vertices between those that are looked at for a first bound
 
 
 @lean_kernel
@@ -39,6 +40,12 @@ def project_on_polyline(
 
     It has the vertices `start` … `stop` - 1 of `xy` (V, 2), with arc lengths `arc` (V,) [m].
     """
+    # no point of the line is nearer than the nearest of all, so any vertex gives a bound
+    square = np.inf
+    for index in range(start, stop, _STRIDE):
+        dx, dy = xy[index, 0] - x, xy[index, 1] - y
+        square = min(square, dx * dx + dy * dy)
+    reach = (np.sqrt(square) + SLACK) * (np.sqrt(square) + SLACK)
     best = np.inf
     found = 0.0
     for index in range(start, stop - 1):
@@ -46,7 +53,7 @@ def project_on_polyline(
         bx, by = xy[index + 1, 0], xy[index + 1, 1]
         apart_x = max(min(ax, bx) - x, 0.0, x - max(ax, bx))
         apart_y = max(min(ay, by) - y, 0.0, y - max(ay, by))
-        if apart_x * apart_x + apart_y * apart_y > (best + SLACK) * (best + SLACK):
+        if apart_x * apart_x + apart_y * apart_y > reach:
             continue  # most often, and without a root
         dx, dy = bx - ax, by - ay
         square = dx * dx + dy * dy
@@ -56,6 +63,7 @@ def project_on_polyline(
         distance = point_segment_distance(x, y, ax, ay, ax + dx, ay + dy)
         if distance < best:
             best = distance
+            reach = min(reach, (best + SLACK) * (best + SLACK))
             found = arc[index] + along * np.sqrt(square)
     return found
 

@@ -1,11 +1,26 @@
 """One step of the closed loop with a plan, behind one call: check, note, track, move."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, sample_poses
 from shiftsim.sim.plan_check import GOOD, check_values
+
+
+class Course(NamedTuple):
+    """The steps that a planner takes at once, and the arrays that a rollout keeps of them."""
+
+    time_us: IntArray  # (R,) time stamps of the rows [us]
+    start: int  # row of iteration 0
+    first: int  # iteration to begin with
+    stop: int  # one past the last iteration
+    ego: FloatArray  # (R, 11) ego states, known up to the first iteration
+    noise: FloatArray  # (K, 2) added to the commands
+    commands: FloatArray  # (K, 2) clean commands
+    kept: FloatArray  # (K, P, 3) poses of the plans
 
 
 @kernel

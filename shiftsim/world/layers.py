@@ -344,6 +344,11 @@ class Layer:
         return out[:count]
 
     @cached_property
+    def most_at_a_point(self) -> int:
+        """Upper bound of the number of polygons that hold one point."""
+        return int(np.diff(self.polygons.cell_ptr).max(initial=0))
+
+    @cached_property
     def _tree(self) -> "Index":
         """The bounding boxes of the polygons in an R-tree, made when it is first asked for."""
         from rtree.index import Index
