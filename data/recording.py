@@ -1,10 +1,11 @@
 """What a reader hands to the store: a recording once, and scenarios as windows into it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
@@ -84,15 +85,23 @@ class Window:
 
 
 def scenario(
-    recording: Recording, ego: EgoTrace, window: Window, road: VectorMap, *, offset: int = 0
+    recording: Recording,
+    ego: EgoTrace,
+    window: Window,
+    road: VectorMap,
+    *,
+    offset: int = 0,
+    is_chosen: bool = False,
 ) -> Scenario:
     """The scenario that a window shows. Its arrays are read-only.
 
-    `recording` may be a span that holds the window and begins at row `offset` of the whole.
+    `recording` may be a span that holds the window and begins at row `offset` of the whole; with
+    `is_chosen` it holds the tracks that the window shows, as `visible_tracks` gives them.
     """
     rows = slice(window.first_row - offset, window.last_row - offset)
     start = window.first_row - ego.first_row - offset
     count = window.last_row - window.first_row
+    tracks = recording.tracks.rows(rows)
     return Scenario(
         token=window.token,
         scenario_type=window.scenario_type,
@@ -101,7 +110,7 @@ def scenario(
         map=road,
         time_us=recording.time_us[rows].copy(),
         ego=ego.states[start : start + count].copy(),
-        tracks=visible_tracks(recording.tracks.rows(rows), without=window.ego),
+        tracks=tracks if is_chosen else visible_tracks(tracks, without=window.ego),
         traffic_lights=listed_lights(recording.lights.rows(rows)),
         iteration_rows=window.iteration_rows - window.first_row,
         row_step=window.row_step,
@@ -114,15 +123,10 @@ def scenario(
 
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
-    seen: BoolArray = np.any(tracks.valid, axis=0)
-    if without in tracks.tokens:
-        seen[tracks.tokens.index(without)] = False
-    index = np.flatnonzero(seen)
-    valid = tracks.valid if seen.all() else tracks.valid[:, index]
-    index = index[order_of_columns(np.ascontiguousarray(valid), tracks.kinds[index])]
-    if len(index) == len(seen) and (index == np.arange(len(seen))).all():
+    index = visible_columns(tracks.valid, tracks.kinds, tracks.tokens, without)
+    if len(index) == tracks.num_tracks and (index == np.arange(len(index))).all():
         return tracks
-    shape = (len(valid), len(index))
+    shape = (len(tracks), len(index))
     chosen = Tracks(
         np.empty(shape, np.bool_),
         np.empty((*shape, 3)),
@@ -135,6 +139,19 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     sources = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
     _copy_columns(index, *map(np.ascontiguousarray, sources), *arrays)
     return chosen
+
+
+def visible_columns(
+    valid: BoolArray, kinds: IntArray, tokens: Sequence[str], without: str
+) -> IntArray:
+    """(N',) columns of the tracks of `valid` (R, N) that `visible_tracks` gives, in its order."""
+    seen: BoolArray = np.any(valid, axis=0)
+    if without in tokens:
+        seen[tokens.index(without)] = False
+    index = np.flatnonzero(seen)
+    shown = valid if seen.all() else valid[:, index]
+    order: IntArray = index[order_of_columns(np.ascontiguousarray(shown), kinds[index])]
+    return order
 
 
 def listed_lights(lights: TrafficLights) -> TrafficLights:
@@ -213,26 +230,33 @@ def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray
         for b in range(num):
             if before[a, b]:
                 waiting[b] += 1
-    done = np.zeros(num, np.bool_)
-    out = np.empty(num, np.int64)
+    out = np.empty(num, np.int64)  # by kind and age; those from `place` on have none yet
+    for track in range(num):
+        place = track
+        while place > 0 and (kinds[out[place - 1]], first[out[place - 1]]) > (
+            kinds[track],
+            first[track],
+        ):
+            place -= 1
+        _insert(out, track, place, track)
     for place in range(num):
-        best = -1
+        best = place  # the oldest where all of its kind wait
+        for other in range(place, num):
+            if kinds[out[other]] != kinds[out[place]]:
+                break
+            if waiting[out[other]] <= 0:
+                best = other
+                break
+        _insert(out, best, place, out[best])
         for track in range(num):
-            if not done[track] and (best < 0 or _precedes(track, best, waiting, kinds, first)):
-                best = track
-        out[place] = best
-        done[best] = True
-        for track in range(num):
-            if before[best, track]:
+            if before[out[place], track]:
                 waiting[track] -= 1
     return out
 
 
-@kernel
-def _precedes(a: int, b: int, waiting: IntArray, kinds: IntArray, first: IntArray) -> bool:
-    """Whether track a is to be placed before b: by kind, then free of predecessors, then age."""
-    if kinds[a] != kinds[b]:
-        return kinds[a] < kinds[b]
-    if (waiting[a] <= 0) != (waiting[b] <= 0):
-        return waiting[a] <= 0
-    return first[a] < first[b]
+@lean_kernel
+def _insert(order: IntArray, gap: int, place: int, track: int) -> None:
+    """Move what stands from `place` on by one, up to the gap, and put a track there."""
+    for other in range(gap, place, -1):
+        order[other] = order[other - 1]
+    order[place] = track

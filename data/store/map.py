@@ -1,19 +1,20 @@
 """A VectorMap as one row of a Parquet file, one list column per array, and back.
 
-Arrays are stored as they are, grids included, so that reading a city costs little more than
-reading its bytes.
+Only what cannot be made of the rest is stored: no arc lengths, bounds and grids, which stores of
+version 1 hold and which are made again for those, too.
 """
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from shiftsim.arrays import sealed
-from shiftsim.data.store.plausible import require_sound
+from shiftsim.data.store.plausible import require_sound, require_vertices
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
-from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
+from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
 from shiftsim.world.map import LAYERS, VectorMap
 
 _LINES = ("baselines", "left_boundaries", "right_boundaries")
@@ -23,26 +24,18 @@ _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its u
     for name in "lane_index left_lane right_lane block_of has_traffic_lights intersection_of"
     " turn_type is_bike intersection_kinds stop_kinds".split()
 }
-_UNITS = {"xy": "xy_m", "arc": "arc_m", "bounds": "bounds_m", "grid": "grid_m"}
 _NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
-_WIDTHS = {"xy": (2,), "bounds": (4,)}  # columns of the arrays that have two axes
-_WHOLE = ("xy", "arc", "bounds", "grid")  # float parts; all others hold integers
+_POINTERS = {name: ("ring_ptr", "poly_ptr") for name in LAYERS} | dict.fromkeys(_LINES, ("ptr",))
 
 
-def _columns(name: str, kind: type[Any]) -> dict[str, str]:
-    return {part: f"{name}_{_UNITS.get(part, part)}" for part in kind._fields}
-
-
-def _groups() -> dict[str, type[Any]]:
-    kinds = {name: Polygons for name in LAYERS}
-    return {**kinds, **dict.fromkeys(_LINES, Polylines), **dict.fromkeys(_LISTS, Lists)}
-
-
-def _schema() -> pa.Schema:
+def _schema(points: tuple[str, ...]) -> pa.Schema:
+    """The columns, where vertices are in columns that end as given."""
     out: dict[str, pa.DataType] = {}
-    for name, kind in _groups().items():
-        for part, column in _columns(name, kind).items():
-            out[column] = pa.float64() if part in _WHOLE else pa.int64()
+    for name, pointers in _POINTERS.items():
+        out |= {f"{name}_{part}": pa.float64() for part in points}
+        out |= {f"{name}_{part}": pa.int64() for part in pointers}
+    for name in _LISTS:
+        out |= {f"{name}_{part}": pa.int64() for part in Lists._fields}
     for name, column in _ARRAYS.items():
         numbers = pa.float64() if name == "speed_limits" else pa.int64()
         out[column] = pa.bool_() if name in ("has_traffic_lights", "is_bike") else numbers
@@ -57,7 +50,8 @@ def _schema() -> pa.Schema:
     )
 
 
-SCHEMA = _schema()
+SCHEMA = _schema(("x_m", "y_m"))
+_FIRST_SCHEMA = _schema(("xy_m",))  # of version 1, x and y in turn
 
 
 def write_map(path: Path, road: VectorMap) -> None:
@@ -68,11 +62,13 @@ def write_map(path: Path, road: VectorMap) -> None:
     """
     require_sound(road, str(path))
     values: dict[str, Any] = {}
-    for name, kind in _groups().items():
+    for name, pointers in _POINTERS.items():
         group = getattr(road, name)
         flat = group.polygons if isinstance(group, Layer) else group
-        for part, column in _columns(name, kind).items():
-            values[column] = getattr(flat, part).reshape(-1)
+        values[f"{name}_x_m"], values[f"{name}_y_m"] = np.ascontiguousarray(flat.xy.T)
+        values |= {f"{name}_{part}": getattr(flat, part) for part in pointers}
+    for name in _LISTS:
+        values |= {f"{name}_{part}": getattr(getattr(road, name), part) for part in Lists._fields}
     for name, column in _ARRAYS.items():
         values[column] = getattr(road, name)
     for name in LAYERS:
@@ -96,14 +92,14 @@ def read_map_file(path: Path) -> VectorMap:
     Raises:
         DataError: The file is missing or damaged.
     """
-    file = Table(path, SCHEMA)
+    file = Table(path, SCHEMA, _FIRST_SCHEMA)
     if file.num_rows != 1:
         raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=REPAIR)
     # column by column: decoding a city at once takes three times its size
-    items = {name: _items(file.read(columns=[name])[name]) for name in SCHEMA.names}
+    items = {name: _items(file.read(columns=[name])[name]) for name in file.names}
     pa.default_memory_pool().release_unused()
     try:
-        road = _assemble(file.footer, items)
+        road = _assemble(file.footer, items, str(path))
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
     require_sound(road, str(path))
@@ -117,14 +113,17 @@ def _items(column: pa.ChunkedArray) -> Any:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _assemble(footer: dict[str, Any], items: dict[str, Any]) -> VectorMap:
+def _assemble(footer: dict[str, Any], items: dict[str, Any], where: str) -> VectorMap:
     parts: dict[str, Any] = {}
-    for name, kind in _groups().items():
-        flat = {
-            part: sealed(items[column].reshape(-1, *_WIDTHS.get(part, ())))
-            for part, column in _columns(name, kind).items()
-        }
-        parts[name] = kind(**flat)
+    for name, pointers in _POINTERS.items():
+        together = items.get(f"{name}_xy_m")
+        if together is None:
+            together = np.column_stack([items[f"{name}_x_m"], items[f"{name}_y_m"]])
+        given = [together.reshape(-1, 2), *(items[f"{name}_{part}"] for part in pointers)]
+        require_vertices(f"{where}: {name}", *given)
+        parts[name] = index_polygons(*given) if name in LAYERS else index_polylines(*given)
+    for name in _LISTS:
+        parts[name] = Lists(*(sealed(items[f"{name}_{part}"]) for part in Lists._fields))
     for name in LAYERS:
         ids = items[f"{name}_ids"]
         if len(ids) != len(parts[name].poly_ptr) - 1:

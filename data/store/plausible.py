@@ -15,12 +15,12 @@ from shiftsim.data.store.tables import TRACKS as TRACKS_FILE
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.ranges import STORE, require
+from shiftsim.world.ranges import MAP_EXTENT, STORE, require
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
 _BOX = TRACKS.names[2:]  # x, y, heading, velocity, size
-_EGO_LIMITS, _BOX_LIMITS = (
+_EGO_LIMITS, BOX_LIMITS = (
     np.array([STORE[name][:2] for name in names]) for names in (EGO_COLUMNS, _BOX)
 )
 
@@ -48,9 +48,14 @@ def require_scenarios(table: pa.Table, where: str) -> None:
             require(STORE, field.name, values.to_numpy(zero_copy_only=False), where)
 
 
-def require_plausible(scene: Scenario, ego: str, folder: Path) -> None:
-    """Refuse a scenario with a number outside of its range; `folder` is that of its recording."""
-    require_recording(scene.time_us, scene.tracks, scene.traffic_lights, folder)
+def require_plausible(scene: Scenario, ego: str, folder: Path, *, boxes: bool = True) -> None:
+    """Refuse a scenario with a number outside of its range; `folder` is that of its recording.
+
+    Without `boxes`, those of the tracks are known to be good.
+    """
+    _require_frames(scene.time_us, scene.traffic_lights, folder)
+    if boxes:
+        require_boxes(scene.tracks, len(scene.time_us), folder / TRACKS_FILE)
     if (np.diff(scene.iteration_times) <= 0).any():
         raise DataError(f"{folder / FRAMES}: column 'time_us' does not increase", REPAIR)
     require_states(scene.ego, ego_file(folder, ego))
@@ -72,22 +77,33 @@ def require_recording(
 
     `folder` is where it is, or is to be written.
     """
+    _require_frames(time_us, lights, folder)
+    require_boxes(tracks, len(time_us), folder / TRACKS_FILE)
+
+
+def _require_frames(time_us: IntArray, lights: TrafficLights, folder: Path) -> None:
     frames = f"{folder / FRAMES}: column"
     require(STORE, "time_us", time_us, frames)
     if (np.diff(time_us) < 0).any():  # they may repeat, nuPlan rule 431
         raise DataError(f"{frames} 'time_us' does not increase", REPAIR)
     _require(lights.status.shape == (len(time_us), len(lights.connector_ids)), frames)
     require(STORE, "light_status", lights.status, frames)
-    boxes = f"{folder / TRACKS_FILE}"
-    shape = (len(time_us), len(tracks.tokens))
-    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], boxes)
+
+
+def require_boxes(tracks: Tracks, num_rows: int, boxes: Path) -> None:
+    """Refuse tracks whose arrays do not fit together, or with a number outside of its range.
+
+    `boxes` is the file where they are, or are to be written.
+    """
+    shape = (num_rows, len(tracks.tokens))
+    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], str(boxes))
     require(STORE, "kinds", tracks.kinds, f"{boxes}: footer")
     arrays = tracks.poses, tracks.velocities, tracks.sizes
     for array, width in zip(arrays, (3, 2, 2), strict=True):
-        _require(array.shape == (*shape, width), boxes)
+        _require(array.shape == (*shape, width), str(boxes))
     poses, velocities, sizes = (_plain(array, np.float64) for array in arrays)
     valid = _plain(tracks.valid, np.bool_)
-    row, track = _first_outside(valid, poses, velocities, sizes, _BOX_LIMITS)
+    row, track = _first_outside(valid, poses, velocities, sizes, BOX_LIMITS)
     if row >= 0:
         where = f"{boxes}: track {tracks.tokens[track]!r}, row {row}: column"
         values = np.concatenate([array[row, track] for array in arrays])
@@ -98,6 +114,20 @@ def require_recording(
 def _plain(array: Any, kind: Any) -> Any:
     """As the kernel takes it."""
     return read_only(np.ascontiguousarray(array, kind))
+
+
+@kernel
+def all_inside(columns: tuple[FloatArray, ...], limits: FloatArray) -> bool:
+    """Whether all boxes are within `limits` (7, 2), given as their columns, each (A,)."""
+    good = 0
+    for column in range(len(columns)):
+        values, low, high = columns[column], limits[column, 0], limits[column, 1]
+        may_be_nan = 3 <= column < 5  # velocities of static objects
+        for box in range(len(values)):
+            value = values[box]
+            inside = (value >= low) & (value <= high)
+            good += inside | (may_be_nan & (value != value))
+    return good == len(columns) * len(columns[0])
 
 
 @kernel
@@ -141,7 +171,7 @@ def require_sound(road: VectorMap, where: str) -> None:
             if len(part.ids) != len(part.polygons.bounds) or len(part.index) != len(part.ids):
                 raise DataError(f"{column} an id is missing or occurs twice", REPAIR)
         elif isinstance(part, Polylines):
-            require(STORE, "xy", part.xy, column)
+            _require_places(part.xy, column)
             require(STORE, "arc", part.arc, column)
             _require_parts(
                 part.ptr, len(part.xy), num_edges, column, least=2 * (name == "baselines")
@@ -178,9 +208,30 @@ def require_sound(road: VectorMap, where: str) -> None:
     _require(0 <= road.num_roadblocks <= num_blocks, f"{where}: num_roadblocks")
 
 
+def require_vertices(where: str, xy: FloatArray, *pointers: IntArray) -> None:
+    """Refuse vertices (V, 2) of which no lines, or polygons with a grid, can be made.
+
+    `pointers` are those of lines, or of rings and of polygons.
+    """
+    _require_places(xy, where)
+    total = len(xy)
+    for ptr in pointers:
+        _require(len(ptr) > 0, where)
+        _require_parts(ptr, total, len(ptr) - 1, where, least=len(pointers) - 1)
+        total = len(ptr) - 1
+
+
+def _require_places(xy: FloatArray, where: str) -> None:
+    """Refuse vertices out of their range, or too far apart for a grid over them."""
+    require(STORE, "xy", xy, where)
+    if len(xy):
+        require(MAP_EXTENT, "extent", np.ptp(xy, axis=0).max(), where)
+
+
 def _require_polygons(flat: Polygons, where: str) -> None:
     count = len(flat.bounds)
-    for name in ("xy", "bounds", "grid"):
+    _require_places(flat.xy, where)
+    for name in ("bounds", "grid"):
         require(STORE, name, getattr(flat, name), where)
     _require_parts(flat.poly_ptr, len(flat.ring_ptr) - 1, count, where, least=1)
     _require_parts(flat.ring_ptr, len(flat.xy), len(flat.ring_ptr) - 1, where, least=1)

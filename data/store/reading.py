@@ -149,13 +149,15 @@ class ScenarioStore:
         """As `read`, without the review."""
         window = self.window(token)
         first, last = window.first_row, window.last_row
-        recording = self.recording(window.log_name).read(first, last)
+        stored = self.recording(window.log_name)
+        recording = stored.read_window(window, plausible=plausible)
         states = ego_states(self.ego(window.log_name, window.ego), first, last)
         # The span starts at the window's first row, and so do the ego states.
         ego = EgoTrace(window.log_name, window.ego, 0, states)
-        scene = make_scenario(recording, ego, window, self.map(recording.city), offset=first)
+        road = self.map(recording.city)
+        scene = make_scenario(recording, ego, window, road, offset=first, is_chosen=True)
         if plausible:
-            require_plausible(scene, window.ego, self.recording_folder(window.log_name))
+            require_plausible(scene, window.ego, stored.frames.path.parent, boxes=False)
         return scene
 
     def map(self, city: str) -> VectorMap:

@@ -20,8 +20,11 @@ from shiftsim.data.arrow import defer_pandas
 defer_pandas()  # before the first array
 
 FORMAT = "shiftsim-store"
-VERSION = 1
-BLOCK_ROWS = 128  # rows of a recording per row group of tracks; a window reads few it does not need
+VERSION = 2
+READABLE = (1, 2)
+# rows of a recording per row group of tracks, about: what opening one costs is that of 80 more rows
+BLOCK_ROWS = 512
+FIRST_BLOCK_ROWS = 128  # in version 1, whose footers do not say it
 FRAME_BLOCK = 2048  # rows per row group of frames and ego states
 
 _F64, _I64, _I32 = pa.float64(), pa.int64(), pa.int32()
@@ -87,5 +90,8 @@ EGO_COLUMNS = (
 )
 EGO = _schema(**dict.fromkeys(EGO_COLUMNS, _F64))
 
-# Columns stored as their bytes in planes, which compress much better than floats as they are.
-PLANES = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "ax_mps2", "ay_mps2")
+# Columns of few values in any file.
+REPEATING = (
+    *("log", "recording", "ego", "type", "city", "duration_s", "offset_s", "subsample_ratio"),
+    *("length_m", "width_m"),
+)

@@ -1,21 +1,32 @@
 """A recording as Parquet files, and the part of it that a window needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.data.recording import EgoTrace, Recording
+from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
-from shiftsim.data.store.plausible import require_recording, require_states
+from shiftsim.data.store.plausible import (
+    BOX_LIMITS,
+    all_inside,
+    require_boxes,
+    require_recording,
+    require_states,
+)
 from shiftsim.data.store.tables import FRAMES, REPAIR, TRACKS, Table, ego_file, write_blocks
 from shiftsim.errors import DataError
 from shiftsim.world.ranges import STORE, require
 from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
+
+# which of some tracks are wanted, in order, from when they are there, their kinds and tokens
+_Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
+_MANY = 8  # rows for every value of a column that is written by a dictionary
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
@@ -38,12 +49,13 @@ def write_recording(folder: Path, recording: Recording) -> None:
         "log": recording.log_name,
         "connectors": list(lights.connector_ids),
     }
-    write_blocks(folder / FRAMES, _split(frames, schema.FRAME_BLOCK), footer)
+    write_blocks(folder / FRAMES, _split(frames, schema.FRAME_BLOCK), footer, codec="lz4")
     tracks = recording.tracks
-    starts = range(0, max(len(tracks), 1), schema.BLOCK_ROWS)
-    blocks = (_track_block(tracks, start) for start in starts)
-    footer = {"tokens": list(tracks.tokens), "kinds": tracks.kinds.tolist()}
-    write_blocks(folder / TRACKS, blocks, footer)
+    num_blocks = max(1, round(len(tracks) / schema.BLOCK_ROWS))
+    rows = max(1, -(-len(tracks) // num_blocks))
+    blocks = (_track_block(tracks, slice(at * rows, (at + 1) * rows)) for at in range(num_blocks))
+    names = {"tokens": list(tracks.tokens), "kinds": tracks.kinds.tolist()}
+    write_blocks(folder / TRACKS, blocks, {**names, "block_rows": rows}, codec="lz4")
 
 
 def write_ego(folder: Path, ego: EgoTrace) -> None:
@@ -56,18 +68,26 @@ def write_ego(folder: Path, ego: EgoTrace) -> None:
     columns = [pa.array(np.ascontiguousarray(ego.states[:, i])) for i in range(NUM_STATE)]
     table = pa.Table.from_arrays(columns, schema=schema.EGO)
     footer = {"name": ego.name, "first_row": ego.first_row}
-    write_blocks(ego_file(folder, ego.name), _split(table, schema.FRAME_BLOCK), footer)
+    few = len(table) // _MANY
+    repeating = [n for n, v in zip(table.column_names, columns, strict=True) if _count(v) <= few]
+    blocks = _split(table, schema.FRAME_BLOCK)
+    write_blocks(ego_file(folder, ego.name), blocks, footer, repeating, codec="lz4")
 
 
 def _split(table: pa.Table, rows: int) -> list[pa.Table]:
     return [table.slice(start, rows) for start in range(0, max(len(table), 1), rows)]
 
 
-def _track_block(tracks: Tracks, start: int) -> pa.Table:
+def _count(values: pa.Array) -> int:
+    """How many values there are, each counted once."""
+    return len(np.unique(values.to_numpy().view(np.int64)))
+
+
+def _track_block(tracks: Tracks, rows: slice) -> pa.Table:
     """Boxes of some rows, track by track: neighbours in time compress well."""
-    part = tracks.rows(slice(start, start + schema.BLOCK_ROWS))
+    part = tracks.rows(rows)
     track, row = np.nonzero(part.valid.T)
-    columns = [pa.array((row + start).astype(np.int32)), pa.array(track.astype(np.int32))]
+    columns = [pa.array((row + rows.start).astype(np.int32)), pa.array(track.astype(np.int32))]
     for values in (part.poses, part.velocities, part.sizes):
         columns += [pa.array(values[row, track, axis]) for axis in range(values.shape[2])]
     return pa.Table.from_arrays(columns, schema=schema.TRACKS)
@@ -84,6 +104,7 @@ class StoredRecording:
     connectors: tuple[str, ...]  # ids of the connectors that have lights
     tokens: tuple[str, ...]  # tokens of the tracks
     kinds: IntArray  # (N,) AgentKind codes of the tracks
+    block_rows: int  # rows of the recording per row group of boxes
 
     @property
     def num_rows(self) -> int:
@@ -96,11 +117,25 @@ class StoredRecording:
         Raises:
             DataError: A file is damaged or does not have the rows.
         """
+        return self._read(first, last, lambda valid, kinds, names: np.arange(len(names)), False)
+
+    def read_window(self, window: Window, *, plausible: bool) -> Recording:
+        """The rows of a window, and the tracks that it shows.
+
+        Raises:
+            DataError: A file is damaged or does not have the rows, or, where `plausible` is asked
+                for, a box holds a number outside of its range.
+        """
+        choose = partial(visible_columns, without=window.ego)
+        return self._read(window.first_row, window.last_row, choose, plausible)
+
+    def _read(self, first: int, last: int, choose: _Choice, plausible: bool) -> Recording:
         if not 0 <= first < last <= self.num_rows:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
         frames = _rows(self.frames, first, last)
-        tracks, lights = self._read_tracks(first, last), self._lights(frames)
+        lights = self._lights(frames)
+        tracks = self._tracks(first, last, choose, plausible)
         return Recording(self.log_name, self.city, frames["time_us"].to_numpy(), tracks, lights)
 
     def _lights(self, frames: pa.Table) -> TrafficLights:
@@ -111,22 +146,30 @@ class StoredRecording:
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
         return TrafficLights(self.connectors, values)
 
-    def _read_tracks(self, first: int, last: int) -> Tracks:
-        blocks = range(first // schema.BLOCK_ROWS, (last - 1) // schema.BLOCK_ROWS + 1)
+    def _tracks(self, first: int, last: int, choose: _Choice, plausible: bool) -> Tracks:
+        blocks = range(first // self.block_rows, (last - 1) // self.block_rows + 1)
         if blocks[-1] >= self.tracks.num_blocks:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
-        table = self.tracks.read(list(blocks))
-        row, track, *values = _views(table, schema.TRACKS.names)
+        row, track, *boxes = _views(self.tracks.read(list(blocks)))
         if len(row) and not 0 <= track.min() <= track.max() < len(self.tokens):
             raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        values = tuple(boxes)
         place = _places(row, track, first, last, len(self.tokens))
         seen = np.flatnonzero(place >= 0)
-        shape = (last - first, len(seen))
-        valid = np.zeros(shape, np.bool_)
-        poses, velocities, sizes = _dense(shape)
-        _scatter(row, track, place, first, tuple(values), valid, poses, velocities, sizes)
+        valid = np.zeros((last - first, len(seen)), np.bool_)
+        _mark(row, track, place, first, valid)
+        order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
+        if len(order) < len(seen) or (order != np.arange(len(seen))).any():
+            valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
+            place[:] = -1
+            place[seen] = np.arange(len(seen))
+        poses, velocities, sizes = _dense(valid.shape)
+        _scatter(row, track, place, first, values, valid, poses, velocities, sizes)
         names = tuple(self.tokens[i] for i in seen.tolist())
-        return Tracks(valid, poses, velocities, sizes, self.kinds[seen], names)
+        tracks = Tracks(valid, poses, velocities, sizes, self.kinds[seen], names)
+        if plausible and not all_inside(values, BOX_LIMITS):
+            require_boxes(tracks, last - first, self.tracks.path)
+        return tracks
 
 
 def open_recording(folder: Path) -> StoredRecording:
@@ -144,7 +187,11 @@ def open_recording(folder: Path) -> StoredRecording:
     if len(kinds) != len(names["tokens"]):
         raise DataError(f"{tracks.path}: kinds and tokens differ in number", hint=REPAIR)
     connectors, tokens = tuple(head["connectors"]), tuple(names["tokens"])
-    return StoredRecording(head["log"], head["city"], frames, tracks, connectors, tokens, kinds)
+    rows = names.get("block_rows", schema.FIRST_BLOCK_ROWS)
+    if not isinstance(rows, int) or rows < 1:
+        raise DataError(f"{tracks.path}: the footer has no good 'block_rows'", hint=REPAIR)
+    open_files = head["log"], head["city"], frames, tracks
+    return StoredRecording(*open_files, connectors, tokens, kinds, rows)
 
 
 def _footer(table: Table, kinds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -184,7 +231,7 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
     rows = _rows(table, first - start, last - start)
     states = np.empty((last - first, NUM_STATE))
-    for index, values in enumerate(_views(rows, schema.EGO_COLUMNS)):
+    for index, values in enumerate(_views(rows)):
         states[:, index] = values
     return states
 
@@ -218,13 +265,15 @@ def _dense(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     )
 
 
-def _views(table: pa.Table, names: Sequence[str]) -> list[Any]:
-    """Columns of a table as arrays, read-only and without a copy where it has one chunk."""
-    whole = table.combine_chunks()
-    return [
-        whole[name].chunk(0).to_numpy() if len(whole) else _nothing(whole[name].type)
-        for name in names
-    ]
+def _views(table: pa.Table) -> list[Any]:
+    """Columns of a table as arrays, read-only and without a copy where they have one chunk."""
+    return [_view(column) for column in table.columns]
+
+
+def _view(column: pa.ChunkedArray) -> Any:
+    if not len(column):
+        return _nothing(column.type)
+    return (column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()).to_numpy()
 
 
 def _nothing(kind: pa.DataType) -> Any:
@@ -249,6 +298,15 @@ def _places(row: IntArray, track: IntArray, first: int, last: int, num: int) -> 
 
 
 @kernel
+def _mark(row: IntArray, track: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
+    """Note in `valid` (R, N), which is false, where there are boxes."""
+    for box in range(len(row)):
+        at = row[box] - first
+        if 0 <= at < len(valid):
+            valid[at, place[track[box]]] = True
+
+
+@kernel
 def _scatter(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
     row: IntArray,
     track: IntArray,
@@ -260,13 +318,11 @@ def _scatter(  # type: ignore[no-untyped-def]  # compiled; the arrays are those 
     velocities: FloatArray,
     sizes: FloatArray,
 ):
-    """Spread boxes over dense arrays; what no box fills becomes NaN."""
+    """Spread boxes of the tracks that have a place over dense arrays; what is not valid is NaN."""
     for box in range(len(row)):
-        at = row[box] - first
-        if at < 0 or at >= len(valid):
+        at, to = row[box] - first, place[track[box]]
+        if at < 0 or at >= len(valid) or to < 0:
             continue
-        to = place[track[box]]
-        valid[at, to] = True
         for axis in range(3):
             poses[at, to, axis] = values[axis][box]
         for axis in range(2):

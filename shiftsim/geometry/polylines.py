@@ -126,12 +126,24 @@ def nearest_vertex(
 
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
     """(V,) arc length at each vertex from the start of its own polyline, as in `Polylines` [m]."""
+    steps = np.diff(xy, axis=0)
     out = np.zeros(len(xy))
-    for start, stop in zip(ptr[:-1].tolist(), ptr[1:].tolist(), strict=True):
-        if stop > start + 1:
-            steps = np.diff(xy[start:stop], axis=0)
-            out[start + 1 : stop] = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))
+    np.hypot(steps[:, 0], steps[:, 1], out=out[1:])
+    if len(ptr) == 2:  # most often; no kernel needs to be compiled for it
+        np.cumsum(out, out=out)
+    else:
+        _sum_up(out, ptr)
     return out
+
+
+@lean_kernel
+def _sum_up(steps: FloatArray, ptr: IntArray) -> None:
+    """Make lengths (V,) of the segments that end at the vertices of lines arc lengths of these."""
+    for line in range(len(ptr) - 1):
+        total = 0.0
+        for vertex in range(ptr[line], ptr[line + 1]):
+            total = 0.0 if vertex == ptr[line] else total + steps[vertex]
+            steps[vertex] = total
 
 
 class Path(NamedTuple):

@@ -95,6 +95,11 @@ def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
     np.cumsum([len(line) for line in lines], out=ptr[1:])
     parts = [np.asarray(line, np.float64).reshape(-1, 2) for line in lines]
     xy = np.ascontiguousarray(np.concatenate(parts)) if parts else np.zeros((0, 2))
+    return index_polylines(xy, ptr)
+
+
+def index_polylines(xy: FloatArray, ptr: IntArray) -> Polylines:
+    """Add arc lengths to flat polylines (arrays as in `Polylines`)."""
     return Polylines(sealed(xy), sealed(ptr), sealed(arc_lengths(xy, ptr)))
 
 

@@ -109,7 +109,7 @@ OPENDRIVE: Table = {
     **_same("object length, object width, signal width, signalReference width", -1, 1e4, "m"),
     **_same("signal value, signalReference value", -1e9, 1e9, "as the file says"),
 }
-MAP_EXTENT: Table = {"extent": Range(0, 2e5, "m")}  # of what is made from OpenDRIVE or nuPlan
+MAP_EXTENT: Table = {"extent": Range(0, 2e5, "m")}  # of a map
 
 # columns of a DSC3D recording, and keys of its data_meta.json
 DSC3D: Table = {
@@ -211,7 +211,7 @@ FORMATS: Mapping[str, Table] = {
     "Open data sets": OPEN_DATA,
     "nuPlan log": NUPLAN_LOG,
     "nuPlan map": {**NUPLAN_MAP, **MAP_EXTENT},
-    "Store": STORE,
+    "Store": {**STORE, **MAP_EXTENT},
     "Run folder": RUN,
     "Checkpoint": CHECKPOINT,
     "Settings": SETTINGS,

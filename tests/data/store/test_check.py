@@ -82,9 +82,9 @@ def test_no_scenario_at_all_is_an_error(tmp_path):
 def test_repeated_boxes_are_an_error(tmp_path, monkeypatch):
     block = stored._track_block
 
-    def twice(tracks, start):
-        table = block(tracks, start)
-        more = table.slice(3, 2 if start == 0 else 0)
+    def twice(tracks, rows):
+        table = block(tracks, rows)
+        more = table.slice(3, 2 if rows.start == 0 else 0)
         return stored.pa.concat_tables([table, more]).combine_chunks()
 
     monkeypatch.setattr(stored, "_track_block", twice)

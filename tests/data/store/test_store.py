@@ -1,6 +1,7 @@
 """The scenario store: what is written comes back to the last bit, and damage is named."""
 
 import dataclasses
+import hashlib
 import json
 import shutil
 import sqlite3
@@ -18,6 +19,7 @@ from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store import schema
 from shiftsim.data.store.check import check_store
+from shiftsim.data.store.map import read_map_file, write_map
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
@@ -27,6 +29,7 @@ from shiftsim.world.state import Tracks, TrafficLights
 GOLDEN = places.GOLDEN / "nuplan_format"
 LOG = GOLDEN / "logs" / "fixture_log_0001.db"
 TOKEN = "000000012a05f23c"
+VERSION_1 = places.GOLDEN / "store_version_1"
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,10 @@ def assert_same(a: object, b: object, where: str = "") -> None:
             assert_same(left, right, where)
     else:
         assert a == b, where
+
+
+def digest(array: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
 
 
 def make_recording(num_rows: int, num_tracks: int, rng: np.random.Generator) -> Recording:
@@ -222,8 +229,82 @@ def test_a_window_reads_only_its_part_of_a_long_recording(
     read = tracks.read
     monkeypatch.setattr(tracks, "read", lambda blocks: asked.append(blocks) or read(blocks))
     store.read("a")
-    first, last = 1000 // schema.BLOCK_ROWS, 1199 // schema.BLOCK_ROWS
-    assert asked == [list(range(first, last + 1))]
+    rows = store.recording("drive").block_rows
+    assert 0.7 * schema.BLOCK_ROWS < rows < 1.5 * schema.BLOCK_ROWS
+    assert asked == [list(range(1000 // rows, 1199 // rows + 1))]
+    assert len(asked[0]) < tracks.num_blocks
+
+
+def test_windows_of_several_blocks_come_back_to_the_last_bit(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    recording = make_recording(1700, 7, rng)
+    tracks = recording.tracks
+    write_store(tmp_path / "s", road, recording, make_window("a", 400, 1500))
+    stored = open_store(tmp_path / "s").recording("drive")
+    assert stored.tracks.num_blocks == 3
+    for first, last in ((0, 1700), (400, 1500), (566, 568), (1699, 1700)):
+        part = stored.read(first, last).tracks
+        kept = [tracks.tokens.index(token) for token in part.tokens]
+        assert kept == np.flatnonzero(tracks.valid[first:last].any(axis=0)).tolist()
+        for name in ("valid", "poses", "velocities", "sizes"):
+            expected = getattr(tracks, name)[first:last, kept]
+            np.testing.assert_array_equal(getattr(part, name), expected)
+
+
+@pytest.mark.golden
+def test_stores_of_version_1_are_read(tmp_path: Path) -> None:
+    expected = json.loads((VERSION_1 / "expected.json").read_text("utf-8"))
+    store = open_store(VERSION_1 / "store")
+    found: dict[str, object] = {}
+    for scene in store:
+        parts = {name: getattr(scene, name) for name in ("time_us", "ego")}
+        for name in ("valid", "poses", "velocities", "sizes", "kinds"):
+            parts[name] = getattr(scene.tracks, name)
+        parts["lights"] = scene.traffic_lights.status
+        found |= {f"{scene.token} {name}": digest(array) for name, array in parts.items()}
+        found[f"{scene.token} tokens"] = list(scene.tracks.tokens)
+    road = store.map("fixture-town")
+    arrays = {"edges": road.edges.polygons.xy, "cells": road.edges.polygons.cell_items}
+    arrays |= {"baselines": road.baselines.xy, "outgoing": road.outgoing.items}
+    found |= {name: digest(array) for name, array in arrays.items()}
+    found["ids"] = list(road.edges.ids[:3])
+    assert found == expected
+
+
+@pytest.mark.golden
+def test_a_store_of_version_1_is_added_to(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    path = Path(shutil.copytree(VERSION_1 / "store", tmp_path / "s"))
+    before = open_store(path).read("a")
+    recording = dataclasses.replace(make_recording(150, 3, rng), log_name="late")
+    with StoreWriter(path) as writer:
+        writer.add_map(road)
+        writer.add_recording(recording)
+        writer.add_ego(EgoTrace("late", "ego", 0, np.full((150, 11), 0.25)))
+        writer.add_window(dataclasses.replace(make_window("c", 0, 150), log_name="late"))
+    assert json.loads((path / "store.json").read_text("utf-8"))["version"] == schema.VERSION
+    after = open_store(path)
+    assert_same(after.read("a"), before)
+    assert after.read("c").tracks.num_tracks == 3
+
+
+def test_a_map_too_wide_for_its_grids_is_neither_written_nor_read(
+    tmp_path: Path, road: VectorMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = np.array(road.crosswalks.polygons.xy)
+    far[0] += 1e8
+    flat = road.crosswalks.polygons._replace(xy=far)
+    wide = dataclasses.replace(road, crosswalks=dataclasses.replace(road.crosswalks, polygons=flat))
+    path = tmp_path / "wide.parquet"
+    message = r"wide\.parquet: crosswalks:? 'extent'.* is beyond"
+    with pytest.raises(DataError, match=message):
+        write_map(path, wide)
+    monkeypatch.setattr("shiftsim.data.store.map.require_sound", lambda *given: None)
+    write_map(path, wide)
+    with pytest.raises(DataError, match=message):
+        read_map_file(path)
 
 
 def test_an_empty_recording_is_fine(tmp_path: Path, road: VectorMap) -> None:
