@@ -49,7 +49,21 @@ def checkpoint_folder() -> Path:
 
 def remote_store_folder() -> Path:
     """Folder of what was copied from stores behind a URL: `SHIFTSIM_CACHE`, or below the cache."""
-    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
+    return _user_cache() / "stores"
+
+
+def _user_cache() -> Path:
+    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser()
+
+
+def kernel_folders() -> list[Path]:
+    """Where compiled kernels are looked for, and kept in the first one that can be written.
+
+    `NUMBA_CACHE_DIR`, else that of the checkout or of the installed package; that of the user.
+    """
+    is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
+    own = PACKAGE.parent / ".numba-cache" if is_checkout else PACKAGE / "__pycache__" / "kernels"
+    return [Path(os.environ.get("NUMBA_CACHE_DIR") or own).expanduser(), _user_cache() / "kernels"]
 
 
 def below(folder: Path, name: str) -> Path:

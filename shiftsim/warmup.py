@@ -1,21 +1,31 @@
-"""Compile the kernels of a simulation beside other work.
+"""Compile kernels before they are needed.
 
-On a fresh install the kernels are compiled once, in about half a minute. `warm_up` starts one
-process per share of them, on a small scene that is part of the package; whoever needs the kernels
-later finds them in the disk cache.
+On a fresh install every kernel is compiled once. `warm_up` does so beside other work, a process
+per share of them, on a small scene that is part of the package; `fill` makes runs of all planners,
+in two processes, and leaves nothing to compile for a run. Who needs kernels later finds them on
+disk.
 """
 
 import json
 import subprocess
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from subprocess import DEVNULL
+from importlib.util import find_spec
+from pathlib import Path
+from subprocess import DEVNULL, PIPE
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
+from shiftsim.arrays import kept
+from shiftsim.errors import ShiftsimError
 from shiftsim.files import PACKAGE, fresh_python
+from shiftsim.planners.table import PLANNERS
+from shiftsim.runs.config import default_workers
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.metric_worlds import read_world
 from shiftsim.verify.worlds import make_scenario, make_tracks
@@ -105,3 +115,127 @@ def scene() -> Scenario:
     log, road = _rollout()
     out = make_scenario(log.token, road, log.time_us, log.ego, log.tracks)
     return replace(out, iteration_rows=np.arange(12, dtype=np.int64), route=("R1", "RC1", "R2"))
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What `fill` left on disk."""
+
+    folders: tuple[str, ...]  # where the kernels are
+    files: int  # kernels, one for each combination of types
+    bytes: int  # their size
+    compiled: int  # of the files, those that were not there before
+    processes: int  # side by side
+    seconds: float  # from start to end [s]
+
+    def line(self) -> str:
+        """As text."""
+        return (
+            f"kernels: {self.files} ({self.bytes / 1e6:.1f} MB) in {' and '.join(self.folders)}, "
+            f"{self.compiled} of them compiled in {self.seconds:.0f} s by "
+            f"{'1 process' if self.processes == 1 else f'{self.processes} processes'}"
+        )
+
+
+def fill(advance: Callable[[int, int, str], None] = lambda done, total, note: None) -> Filled:
+    """Compile all that runs need, and see where it is.
+
+    Raises:
+        ShiftsimError: A run failed.
+    """
+    began, number = perf_counter(), min(2, default_workers())
+    files = dict[str, bool]()
+    with tempfile.TemporaryDirectory(prefix="shiftsim-kernels-") as folder:
+        rounds = [[*map(_share, SHARES), ("store", folder, "{}")], [*_runs(folder)]]
+        total, done = sum(map(len, rounds)), 0
+        for jobs in rounds:
+            for name, found in _side_by_side(jobs, number):
+                files |= {path: made or files.get(path, False) for path, made in found.items()}
+                done += 1
+                advance(done, total, name)
+    return Filled(
+        folders=tuple(sorted({str(Path(path).parent.parent) for path in files})),
+        files=len(files),
+        bytes=sum(Path(path).stat().st_size for path in files),
+        compiled=sum(files.values()),
+        processes=number,
+        seconds=perf_counter() - began,
+    )
+
+
+def _share(name: str) -> tuple[str, str, str]:
+    return name, "", "{}"
+
+
+def _runs(folder: str) -> Iterator[tuple[str, str, str]]:
+    """Runs that together use every kernel of a run: name, folder, settings; the longest first."""
+    has_torch = find_spec("torch") is not None
+    learned = [name for name, entry in PLANNERS.items() if entry.kind == "learned"]
+    rules = [name for name in PLANNERS if name not in ("scripted", "pdm-closed", *learned)]
+    wanted: list[tuple[Sequence[str], str, str]] = [
+        (["constant-velocity"], "reactive", "lqr"),
+        (["pdm-closed"], "nonreactive", "lqr"),
+        (rules, "nonreactive", "lqr"),
+        *(([name], "nonreactive", "lqr") for name in learned if has_torch),
+        (["constant-velocity"], "constant-velocity", "perfect"),
+        (["constant-velocity"], "learned", "lqr"),
+    ]
+    for planners, traffic, controller in wanted:
+        if traffic == "learned" and not has_torch:
+            continue
+        drawn = {
+            name: {"checkpoint": "deterministic:drive"} for name in planners if name in learned
+        }
+        settings = {"traffic": traffic, "controller": controller, "planner_args": drawn}
+        name = f"{', '.join(planners)} in {traffic} traffic"
+        yield name, folder, json.dumps({"planners": list(planners), **settings})
+
+
+def _side_by_side(
+    jobs: Sequence[tuple[str, str, str]], number: int
+) -> Iterator[tuple[str, dict[str, bool]]]:
+    """Do jobs, so many at a time: the name of each that is done, and the files that it used."""
+    command = "import sys; from shiftsim.warmup import do; do(*sys.argv[1:])"
+    waiting, running = list(jobs), dict[str, subprocess.Popen[str]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < number:
+                job = waiting.pop(0)
+                words, environment = fresh_python(command, *job)
+                running[job[0]] = subprocess.Popen(
+                    words, env=environment, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, text=True
+                )
+            for name, process in [*running.items()]:
+                try:
+                    out, said = process.communicate(timeout=0.1)
+                except subprocess.TimeoutExpired:
+                    continue
+                if process.returncode:
+                    why = (said.strip().splitlines() or ["no message"])[-1]
+                    raise ShiftsimError(
+                        f"compiling the kernels of {name}: {why}", hint="see shiftsim doctor"
+                    )
+                del running[name]
+                yield name, json.loads(out.splitlines()[-1])
+    finally:
+        for process in running.values():
+            process.kill()
+            process.wait()
+
+
+def do(name: str, folder: str, settings: str) -> None:
+    """One job of `fill`; prints which files of kernels it used, and whether it made them."""
+    values: dict[str, Any] = json.loads(settings)
+    if values:
+        from shiftsim.api import run
+
+        values |= {"store": f"{folder}/demo", "split": "demo-mini", "limit": 6, "workers": 1}
+        with tempfile.TemporaryDirectory(prefix="run-", dir=folder) as out:
+            run(values.pop("planners"), noise=["ou-high"], out=f"{out}/run", **values)
+    elif name == "store":
+        from shiftsim.data.demo.store import demo_store
+
+        demo_store(Path(folder, "demo"))
+    else:
+        SHARES[name]()
+    print(json.dumps({str(path): made for path, made in kept.used.items()}))

@@ -5,12 +5,10 @@ import importlib.util
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from shiftsim.arrays import cache_folder
-from shiftsim.files import PACKAGE, sources
+from shiftsim.files import PACKAGE, kernel_folders, sources
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.warmup import SHARES, scene
@@ -27,12 +25,12 @@ def compile_all() -> None:
     """Do nothing where it has been done; a process for each of `GROUPS` otherwise."""
     everything = sources(path for path in PACKAGE.rglob("*.py"))
     digest = hashlib.sha256(repr(sorted(everything.items())).encode()).hexdigest()
-    marker = Path(cache_folder()) / f"compiled-for-tests-{digest[:16]}"
+    marker = kernel_folders()[0] / f"compiled-for-tests-{digest[:16]}"
     if marker.exists():
         return
     processes = [subprocess.Popen([sys.executable, __file__, *group]) for group in GROUPS]
     if not any([process.wait() for process in processes]):
-        marker.parent.mkdir(exist_ok=True)
+        marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
 
 

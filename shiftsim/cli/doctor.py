@@ -4,15 +4,18 @@ The few reference values that come with the package are compared by the code tha
 """
 
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
+
+if TYPE_CHECKING:
+    from shiftsim.warmup import Filled
 
 REFERENCE = PACKAGE / "verify" / "reference"
 _DATA = 2
@@ -52,10 +55,23 @@ def verify(
     raise typer.Exit(result.exit_code(require_all=require_all))
 
 
-def doctor(quiet: Quiet = False, as_json: Json = False, debug: Debug = False) -> None:
+def doctor(
+    fills: Annotated[
+        bool, typer.Option("--compile", help="First compile all kernels that runs need.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    debug: Debug = False,
+) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
+    kernels = None
+    if fills:
+        from shiftsim.warmup import fill
+
+        with progress_bar(quiet=quiet or as_json) as advance:
+            kernels = fill(advance)
     with progress_bar(quiet=quiet or as_json) as advance:
-        found = examine(advance)
+        found = replace(examine(advance), kernels=kernels)
     show(asdict(found), found.lines(), as_json=as_json)
     if not found.is_well:
         raise typer.Exit(_DATA)
@@ -70,10 +86,11 @@ class Diagnosis:
     cores: int  # cores this process may use
     memory: int  # memory of the machine [bytes], 0 where unknown
     workers: int  # suggested number of worker processes
-    kernel_cache: str  # folder of compiled kernels, empty for the default
+    kernel_cache: str  # folder of compiled kernels
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
+    kernels: "Filled | None" = None  # what was compiled before, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -89,7 +106,8 @@ class Diagnosis:
             f" {packages}",
             f" torch: {self.torch}",
             f" {self.cores} cores, {memory}, suggested workers {self.workers}",
-            f" kernel cache: {self.kernel_cache or 'next to the source'}",
+            f" kernel cache: {self.kernel_cache}",
+            *([f" {self.kernels.line()}"] if self.kernels else []),
             f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
             *(f" MISMATCH {line}" for line in self.mismatches[:20]),
         ]
@@ -97,7 +115,7 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
-    from shiftsim.arrays import cache_folder
+    from shiftsim.files import kernel_folders
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
     from shiftsim.verify import verify
@@ -120,7 +138,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         cores=default_workers(memory_each=1.0),
         memory=_memory(),
         workers=default_workers(),
-        kernel_cache=cache_folder(),
+        kernel_cache=str(kernel_folders()[0]),
         seconds=perf_counter() - began,
         cases=sum(report.num_cases for report in reports),
         mismatches=tuple(line for report in reports for line in report.mismatches),
