@@ -48,14 +48,18 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
     """The nuPlan version of CaRL."""
 
     name = "carl"
+    _scene: SceneInfo | None = None
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the networks, of several checkpoints as `split_ensemble` has them."""
+        self.begin()
         parts = split_ensemble(checkpoint, self.name)
         self.networks = [load_network(part, self.name, device=device) for part in parts]
         self.device = resolve_device(device)
+
+    def begin(self) -> None:
+        """Make the maps that are laid out."""
         self._maps = PerMap(_lay_out)
-        self._scene: SceneInfo | None = None
 
     def reset(self, scene: SceneInfo) -> None:
         """Lay out the map and forget the last action; the route is corrected at the first step."""
