@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from processes import children
+from stores import write_toy_store
 
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
@@ -66,6 +68,7 @@ def test_an_error_of_the_network_is_that_of_its_scenario(toy, tmp_path, without,
     assert ours.scores.to_pylist() == good
 
 
+@pytest.mark.slow
 def test_where_the_process_ends_once_it_is_asked_again(toy, tmp_path, without):
     ours = run(toy, tmp_path / "run", trouble="die once", notes=tmp_path / "notes")
     assert content(ours) == content(without)
@@ -73,6 +76,8 @@ def test_where_the_process_ends_once_it_is_asked_again(toy, tmp_path, without):
     assert len(pids) == 2
 
 
+@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_scenario_that_ends_the_process_fails_and_the_others_go_on(toy, tmp_path, without):
     ours = run(
         toy, tmp_path / "run", trouble="die", notes=tmp_path / "notes", workers=1, timeout=60
@@ -81,6 +86,40 @@ def test_a_scenario_that_ends_the_process_fails_and_the_others_go_on(toy, tmp_pa
     assert failures(ours) == {BAD: told}
     good = [row for row in without.scores.to_pylist() if row["token"] != BAD]
     assert ours.scores.to_pylist() == good
+
+
+def have_torch():
+    """How many of the processes that this one has started have loaded torch."""
+    maps = []
+    for pid in children(os.getpid()):
+        with suppress(OSError):
+            maps.append(Path(f"/proc/{pid}/maps").read_text())
+    return sum("libtorch" in text for text in maps)
+
+
+@pytest.mark.learned
+@pytest.mark.thorough
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("names", "traffic"),
+    [
+        (["carl", "diffusion-planner", "plantf", "pluto"], "nonreactive"),
+        (["plantf"], "planner:plantf"),
+    ],
+)
+def test_the_learned_planners_ask_and_workers_need_no_torch(tmp_path, names, traffic):
+    pytest.importorskip("torch")
+    write_toy_store(tmp_path / "toy", count=3, iterations=6)
+    arguments = {name: {"checkpoint": "deterministic:drive"} for name in names}
+    values = {"planners": names, "planner_args": arguments, "traffic": traffic, "noise": ["none"]}
+    ours = prepared(tmp_path / "toy", tmp_path / "ours", **values)
+    shared = (*names, *([traffic] if traffic.startswith("planner:") else ()))
+    counts = set()
+    done = execute(replace(ours, shared=shared), on_progress=lambda _: counts.add(have_torch()))
+    assert not failures(done)
+    assert counts == {1}
+    alone = run(tmp_path / "toy", tmp_path / "alone", shared=False, **values | {"workers": 1})
+    assert content(done) == content(alone)
 
 
 RUN = """
@@ -107,6 +146,7 @@ def when_it_infers(folder, count=30):
     return int(lines[0].split()[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_kills_and_interrupts_leave_nobody_and_the_rest_is_resumed(toy, tmp_path):
     first = start(toy, tmp_path)
@@ -136,3 +176,24 @@ def ended(pids):
     while any(Path(f"/proc/{pid}").exists() for pid in pids):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+@pytest.mark.learned
+def test_networks_on_a_gpu_are_shared_by_workers_that_need_little_memory(toy, monkeypatch):
+    pytest.importorskip("torch")
+    # the weights are loaded on the CPU nevertheless
+    monkeypatch.setattr("shiftsim.planners.learned.base.resolve_device", lambda name: "cuda:0")
+    asked = []
+    count = "shiftsim.runs.prepare.default_workers"
+    monkeypatch.setattr(count, lambda *memory: asked.append(memory) or 2)
+    values = {"planners": ["carl", "idm"], "store": str(toy)}
+    values["planner_args"] = {"carl": {"checkpoint": "deterministic:drive"}}
+    found = prepare(make_config(values))
+    assert (found.shared, found.workers, asked) == (("carl",), 2, [()])
+    assert prepare(make_config(values | {"workers": 1})).shared == ()
+    assert (
+        prepare(make_config(values | {"executor": "dask", "scheduler": "tcp://a:1"})).shared == ()
+    )
+    assert prepare(make_config(values | {"isolate": True})).shared == ()
+    monkeypatch.undo()
+    assert prepare(make_config(values | {"workers": 2})).shared == ()
