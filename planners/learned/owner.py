@@ -14,7 +14,13 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import AuthenticationError
-from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.connection import (
+    Client,
+    Connection,
+    Listener,
+    answer_challenge,
+    deliver_challenge,
+)
 from threading import Lock, Thread
 from time import monotonic, sleep
 from typing import Any, NamedTuple
@@ -50,17 +56,23 @@ class Owner:
         """Make the planners, by name, each of which has a network, and listen."""
         self._planners = {name: make() for name, make in planners.items()}
         self._pass = Lock()  # one at a time is on the device
-        self._listener = Listener(address.place, authkey=address.key)
+        self._key, self._listener = address.key, Listener(address.place)
         Thread(target=self._admit, daemon=True).start()
 
     def _admit(self) -> None:
         while True:
-            with suppress(AuthenticationError, EOFError, OSError):
+            try:
                 connection = self._listener.accept()
-                Thread(target=self._serve, args=(connection,), daemon=True).start()
+            except OSError:  # too many files are open: a connection may end
+                sleep(_PAUSE)
+                continue
+            Thread(target=self._serve, args=(connection,), daemon=True).start()
 
     def _serve(self, connection: "Connection[Any, Any]") -> None:
-        with suppress(EOFError, OSError), connection:  # until the worker has gone
+        # until the worker has gone; who keeps silent keeps nobody else waiting
+        with suppress(AuthenticationError, EOFError, OSError), connection:
+            deliver_challenge(connection, self._key)
+            answer_challenge(connection, self._key)
             while True:
                 send(connection, self._answer(*receive(connection)))
 

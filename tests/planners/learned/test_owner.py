@@ -103,6 +103,8 @@ def test_who_has_not_the_key_is_not_let_in(asking):
     make = asking[0]
     with pytest.raises(AuthenticationError):
         Client(make("doubling").address.place, authkey=b"guessed")
+    with Client(make("doubling").address.place):  # and says nothing
+        assert make("doubling")([1]) == [2]
     assert make("doubling")([1]) == [2]
 
 
