@@ -166,14 +166,25 @@ class RunPlanner:
     arguments: Mapping[str, Any]  # passed to the constructor of a name or class
     fingerprint: Mapping[str, Any]  # all that tells it from another planner, as JSON values
     in_batches: bool = False  # whether it answers for several scenarios at once
+    ask: Any = None  # of `LearnedPlanner.asking`, where another process has the network
 
     def make(self) -> Planner:
         """An instance of its own for one worker."""
+        if self.ask is not None:
+            return cast(Planner, planner_factory(self.source).asking(self.ask))
         if isinstance(self.source, str):
             return load_planner(self.source, self.arguments)
         if inspect.isclass(self.source):
             return cast(Planner, self.source(**self.arguments))
         return cast(Planner, copy.deepcopy(self.source))
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether it is one of the table whose network is on a GPU."""
+        known = PLANNERS.get(self.source) if isinstance(self.source, str) else None
+        return (
+            bool(known and known.checkpoint) and self.fingerprint["arguments"]["device"] == "cuda"
+        )
 
     @property
     def can_travel(self) -> bool:

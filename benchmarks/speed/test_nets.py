@@ -9,11 +9,13 @@ however many scenarios it has driven. A network is to be as many times as quick 
 """
 
 import copy
+import pickle
 import statistics
 import subprocess
 import sys
 import tarfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 
@@ -21,9 +23,12 @@ import numpy as np
 import pytest
 
 from shiftsim.benchmarks.speed import gpu
+from shiftsim.benchmarks.speed.conftest import median_seconds
 from shiftsim.data.demo.store import bench_scene, demo_store
 from shiftsim.data.store.reading import open_store
+from shiftsim.planners.learned.owner import Ask, Owner, new_address
 from shiftsim.planners.registry import load_planner
+from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout
 from shiftsim.verify.scenes import Scenes
 from shiftsim.world.state import center_poses
@@ -43,6 +48,7 @@ PLAIN_ROUNDS = 5
 MEMORY_TARGET, GROWTH_TARGET = 1500.0, 50.0  # MB
 STEPS = 60  # of a scene
 WARM = 5  # steps that are not counted
+ASKED = 300  # times
 DRIVES = 3  # of which the fastest counts
 BATCH = 16
 GPU_BATCHES = (1, 16, 64, 256)
@@ -286,19 +292,44 @@ def test_rollouts_on_a_gpu(store, size, capsys, name):
     import torch
 
     batches = GPU_BATCHES if torch.cuda.is_available() and size(2) > 1 else (1, 2)
-    few = ["--scenarios", "2", "--seeds", "1", "--iterations", "6"] if len(batches) == 2 else []
+    few = "--scenarios 2 --seeds 1 --iterations 6 --workers 2".split() if len(batches) == 2 else []
     gpu.main([str(store), "--planners", name, "--batches", *map(str, batches), *few])
     printed = capsys.readouterr().out
     print(f"\n{printed}", end="")
     rows = [line for line in printed.splitlines() if "rollouts/s" in line]
-    assert len(rows) in (len(batches), 2 * len(batches))
+    assert len(rows) > len(batches)
     assert all(line.startswith(name) for line in rows)
+    assert "workers" in rows[-1]
+    if not torch.cuda.is_available():
+        assert all(" 0.0 % of scores differ" in line for line in rows)
+
+
+@pytest.mark.parametrize("batch", [1, BATCH])
+@pytest.mark.parametrize("name", LEARNED)
+def test_asking_another_process(scenes, loaded, size, note, name, batch):
+    """What it costs that the network is in another process: pickling, the socket, the answer."""
+    planner, address = loaded(name), new_address()
+    forks, observations = started(planner, [scenes[n] for n in NAMES if n in scenes], batch)
+    features = [fork.features(seen) for fork, seen in zip(forks, observations, strict=True)]
+    outputs = list(planner.infer(features))
+    with beside(partial(Owner, {name: partial(gpu.Repeating, outputs)}, address)):
+        ask = Ask(address, name)
+        seconds = median_seconds(lambda: ask(features), size(ASKED, 2))
+        answered = ask(features)
+    assert pickle.dumps(answered) == pickle.dumps(outputs)
+    bytes_sent = len(pickle.dumps(features, 5))
+    print(
+        f"\n{name:17} batch {batch:2}: {bytes_sent / 1e3:6.0f} kB, {seconds * 1e6:6.0f} µs", end=""
+    )
+    note(asking=seconds)
 
 
 MEMORY = """
 import re, sys
 from shiftsim.data.store.reading import open_store
+from shiftsim.planners.learned.owner import Ask, Owner, new_address
 from shiftsim.planners.registry import load_planner
+from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout
 store = open_store(sys.argv[1])
 planner = load_planner(sys.argv[2], {"checkpoint": "deterministic:drive"})

@@ -7,8 +7,8 @@ to one scenario is made in `reset`.
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, Generic, Self, TypeVar, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, Self, TypeAlias, TypeVar, cast
 
 from shiftsim.planners.learned.checkpoint import (
     checkpoint_fingerprint,
@@ -21,6 +21,7 @@ from shiftsim.world.state import Command, Trajectory
 
 Features = TypeVar("Features")
 Output = TypeVar("Output")
+Infer: TypeAlias = Callable[[Sequence[Any]], Sequence[Any]]  # features to outputs, as `infer`
 
 
 class LearnedPlanner(ABC, Generic[Features, Output]):
@@ -31,8 +32,20 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the network; arguments and errors are those of `load_weights`."""
+        self.begin()
         self.network = load_network(checkpoint, self.name, device=device)
         self.device = resolve_device(device)
+
+    @classmethod
+    def asking(cls, infer: Infer) -> Self:
+        """A planner without a network: `infer`, which takes the method's place, has it."""
+        planner = cls.__new__(cls)
+        planner.begin()
+        vars(planner)["infer"] = infer
+        return planner
+
+    def begin(self) -> None:
+        """Make what forks share beside the network."""
 
     @classmethod
     def fingerprint(cls, checkpoint: str = "", device: str = "cpu") -> dict[str, str]:

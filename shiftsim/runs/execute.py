@@ -16,7 +16,7 @@ from threading import get_ident
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from shiftsim.errors import DataError
-from shiftsim.planners.registry import planner_name
+from shiftsim.planners.registry import RunPlanner, planner_name
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import make_manifest, now
@@ -190,15 +190,35 @@ def _results(
 ) -> Generator[list[TaskResult], None, None]:
     """The results of each batch, in whatever order they end."""
     config = prepared.config
-    given = config, prepared.store, prepared.planners, prepared.noises
-    make = partial(TaskRunner, *given, prepared.traffic, prepared.edits)
-    if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
-        with closing(make()) as run_batch, _no_exit():
-            for batch in batches:
-                yield run_batch(batch)
+    with _networks_beside(prepared) as (planners, traffic):
+        given = config, prepared.store, planners, prepared.noises
+        make = partial(TaskRunner, *given, traffic, prepared.edits)
+        if config.executor != "dask" and prepared.workers <= 1 and not config.timeout:
+            with closing(make()) as run_batch, _no_exit():
+                for batch in batches:
+                    yield run_batch(batch)
+            return
+        with closing(_outcomes(prepared, make, batches)) as outcomes:
+            yield from map(ended, outcomes)
+
+
+@contextmanager
+def _networks_beside(
+    prepared: Prepared,
+) -> Iterator[tuple[Mapping[str, RunPlanner], RunPlanner | None]]:
+    """The planners, and the one of traffic; those that share a device ask its owner."""
+    planners, traffic, name = dict(prepared.planners), prepared.traffic, prepared.config.traffic
+    if not prepared.shared:
+        yield planners, traffic
         return
-    with closing(_outcomes(prepared, make, batches)) as outcomes:
-        yield from map(ended, outcomes)
+    from shiftsim.planners.learned.owner import Ask, Owner, new_address
+    from shiftsim.runs.workers import beside
+
+    known = planners | ({name: traffic} if traffic else {})
+    address = new_address()
+    asking = {who: replace(known[who], ask=Ask(address, who)) for who in prepared.shared}
+    with beside(partial(Owner, {who: known[who].make for who in prepared.shared}, address)):
+        yield {who: asking.get(who, planners[who]) for who in planners}, asking.get(name, traffic)
 
 
 @contextmanager

@@ -64,6 +64,8 @@ class Prepared:
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
     edits: "EditSet | None" = None  # what makes the scenarios of recorded ones
     made: Mapping[str, Any] = field(default_factory=dict)  # which are made of which
+    # planners, of the ego and of traffic, whose networks one process holds for all workers
+    shared: tuple[str, ...] = ()
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -126,6 +128,8 @@ def prepare(
     if before == "new":
         count = sum(len(batch.tasks) for batch in batches)
         check_space(folder, count, with_rollouts=config.save_rollouts == "all")
+    shared = _on_gpu(config, entries, traffic)
+    workers = _workers(config, entries, len(batches), shared)
     return Prepared(
         config=config,
         store=store.source,
@@ -139,11 +143,12 @@ def prepare(
         determining=determining,
         folder=folder,
         before=before,
-        workers=_workers(config, entries, len(batches)),
+        workers=workers,
         generator=store.generator,
         traffic=traffic,
         edits=chosen.edits,
         made=chosen.made,
+        shared=shared if workers > 1 else (),
     )
 
 
@@ -302,7 +307,19 @@ def _check_folder(config: RunConfig, folder: Path, determining: dict[str, Any]) 
     return before
 
 
-def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int) -> int:
+def _on_gpu(
+    config: RunConfig, entries: Sequence[RunPlanner], traffic: RunPlanner | None
+) -> tuple[str, ...]:
+    """Planners whose networks the workers of this machine can share."""
+    if config.executor != "processes":
+        return ()
+    names = [entry.name for entry in entries if entry.on_gpu]
+    return (*names, *([config.traffic] if traffic is not None and traffic.on_gpu else ()))
+
+
+def _workers(
+    config: RunConfig, entries: Sequence[RunPlanner], num_batches: int, shared: Sequence[str]
+) -> int:
     """Number of worker processes; 1 for planners that cannot be sent to another process."""
     stuck = [entry.name for entry in entries if not entry.can_travel]
     if stuck and (config.timeout or config.executor != "processes"):
@@ -314,6 +331,7 @@ def _workers(config: RunConfig, entries: Sequence[RunPlanner], num_batches: int)
     large = (
         entry.in_batches or getattr(type(entry.source), "shares_nothing", False)
         for entry in entries
+        if entry.name not in shared
     )
     memory = _MEMORY_OF_NETWORK if any(large) else 0.0
     workers = config.workers or (default_workers(memory) if memory else default_workers())

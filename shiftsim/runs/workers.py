@@ -5,6 +5,7 @@ main script is not imported again, and a worker that dies, or hangs and is kille
 task it was working on. The standard pools do not give that: theirs break as a whole.
 """
 
+import logging
 import os
 import pickle
 import signal
@@ -12,12 +13,13 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, wait
+from threading import Event, Thread
 from time import monotonic
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
@@ -27,9 +29,11 @@ from shiftsim.files import fresh_python
 T = TypeVar("T")
 R = TypeVar("R")
 
+_LOG = logging.getLogger(__name__)
 MakeFunction = Callable[[], Callable[[T], R]]
 _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a task
 _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
+_PAUSE = 0.5  # s, before a process that ended is started again
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 # one thread per worker: the parallelism is across scenarios
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
@@ -80,12 +84,56 @@ def map_unordered(
     if workers <= 1 and not limit:
         yield from _serial(make, tasks)
         return
-    payload = pickle.dumps((sys.path, pickle.dumps(make), limit > 0.0))
+    payload = _payload(make, is_timed=limit > 0.0)
     pool = Pool(payload, max(1, workers), limit, pieces, group)
     try:
         yield from pool.run(tasks, alone)
     finally:
         pool.close()
+
+
+@contextmanager
+def beside(make: Callable[[], object]) -> Iterator[None]:
+    """Keep what `make` makes in a process of its own, which is started again when it ends.
+
+    Raises:
+        ConfigError: It cannot be made there.
+    """
+    payload, leaving = _payload(make), Event()
+    worker = _Worker(payload)
+
+    def keep() -> None:
+        nonlocal worker
+        while True:
+            try:
+                worker.receive()  # once, when it is ready again
+            except _DeathError as death:
+                if leaving.wait(_PAUSE):
+                    return
+                _LOG.warning("a process for the device is started again: %s", death)
+                worker = _Worker(payload)
+
+    try:
+        worker.receive()
+    except _DeathError as death:
+        raise ConfigError(
+            f"the process for the device cannot start: {death}",
+            hint="run with --workers 1 to see why",
+        ) from death
+    # a process that a thread started is killed when this thread ends: it must outlive it
+    keeper = Thread(target=keep, daemon=True)
+    keeper.start()
+    try:
+        yield
+    finally:
+        leaving.set()
+        while keeper.is_alive():
+            worker.process.kill()
+            keeper.join(_PAUSE)
+
+
+def _payload(make: Callable[[], object], *, is_timed: bool = False) -> bytes:
+    return pickle.dumps((sys.path, pickle.dumps(make), is_timed))
 
 
 def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T, R], None, None]:

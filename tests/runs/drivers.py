@@ -5,6 +5,8 @@ import time
 import typing
 from pathlib import Path
 
+import numpy as np
+
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.world.state import Trajectory
@@ -134,6 +136,43 @@ class Together(LearnedPlanner):
 
     def decode(self, output, observation):
         return self.inner.plan(observation)
+
+
+class Networked(LearnedPlanner):
+    """Has a network of one sum, which fails, or ends its process, in one scenario where told to.
+
+    Every pass is noted in a file: the process, and how many scenarios.
+    """
+
+    def __init__(self, trouble: str = "", notes: str = ""):
+        self.trouble, self.notes = trouble, notes
+
+    def reset(self, scene):
+        self.inner = ConstantVelocity()
+        self.inner.reset(scene)
+        self.is_bad = scene.token == BAD
+
+    def features(self, observation):
+        noise = np.full(100_000, observation.ego.speed)  # large enough to be sent apart
+        return np.array([observation.iteration, self.is_bad]), noise
+
+    def infer(self, features):
+        if self.notes:
+            with open(self.notes, "a") as file:
+                file.write(f"{os.getpid()} {len(features)}\n")
+        if self.trouble and any(tuple(when) == (5, True) for when, _ in features):
+            if self.trouble == "fail":
+                raise RuntimeError("cannot infer here")
+            ended = Path(f"{self.notes}.ended")
+            if self.trouble == "die" or not ended.exists():
+                ended.touch()
+                os.kill(os.getpid(), 9)
+        return [1e-3 * noise.mean() for _, noise in features]
+
+    def decode(self, output, observation):
+        plan = self.inner.plan(observation)
+        plan.states[:, 1] += output
+        return plan
 
 
 class Remembers(ConstantVelocity):

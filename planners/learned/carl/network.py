@@ -14,6 +14,7 @@ from torch.nn.functional import layer_norm, softplus
 
 from shiftsim.planners.learned.carl.drawn import convolve_drawn
 from shiftsim.planners.learned.deterministic import State
+from shiftsim.planners.learned.network.graphs import Replayed
 from shiftsim.planners.learned.network.rows import Linear, store_by_columns
 
 PREFIXES = ("",)  # of the names in the published checkpoint
@@ -136,7 +137,12 @@ class CarlNetwork(nn.Module):
         self.value_head = nn.Sequential(
             *_perceptron(FEATURES + VALUE_MEASUREMENTS, FEATURES, FEATURES), Linear(FEATURES, 1)
         )
+        self.act = Replayed(self._act)
         store_by_columns(self)
+
+    def _act(self, pictures: Tensor, measurements: Tensor) -> Tensor:
+        """(B, 2) the mean action; the arguments are those of `forward`."""
+        return self(pictures, measurements).action
 
     def forward(self, pictures: Tensor, measurements: Tensor) -> Policy:
         """The policy for (B, 9, 256, 256) pictures of 0 to 255 and (B, 10) measurements."""

@@ -48,14 +48,18 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
     """The nuPlan version of CaRL."""
 
     name = "carl"
+    _scene: SceneInfo | None = None
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the networks, of several checkpoints as `split_ensemble` has them."""
+        self.begin()
         parts = split_ensemble(checkpoint, self.name)
         self.networks = [load_network(part, self.name, device=device) for part in parts]
         self.device = resolve_device(device)
+
+    def begin(self) -> None:
+        """Make the maps that are laid out."""
         self._maps = PerMap(_lay_out)
-        self._scene: SceneInfo | None = None
 
     def reset(self, scene: SceneInfo) -> None:
         """Lay out the map and forget the last action; the route is corrected at the first step."""
@@ -92,7 +96,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         parts = (np.stack(part) for part in zip(*features, strict=True))
         pictures, measured = (on_device(part, self.device) for part in parts)
         with torch.inference_mode():
-            each = [network(pictures, measured).action for network in self.networks]
+            each = [network.act(pictures, measured) for network in self.networks]
             return list(torch.stack(each).mean(dim=0).cpu().numpy())
 
     def decode(self, output: Action, observation: Observation) -> state.Command:

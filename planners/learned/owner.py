@@ -1,0 +1,182 @@
+"""One process owns a device: it holds the networks, and workers ask it for outputs.
+
+A worker makes features and decodes outputs, and needs neither torch nor the device. What it sends
+is one forward pass: requests of different workers are not joined, as the last digits of a GPU
+depend on what is computed together, and who asks at the same time is chance. While one pass is
+computed, the next request is already read.
+"""
+
+import logging
+import pickle
+import secrets
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import (
+    Client,
+    Connection,
+    Listener,
+    answer_challenge,
+    deliver_challenge,
+)
+from threading import Lock, Thread
+from time import monotonic, sleep
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shiftsim.errors import PlannerError, ShiftsimError
+
+LARGE = 1 << 16  # bytes from which an array is sent as it lies in memory, without a copy
+PATIENCE = 60.0  # s, for an owner that has ended to be there again
+_TRIES = 2  # of one request: an owner that has ended by chance, and one that ends of it
+_PAUSE = 0.05  # s
+
+
+class Address(NamedTuple):
+    """Where an owner is found."""
+
+    place: str  # of its socket
+    key: bytes  # who does not know it is not let in
+
+
+def new_address() -> Address:
+    """An address that nobody else uses."""
+    name = f"shiftsim-{secrets.token_hex(8)}"
+    place = rf"\\.\pipe\{name}" if sys.platform == "win32" else f"\0{name}"
+    return Address(place, secrets.token_bytes(32))
+
+
+class Owner:
+    """Answers for planners, on threads, as long as it lives."""
+
+    def __init__(self, planners: Mapping[str, Callable[[], Any]], address: Address) -> None:
+        """Make the planners, by name, each of which has a network, and listen."""
+        self._planners = {name: make() for name, make in planners.items()}
+        self._pass = Lock()  # one at a time is on the device
+        self._key, self._listener = address.key, Listener(address.place)
+        Thread(target=self._admit, daemon=True).start()
+
+    def _admit(self) -> None:
+        while True:
+            try:
+                connection = self._listener.accept()
+            except OSError:  # too many files are open: a connection may end
+                sleep(_PAUSE)
+                continue
+            Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: "Connection[Any, Any]") -> None:
+        # until the worker has gone; who keeps silent keeps nobody else waiting
+        with suppress(AuthenticationError, EOFError, OSError), connection:
+            deliver_challenge(connection, self._key)
+            answer_challenge(connection, self._key)
+            while True:
+                send(connection, self._answer(*receive(connection)))
+
+    def _answer(self, name: str, features: Sequence[Any]) -> Any:
+        """The outputs, or the error and its traceback."""
+        try:
+            with self._pass:
+                return self._planners[name].infer(features), ""
+        except Exception as error:  # becomes that of the scenario
+            ours = isinstance(error, ShiftsimError)
+            told = error if ours else PlannerError(f"{type(error).__name__}: {error}")
+            return told, traceback.format_exc()
+
+
+class Ask:
+    """What takes the place of `infer` where an owner has the network.
+
+    Copies of a planner share it, and its connection, which is made when it is needed.
+    """
+
+    def __init__(self, address: Address, name: str) -> None:
+        """Ask the owner at an address for the planner of that name."""
+        self.address, self.name = address, name
+        self._connection: Connection[Any, Any] | None = None
+        self._patience = PATIENCE
+
+    def __reduce__(self) -> Any:
+        return Ask, (self.address, self.name)
+
+    def __call__(self, features: Sequence[Any]) -> Sequence[Any]:
+        """What the planner's `infer` returns.
+
+        Raises:
+            PlannerError: There is no owner, or it ended twice of this request.
+            ShiftsimError: `infer` failed.
+        """
+        for left in reversed(range(_TRIES)):
+            try:
+                self._connection = self._connection or self._connected()
+                send(self._connection, (self.name, features))
+                answer, trace = receive(self._connection)
+                break
+            except (EOFError, OSError) as error:
+                self.close()
+                if not left:
+                    raise PlannerError(
+                        f"planner {self.name!r}: the process that holds its network has ended",
+                        hint="its memory may not suffice: use a smaller --batch-size, and "
+                        "--resume --retry-failed",
+                    ) from error
+                logging.getLogger(__name__).info("planner %s: asking again", self.name)
+        if isinstance(answer, Exception):
+            answer.add_note(f"in the process that holds the network:\n{trace}")
+            raise answer
+        outputs: Sequence[Any] = answer
+        return outputs
+
+    def close(self) -> None:
+        """Close the connection; the next request makes a new one."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
+
+    def _connected(self) -> "Connection[Any, Any]":
+        """A new connection; who has waited in vain does not wait again."""
+        until = monotonic() + self._patience
+        while True:
+            try:
+                found = Client(self.address.place, authkey=self.address.key)
+            except (EOFError, OSError):
+                if monotonic() > until:
+                    self._patience = 0.0
+                    raise
+                sleep(_PAUSE)
+            else:
+                self._patience = PATIENCE
+                return found
+
+
+def send(connection: "Connection[Any, Any]", value: object) -> None:
+    """Send a value; its large arrays follow it, and are not copied into it."""
+    large: list[memoryview] = []
+
+    def stays(buffer: pickle.PickleBuffer) -> bool:
+        raw = buffer.raw()
+        if raw.nbytes >= LARGE:
+            large.append(raw)
+        return raw.nbytes < LARGE
+
+    head = pickle.dumps(value, 5, buffer_callback=stays)
+    connection.send_bytes(np.array([part.nbytes for part in large], np.int64).tobytes())
+    connection.send_bytes(head)
+    for part in large:
+        connection.send_bytes(part)
+
+
+def receive(connection: "Connection[Any, Any]") -> Any:
+    """What `send` sent.
+
+    Raises:
+        EOFError: The other side has gone.
+    """
+    sizes = np.frombuffer(connection.recv_bytes(), np.int64).tolist()
+    head, large = connection.recv_bytes(), [bytearray(size) for size in sizes]
+    for part in large:
+        connection.recv_bytes_into(part)
+    return pickle.loads(head, buffers=large)
