@@ -96,13 +96,21 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
         at = int(np.flatnonzero(~(steps > 0.0))[0]) + 1
         raise DataError(f"time stamps of the rollout do not increase at sample {at}")
     step = float(np.mean(steps))
-    raw, signals = np.empty((4, len(states))), np.empty((7, len(states)))
-    raw[:2] = center_accelerations(states).T
+    center = np.ascontiguousarray(center_accelerations(states).T)
     # nuPlan rule 80: magnitudes are taken at the rear axle, components at the centre
-    raw[2] = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
-    raw[3] = _unwrap(states[:, HEADING])
-    _filter_all(raw, filters_of(len(time_us)), step, step**2, signals)
-    return ComfortSignals(*signals)
+    magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
+    smooth, jerk, yaw_rate, yaw_accel = filters_of(len(time_us))
+    lon, lat, mag = (_filtered(v, smooth, 1.0) for v in (*center, magnitude))
+    heading = _unwrap(states[:, HEADING])
+    return ComfortSignals(
+        lon_accel=lon,
+        lat_accel=lat,
+        mag_accel=mag,
+        lon_jerk=_filtered(lon, jerk, step),
+        mag_jerk=_filtered(mag, jerk, step),
+        yaw_rate=_filtered(heading, yaw_rate, step),
+        yaw_accel=_filtered(heading, yaw_accel, step**2),
+    )
 
 
 def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:
@@ -215,6 +223,12 @@ def _with_interior(fit: FloatArray) -> Filter:
     return Filter(fit[len(fit) // 2].copy(), fit)
 
 
+def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
+    out = np.empty(len(values))
+    filter_signal(values, how, scale, out)
+    return out
+
+
 def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
     """(window, window) that maps samples at unit spacing to derivatives of their fit there."""
     at = np.arange(window) - 0.5 * (window - 1)
@@ -225,22 +239,6 @@ def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
         scale = factorial(power) / factorial(power - order)
         derived[:, power] = scale * at ** (power - order)
     return np.ascontiguousarray(derived @ fit)
-
-
-@lean_kernel
-def _filter_all(
-    raw: FloatArray,  # (4, K) accelerations lon, lat, magnitude [m/s^2], heading, unwrapped [rad]
-    filters: Filters,
-    step: float,  # between samples [s]
-    square: float,  # of the step [s^2]
-    out: FloatArray,  # (7, K) written, in the order of `ComfortSignals`
-) -> None:
-    for index in range(3):
-        filter_signal(raw[index], filters.smooth, 1.0, out[index])
-    filter_signal(out[0], filters.jerk, step, out[3])
-    filter_signal(out[2], filters.jerk, step, out[4])
-    filter_signal(raw[3], filters.yaw_rate, step, out[5])
-    filter_signal(raw[3], filters.yaw_accel, square, out[6])
 
 
 @lean_kernel

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel, part_kernel
+from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import MapError
 from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
 from shiftsim.world.map import VectorMap
@@ -103,7 +103,7 @@ def has(items: IntArray, count: int, value: int) -> bool:
     return False
 
 
-@part_kernel
+@lean_kernel
 def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     """Write the lane that holds a point, else the connectors; how many, or _OVERLAP."""
     found = containing(lanes.polygons, x, y, out)
@@ -114,7 +114,7 @@ def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     return found
 
 
-@part_kernel
+@lean_kernel
 def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: IntArray) -> int:
     """Write which of the first `count` known edges, or the successors of one, hold a point."""
     polygons, outgoing = lanes.polygons, lanes.outgoing

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.sim.dynamics.lqr import TRACKED
 from shiftsim.sim.execute import Course, execute
 from shiftsim.sim.plan_check import GOOD
@@ -29,7 +29,7 @@ class ConstantVelocity:
 
     def drive_on(self, course: Course) -> int:
         """Take the steps of a course; the first iteration that was not taken."""
-        return int(_drive_on(course, _TIMES))
+        return int(_drive_on(course, _TIMES, np.zeros((len(_TIMES), NUM_STATE))))
 
 
 @lean_kernel
@@ -42,10 +42,10 @@ def _go_straight(x: float, y: float, heading: float, speed: float, out: FloatArr
         out[step, VX] = speed
 
 
-@kernel
-def _drive_on(course: Course, plan_us: IntArray) -> int:
+@lean_kernel
+def _drive_on(course: Course, plan_us: IntArray, states: FloatArray) -> int:
     """Plan and execute until the end, or until a plan cannot be executed, at that iteration."""
-    ego, time_us, states = course.ego, course.time_us, np.zeros((len(plan_us), NUM_STATE))
+    ego, time_us = course.ego, course.time_us
     for iteration in range(course.first, course.stop):
         row = course.start + iteration
         speed = np.hypot(ego[row, VX], ego[row, VY])

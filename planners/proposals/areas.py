@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
 from shiftsim.geometry.rings import ray_crossings
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, square_around
@@ -148,7 +148,7 @@ def near_areas(bounds: FloatArray, selected: IntArray, corners: FloatArray) -> I
     return out[:count]
 
 
-@lean_kernel
+@part_kernel
 def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
     """Which points (K, 2) lie in the interior of an area, and which on its boundary: bits."""
     bounds, scale, slab_ptr, edge_ptr, ends = slabs
