@@ -47,9 +47,12 @@ def checkpoint_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
 
 
-def remote_store_folder() -> Path:
-    """Folder of what was copied from stores behind a URL: `SHIFTSIM_CACHE`, or below the cache."""
-    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / "stores"
+def user_cache(part: str) -> Path:
+    """Folder of what is kept to save time, below `SHIFTSIM_CACHE` (`~/.cache/shiftsim`).
+
+    `stores` are files copied from stores behind a URL, `maps` are maps as they are in memory.
+    """
+    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 
 
 def below(folder: Path, name: str) -> Path:
