@@ -47,13 +47,13 @@ def checkpoint_folder() -> Path:
     return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
 
 
-def remote_store_folder() -> Path:
-    """Folder of what was copied from stores behind a URL: `SHIFTSIM_CACHE`, or below the cache."""
-    return _user_cache() / "stores"
+def user_cache(part: str) -> Path:
+    """Folder of what is kept to save time, below `SHIFTSIM_CACHE` (`~/.cache/shiftsim`).
 
-
-def _user_cache() -> Path:
-    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser()
+    `stores` are files copied from stores behind a URL, `maps` are maps as they are in memory,
+    `kernels` are compiled kernels.
+    """
+    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 
 
 def kernel_folders() -> list[Path]:
@@ -63,7 +63,7 @@ def kernel_folders() -> list[Path]:
     """
     is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
     own = PACKAGE.parent / ".numba-cache" if is_checkout else PACKAGE / "__pycache__" / "kernels"
-    return [Path(os.environ.get("NUMBA_CACHE_DIR") or own).expanduser(), _user_cache() / "kernels"]
+    return [Path(os.environ.get("NUMBA_CACHE_DIR") or own).expanduser(), user_cache("kernels")]
 
 
 def below(folder: Path, name: str) -> Path:

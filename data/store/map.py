@@ -17,15 +17,15 @@ from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
 from shiftsim.world.map import LAYERS, VectorMap
 
-_LINES = ("baselines", "left_boundaries", "right_boundaries")
-_LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
+LINES = ("baselines", "left_boundaries", "right_boundaries")
+LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
 _ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its unit
     name: name
     for name in "lane_index left_lane right_lane block_of has_traffic_lights intersection_of"
     " turn_type is_bike intersection_kinds stop_kinds".split()
 }
 _NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
-_POINTERS = {name: ("ring_ptr", "poly_ptr") for name in LAYERS} | dict.fromkeys(_LINES, ("ptr",))
+_POINTERS = {name: ("ring_ptr", "poly_ptr") for name in LAYERS} | dict.fromkeys(LINES, ("ptr",))
 
 
 def _schema(points: tuple[str, ...]) -> pa.Schema:
@@ -34,7 +34,7 @@ def _schema(points: tuple[str, ...]) -> pa.Schema:
     for name, pointers in _POINTERS.items():
         out |= {f"{name}_{part}": pa.float64() for part in points}
         out |= {f"{name}_{part}": pa.int64() for part in pointers}
-    for name in _LISTS:
+    for name in LISTS:
         out |= {f"{name}_{part}": pa.int64() for part in Lists._fields}
     for name, column in _ARRAYS.items():
         numbers = pa.float64() if name == "speed_limits" else pa.int64()
@@ -67,7 +67,7 @@ def write_map(path: Path, road: VectorMap) -> None:
         flat = group.polygons if isinstance(group, Layer) else group
         values[f"{name}_x_m"], values[f"{name}_y_m"] = np.ascontiguousarray(flat.xy.T)
         values |= {f"{name}_{part}": getattr(flat, part) for part in pointers}
-    for name in _LISTS:
+    for name in LISTS:
         values |= {f"{name}_{part}": getattr(getattr(road, name), part) for part in Lists._fields}
     for name, column in _ARRAYS.items():
         values[column] = getattr(road, name)
@@ -97,11 +97,12 @@ def read_map_file(path: Path) -> VectorMap:
         raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=REPAIR)
     # column by column: decoding a city at once takes three times its size
     items = {name: _items(file.read(columns=[name])[name]) for name in file.names}
-    pa.default_memory_pool().release_unused()
     try:
         road = _assemble(file.footer, items, str(path))
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
+    del items
+    pa.default_memory_pool().release_unused()
     require_sound(road, str(path))
     return road
 
@@ -122,7 +123,7 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any], where: str) -> Vect
         given = [together.reshape(-1, 2), *(items[f"{name}_{part}"] for part in pointers)]
         require_vertices(f"{where}: {name}", *given)
         parts[name] = index_polygons(*given) if name in LAYERS else index_polylines(*given)
-    for name in _LISTS:
+    for name in LISTS:
         parts[name] = Lists(*(sealed(items[f"{name}_{part}"]) for part in Lists._fields))
     for name in LAYERS:
         ids = items[f"{name}_ids"]

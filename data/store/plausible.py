@@ -225,7 +225,7 @@ def _require_places(xy: FloatArray, where: str) -> None:
     """Refuse vertices out of their range, or too far apart for a grid over them."""
     require(STORE, "xy", xy, where)
     if len(xy):
-        require(MAP_EXTENT, "extent", np.ptp(xy, axis=0).max(), where)
+        require(MAP_EXTENT, "extent", max(np.ptp(xy[:, 0]), np.ptp(xy[:, 1])), where)
 
 
 def _require_polygons(flat: Polygons, where: str) -> None:

@@ -16,8 +16,8 @@ import pyarrow as pa
 from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
-from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.plausible import require_plausible, require_rows, require_scenarios
+from shiftsim.data.store.shared import shared_map
 from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.world.map import VectorMap
@@ -167,7 +167,7 @@ class ScenarioStore:
             DataError: The store has no such map, or its file is damaged.
         """
         if city not in self._maps:
-            self._maps[city] = read_map_file(self.map_file(city))
+            self._maps[city] = shared_map(self.map_file(city))
         return self._maps[city]
 
     def map_file(self, city: str) -> Path:

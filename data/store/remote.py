@@ -14,7 +14,7 @@ from pyarrow import fs
 
 from shiftsim.data.store.tables import MANIFEST, REVIEW, SCENARIOS, digest, read_manifest
 from shiftsim.errors import DataError
-from shiftsim.files import below, remote_store_folder
+from shiftsim.files import below, user_cache
 
 _LOG = logging.getLogger(__name__)
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
@@ -38,7 +38,7 @@ class RemoteFiles:
         self._files: dict[str, str] = {}
         self._checked = set[str]()  # files whose copy is what it should be
         try:
-            self.path = self._identify(remote_store_folder())
+            self.path = self._identify(user_cache("stores"))
         except OSError as error:
             _LOG.warning("copies of %s are not kept: %s", self.url, error)
             self._own = tempfile.TemporaryDirectory()  # goes away with this object
