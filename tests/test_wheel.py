@@ -1,5 +1,7 @@
 """What is installed from a wheel: all that is needed, weights included, and not much more."""
 
+import ctypes
+import json
 import os
 import resource
 import subprocess
@@ -9,6 +11,7 @@ import zipfile
 import pytest
 from places import REPOSITORY
 
+from shiftsim.data.demo.store import demo_store
 from shiftsim.planners.table import SHIPPED_NOTE
 
 MOST = 3.0e6  # bytes, without weights
@@ -91,3 +94,104 @@ def test_the_headline_command_scores_in_an_empty_folder_and_says_whose_weights(w
     # busy processors, of which it uses two
     assert after.ru_utime - before.ru_utime < 2.0 * MOST_SECONDS
     assert HEADLINE in (REPOSITORY / "README.md").read_text()
+
+
+COUNTED = """
+import json, sys
+from contextlib import redirect_stdout, suppress
+from numba.core import event
+from shiftsim.cli import main
+
+compiled = []
+
+class Watch(event.Listener):
+    def on_start(self, event):
+        compiled.append(event.data["dispatcher"].py_func.__qualname__)
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Watch())
+with redirect_stdout(sys.stderr):
+    try:
+        main(sys.argv[1:])
+    except SystemExit as left:
+        compiled += [f"left with {left.code}"] if left.code else []
+print(json.dumps(compiled))
+"""
+
+
+def obey_permissions():
+    """Nor may root write then what nobody may."""
+    if os.geteuid() == 0:
+        drop, override = 24, 1
+        assert ctypes.CDLL(None, use_errno=True).prctl(drop, override, 0, 0, 0) == 0
+
+
+class Image:
+    """A wheel in a folder, and users of it."""
+
+    def __init__(self, wheel, folder):
+        self.folder, self.package = folder, folder / "installed"
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(self.package)
+        self.store = demo_store(folder / "demo")
+
+    def compiled(self, user, *words):
+        """What a command compiles."""
+        home = self.folder / user
+        home.mkdir(exist_ok=True)
+        places = {"PATH": os.defpath, "PYTHONPATH": str(self.package), "HOME": str(home)}
+        done = subprocess.run(
+            [sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, cwd=home,
+            env=places, preexec_fn=obey_permissions,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    def run(self, user, planner, traffic="nonreactive"):
+        """What a run compiles."""
+        words = ["--store", str(self.store), "--limit", "2", "--workers", "1", "--quiet"]
+        out = self.folder / user / f"{planner}-{traffic}"
+        words += ["--traffic", traffic, "--out", str(out)]
+        return self.compiled(user, "run", "--planner", planner, *words)
+
+    def seal(self):
+        """As a layer of an image: nobody may write, and times are others."""
+        for path in [*self.package.rglob("*"), self.package]:
+            os.utime(path, (1_000_000_000, 1_000_000_000))
+            path.chmod(0o555 if path.is_dir() else 0o444)
+
+
+@pytest.fixture
+def image(wheel, tmp_path):
+    image = Image(wheel, tmp_path)
+    yield image
+    for path in [image.package, *image.package.rglob("*")]:
+        path.chmod(0o755)
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_kernels_of_an_image_serve_users_who_cannot_write_there(image):
+    built = image.run("builder", "constant-velocity")
+    assert "_driven_route" in built
+    image.seal()
+    assert image.run("user", "constant-velocity") == []
+    assert not (image.folder / "user" / ".cache").exists()
+    # what the image lacks is compiled once, and kept for this user
+    assert "advance" in image.run("user", "constant-velocity", "reactive")
+    assert [*(image.folder / "user" / ".cache" / "shiftsim" / "kernels").rglob("*.nbc")]
+    assert image.run("user", "constant-velocity", "reactive") == []
+
+
+@pytest.mark.long
+def test_after_doctor_compile_no_run_compiles(image):
+    assert not [word for word in image.compiled("builder", "doctor", "--compile") if "left" in word]
+    image.seal()
+    for planner, traffic in (
+        ("constant-velocity", "nonreactive"), ("pdm-closed", "reactive"), ("idm", "nonreactive"),
+        ("simple", "constant-velocity"), ("log-future", "reactive"),
+    ):  # fmt: skip
+        assert image.run("user", planner, traffic) == [], (planner, traffic)
+    assert not (image.folder / "user" / ".cache").exists()
