@@ -122,6 +122,9 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
         stated = end
     elif abs(stated - end) > 0.01:
         reader.warn("road length is not the end of its geometry")
+    if 0.0 < geometries[0].s >= min(stated, end):
+        reader.warn("road left out: its geometry begins where it ends")
+        return None
     if any(a.s > b.s for a, b in pairwise(sections)):
         reader.warn("records out of order")
     link = element.find("link")

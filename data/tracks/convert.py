@@ -57,6 +57,7 @@ _REMEDIES = {
 class Looked:
     """Tracks and map, and what cannot be right about them."""
 
+    path: Path  # the file of tracks
     table: TrackTable
     road: VectorMap
     map_warnings: dict[str, int]  # count by kind of what was repaired in the map
@@ -106,7 +107,7 @@ def look_at(
     if road.num_lanes == 0:
         raise ConversionError(f"{map_path} has no drivable lane", "give a map with roads")
     doubts = find_doubts(table, road, config.min_drivable_share)
-    return Looked(table, road, dict(report.warnings), doubts)
+    return Looked(tracks, table, road, dict(report.warnings), doubts)
 
 
 def convert_tracks(
@@ -151,7 +152,7 @@ def convert_tracks(
     doubts.derived = None  # large, and not needed any more
     made = make_scenarios(samples, road, egos=egos, config=config or tracks_config())
     if not made.windows:
-        raise ConversionError(*_why_none(made.summary))
+        raise ConversionError(*_why_none(looked.path, made.summary))
     found = {role: column.name for role, column in table.columns.found.items()}
     report = TracksReport(
         road.name, len(road.edges), made.summary, doubts.figures, found, looked.map_warnings
@@ -171,10 +172,10 @@ def tracks_config(**values: Any) -> ConversionConfig:
     return ConversionConfig(**{"ego_categories": EGO_CATEGORIES, **values})
 
 
-def _why_none(summary: RecordingSummary) -> tuple[str, str]:
+def _why_none(path: Path, summary: RecordingSummary) -> tuple[str, str]:
     if not summary.seen:
         return (
-            f"{summary.name}: the recording is {summary.duration_s:.1f} s long, too short for a"
+            f"{path}: the recording is {summary.duration_s:.1f} s long, too short for a"
             " scenario: need at least 2.3 s, 2 s of them history",
             "check the unit of time, or --hz",
         )
@@ -182,7 +183,7 @@ def _why_none(summary: RecordingSummary) -> tuple[str, str]:
     others = {rule: n for rule, n in summary.rejected.items() if rule != CATEGORY}
     most = max(others, key=lambda rule: others[rule]) if others else CATEGORY
     return (
-        f"{summary.name}: no scenario is left of {summary.seen} pairs of window and object; dropped"
+        f"{path}: no scenario is left of {summary.seen} pairs of window and object; dropped"
         f" by the rules {counts}",
         _REMEDIES[most],
     )
