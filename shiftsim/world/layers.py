@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _MIN_CELL, _MAX_CELL = 4.0, 64.0  # m
 _CELLS_PER_POLYGON = 4
+_MAX_ENTRIES = 1 << 26  # of the cells of a layer, half a gigabyte
 
 
 class Lists(NamedTuple):
@@ -115,7 +116,11 @@ def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
 
 
 def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Polygons:
-    """Add bounds and the grid to flat polygons (arrays as in `Polygons`)."""
+    """Add bounds and the grid to flat polygons (arrays as in `Polygons`).
+
+    Raises:
+        ValueError: Polygons are so many and so large that the grid would fill the memory.
+    """
     count = len(poly_ptr) - 1
     bounds = np.empty((count, 4))
     if count:
@@ -131,6 +136,8 @@ def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Po
     shape = (np.floor((high - low) / cell).astype(np.int64) + 1).astype(np.int64)
     first = np.floor((bounds[:, :2] - low) / cell).astype(np.int64)
     last = np.minimum(np.floor((bounds[:, 2:] - low) / cell).astype(np.int64), shape - 1)
+    if np.prod(last - first + 1.0, axis=1).sum() > _MAX_ENTRIES:
+        raise ValueError("too many polygons cover too much of the map")
     cell_ptr, cell_items = _fill_cells(first, last, shape)
     grid = np.array([low[0], low[1], cell])
     arrays = (xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)

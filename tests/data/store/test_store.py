@@ -307,6 +307,35 @@ def test_a_map_too_wide_for_its_grids_is_neither_written_nor_read(
         read_map_file(path)
 
 
+def test_a_map_whose_grid_would_fill_the_memory_is_refused(tmp_path: Path, road: VectorMap) -> None:
+    count = len(road.crosswalks)
+    square = np.tile([[0.0, 0.0], [1e5, 0.0], [1e5, 1e5], [0.0, 1e5]], (count, 1))
+    flat = road.crosswalks.polygons
+    whole = flat._replace(
+        xy=square,
+        ring_ptr=np.arange(count + 1) * 4,
+        poly_ptr=np.arange(count + 1),
+        bounds=np.tile([0.0, 0.0, 1e5, 1e5], (count, 1)),
+    )
+    wide = dataclasses.replace(road.crosswalks, polygons=whole)
+    path = tmp_path / "m.parquet"
+    write_map(path, dataclasses.replace(road, crosswalks=wide))
+    assert read_map_file(path).crosswalks.polygons.shape.tolist() == [1563, 1563]
+    many = dataclasses.replace(
+        wide,
+        ids=tuple(map(str, range(100))),
+        polygons=whole._replace(
+            xy=np.tile(square[:4], (100, 1)),
+            ring_ptr=np.arange(101) * 4,
+            poly_ptr=np.arange(101),
+            bounds=np.tile([0.0, 0.0, 1e5, 1e5], (100, 1)),
+        ),
+    )
+    write_map(path, dataclasses.replace(road, crosswalks=many))
+    with pytest.raises(DataError, match=r"m\.parquet: .* too many polygons cover too much"):
+        read_map_file(path)
+
+
 def test_an_empty_recording_is_fine(tmp_path: Path, road: VectorMap) -> None:
     recording = Recording(
         "drive", "fixture-town", np.arange(50) * 50_000, Tracks.empty(50), TrafficLights.empty(50)
