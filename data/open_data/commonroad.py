@@ -25,7 +25,6 @@ from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.xml_elements import xml_elements
 from shiftsim.world.state import AgentKind, LightStatus
 
-VERSIONS = ("2018b", "2020a")
 _MAX_BYTES = 500_000_000
 _MAX_STEPS = 1_000_000
 _STATE = {  # field of `OPEN_DATA` by path
@@ -73,9 +72,8 @@ class _File(Source):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        content = self.content(_MAX_BYTES)
-        (self.root,) = xml_elements(content, "commonRoad", self.fault)
-        self.known([self.root.get("commonRoadVersion")], VERSIONS, "commonRoadVersion")
+        (self.root,) = xml_elements(self.content(_MAX_BYTES), "commonRoad", self.fault)
+        self.known([self.root.get("commonRoadVersion")], ("2018b", "2020a"), "commonRoadVersion")
         self.warnings: Counter[str] = Counter()
         self.step_s = self.number(self.root.get("timeStepSize"), "step length", "'timeStepSize'")
 

@@ -39,16 +39,15 @@ _LANE = LaneNames(
     speed_limit="speed_limit_mps",
     line=np.ndarray,
 )
-_LANE_FORM = {**_LANE.form, "lane_type": (int,), "lane_group_id": (int,)}
 _FEATURES = {  # by layer
-    "lane": _LANE_FORM,
+    "lane": {**_LANE.form, "lane_type": (int,), "lane_group_id": (int,)},
     "lane group": {"intersection_id": (int,)},
     "stop zone": {"stop_zone_type": (int,)},
 }
 _DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
 _STAMP = need("timestamp_us", pa.int64())
 _ABOUT = {"dataset": str, "location": (str,)}
-_FILES = {  # columns and metadata
+_FILES = {  # columns and metadata by file of a log
     "sync": ([], {**_ABOUT, "split": str, "version": (str,), "map_metadata": (_ABOUT,)}),
     "ego_state_se3": (
         [_STAMP, need("imu_se3", items(pa.float64(), 7))],
@@ -68,16 +67,15 @@ _FILES = {  # columns and metadata
         [_STAMP, need("lane_id", items(pa.int32())), need("status", items(pa.uint8()))],
         {},
     ),
-    "map": (
-        [
-            need("object_id", pa.int64()),
-            need("map_layer", pa.int8()),
-            need("features", pa.binary()),
-            need("wkb", pa.binary()),
-        ],
-        {},
-    ),
 }
+_MAP: Any = (  # the same of a map
+    [
+        need("object_id", pa.int64()),
+        need("map_layer", pa.int8()),
+        *(need(name, pa.binary()) for name in ("features", "wkb")),
+    ],
+    {},
+)
 
 
 class Py123dReader:
@@ -92,11 +90,11 @@ class Py123dReader:
     def files(self, path: Path) -> list[Path]:
         """Tracks, lights, and the map of the log or of its city."""
         files = [path / f"{name}.arrow" for name in _FILES]
-        return [file for file in (*files[:-1], _map_path(path)) if file.is_file()]
+        return [file for file in (*files, _map_path(path)) if file.is_file()]
 
     def read(self, path: Path) -> Scene:
         """One log."""
-        sync = _File(path, "sync")
+        sync = _File(path / "sync.arrow")
         dataset, split = sync.notes["dataset"], sync.notes["split"]
         if dataset.startswith("wod") and split.endswith("test"):
             raise sync.fault(f"split {split!r} hides the future", "convert train or val")
@@ -122,10 +120,10 @@ class Py123dReader:
 class _File(Source):
     """An Arrow file: its columns, and what msgpack packed in its metadata and cells."""
 
-    def __init__(self, log: Path, name: str, at: Path | None = None) -> None:
-        super().__init__(at or log / f"{name}.arrow", HINT)
-        columns, form = _FILES[name]
-        self.table = self.columns(columns, prefix="" if name == "map" else f"{name}.")
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, HINT)
+        columns, form = _FILES.get(path.stem, _MAP)
+        self.table = self.columns(columns, prefix=f"{path.stem}." if path.stem in _FILES else "")
         packed = (self.table.schema.metadata or {}).get(b"metadata")
         self.notes = self.unpack(packed, form, "'metadata'")
 
@@ -182,7 +180,7 @@ def _vectors(column: pa.Array, count: int) -> FloatArray:
 
 def _map_path(log: Path) -> Path:
     """Where the map of a log is: beside it, or in the `maps` of the whole folder."""
-    notes = _File(log, "sync").notes
+    notes = _File(log / "sync.arrow").notes
     about = notes.get("map_metadata") or notes
     shared = f"maps/{about['dataset']}/{about['dataset']}_{about.get('location')}.arrow"
     beside = log / "map.arrow"
@@ -192,7 +190,7 @@ def _map_path(log: Path) -> Path:
 def _read_tracks(log: Path) -> TrackSamples:
     """The boxes of all steps, and the box of the recording car."""
     ego_us, ego = _ego_boxes(log)
-    file = _File(log, "box_detections_se3")
+    file = _File(log / "box_detections_se3.arrow")
     rows, (boxes, tokens, velocities, labels) = file.lists()
     label_class = file.notes["box_detection_label_class"].rpartition(".")[2]
     file.known([label_class], codes.LABELS, "label class")
@@ -221,7 +219,7 @@ def _ego_boxes(log: Path) -> tuple[IntArray, FloatArray]:
 
     Stored velocities of egos are 0 in many rows in which the car moves, and are not used.
     """
-    file = _File(log, "ego_state_se3")
+    file = _File(log / "ego_state_se3.arrow")
     # of equal stamps the first is kept
     stamps, first = np.unique(file.stamps(), return_index=True)
     poses = _vectors(file.table["imu_se3"].combine_chunks(), 7)[first]
@@ -238,9 +236,10 @@ def _ego_boxes(log: Path) -> tuple[IntArray, FloatArray]:
 
 
 def _read_lights(log: Path) -> LightStates | None:
-    if not (log / "traffic_light_detections.arrow").is_file():
+    path = log / "traffic_light_detections.arrow"
+    if not path.is_file():
         return None
-    file = _File(log, "traffic_light_detections")
+    file = _File(path)
     rows, (lanes, shown) = file.lists()
     return states_of_lists(file.stamps(), rows, lanes.to_numpy(), shown.to_numpy(), codes.LIGHTS)
 
@@ -248,7 +247,7 @@ def _read_lights(log: Path) -> LightStates | None:
 @lru_cache(maxsize=1)  # logs of one city follow each other
 def _read_map(path: Path, name: str, lit: frozenset[str]) -> PieceMap:
     """A map; `lit` are the lanes that have a light."""
-    file = _File(path.parent, "map", at=path)
+    file = _File(path)
     table = file.table.filter(pc.is_in(file.table["map_layer"], pa.array(codes.LAYERS, pa.int8())))
     numbers, layers, features, wkb = (column.to_pylist() for column in table.columns)
     found: defaultdict[str, dict[int, dict[Any, Any]]] = defaultdict(dict)

@@ -222,6 +222,7 @@ def _arrow(path: Path, random: Random) -> str:
     """As for Parquet; and what msgpack packed in the schema or a cell changed."""
     with pa.OSFile(str(path)) as source:
         table = pa.ipc.open_file(source).read_all()
+    table.validate(full=True)  # a damaged one would end this process
     notes = dict(table.schema.metadata or {})
     packed = [name for name in ("features",) if name in table.column_names]
     if packed and random.random() < 0.4:
