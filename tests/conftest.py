@@ -59,7 +59,7 @@ def nuplan_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The nuplan reference folder: logs, maps and outputs of the official stack."""
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN / "nuplan.tar.xz") as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder)
     return folder / "nuplan"
 
 

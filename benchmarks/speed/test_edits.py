@@ -40,7 +40,7 @@ def codes(tmp_path_factory):
     """Scenes of nuPlan's format with the codes of interPlan that are kept for tests."""
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN / "nuplan.tar.xz") as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder)
     scenes = Scenes(folder / "nuplan")
     cases = json.loads((GOLDEN / "scenario_edits" / "build.json").read_text())["cases"]
     found = {}

@@ -76,7 +76,7 @@ def scenes(store, tmp_path_factory):
     if not folder.is_dir():
         folder = tmp_path_factory.mktemp("reference") / "nuplan"
         with tarfile.open(REPOSITORY / "tests/golden/nuplan.tar.xz") as archive:
-            archive.extractall(folder.parent, filter="data")
+            archive.extractall(folder.parent)
     demo = open_store(store)
     found = {**Scenes(folder), "bench_scene_100": bench_scene(100, 0)}
     return {**found, "demo": demo.read(demo.tokens[0])}

@@ -35,7 +35,7 @@ def scenes(tmp_path_factory):
     """The reference scenes and the city scene with 100 agents."""
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN) as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder)
     cities = {f"bench_scene_{count}": bench_scene(count, 0) for count in (100, 300)}
     return {**Scenes(folder / "nuplan"), **cities}
 

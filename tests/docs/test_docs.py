@@ -118,7 +118,7 @@ def _write_results(folder: Path, golden: Path) -> None:
         for member in archive.getmembers():
             _, _, member.name = member.name.partition("/")
             if member.name.startswith("maps/") or Path(member.name).name in logs:
-                archive.extract(member, folder / "scenes", filter="data")
+                archive.extract(member, folder / "scenes")
 
 
 def _write_tracks(folder: Path, recording: Path) -> None:
