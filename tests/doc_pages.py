@@ -35,7 +35,7 @@ _FENCE = re.compile(
 _FILE = re.compile(r'^(?:# |""")(?P<name>[\w-]+\.(?:py|toml|yaml|csv|txt|sh))(?:""")?$')
 _SHELL = re.compile(r"[|<>&;$*]")  # what only a shell understands
 RUN, SHOWN = ("sh", "python"), ("text",)
-PLAIN = ("", "toml", "yaml", "csv", "json", "bibtex")
+PLAIN = ("", "dockerfile", "toml", "yaml", "csv", "json", "bibtex")
 
 
 @dataclass(frozen=True)
