@@ -74,12 +74,12 @@ def interplan_score(scores: dict[str, float | None], sorts: str) -> float:
     for metric, score in scores.items():
         if score is None:
             continue
-        role, weight = role_of(metric, sorts)
-        if role == "multiplier":
+        _, weight = role_of(metric, sorts)
+        if weight is None:
             product *= score
         else:
-            total += (weight or 0.0) * score
-            weights += weight or 0.0
+            total += weight * score
+            weights += weight
     return product * (total / weights if weights > 0.0 else 0.0)
 
 
@@ -151,9 +151,7 @@ def lane_changes_to_goal(road: VectorMap, log: SimulationLog) -> LaneChanges:
         raise DataError("lane changes to the goal: the ego or the expert starts on no lane")
     known = set(expert_lanes)
     lanes = [lane for edges in found for lane in edges if len(edges) == 1 or lane in known]
-    if not lanes or lanes[0] != expert_lanes[0]:
-        lanes.insert(0, expert_lanes[0])
-    goal, last = _at_the_end(road, expert_lanes, lanes)
+    goal, last = _at_the_end(road, expert_lanes, [expert_lanes[0], *lanes])
     starts = [expert.at(0), expert.at(1)]
     same = starts[1] and road.block_of[starts[0][0]] == road.block_of[starts[1][0]]
     initial: int | None = 0

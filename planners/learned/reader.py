@@ -13,7 +13,9 @@ import zipfile
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
+from pickletools import genops
 from typing import Any
 
 import numpy as np
@@ -37,6 +39,7 @@ _STORAGES = {  # names of typed storages in a torch file
 _TORCH_HINT = "download it again, and compare its size with the one that its authors publish"
 ARGS_HINT = "use the args.json that was published with the checkpoint"
 _WRITTEN_HINT = "give the checkpoint that the training wrote"
+_NUMBERED = ("PUT", "LONG_BINPUT")  # a pickle's reader makes room for all up to a number
 # what content of any kind makes code raise that takes it for granted
 MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 # what reading a damaged file raises
@@ -178,9 +181,8 @@ def _read_tensors(archive: zipfile.ZipFile, root: str, path: Path) -> Contents:
     order = f"{root}/byteorder"
     if order in archive.namelist() and archive.read(order) != b"little":
         raise ValueError("its numbers are big-endian")
-    with archive.open(f"{root}/data.pkl") as file:
-        reader = _TensorReader(file, archive, root)
-        entries = _as_entries(reader.load(), path)
+    reader = _TensorReader(archive.read(f"{root}/data.pkl"), archive, root)
+    entries = _as_entries(reader.load(), path)
     return Contents("torch zip", entries, skipped=tuple(sorted(reader.foreign)))
 
 
@@ -217,9 +219,16 @@ class PlainReader(pickle.Unpickler):
     Nothing that the file names is imported, and nothing is called but what is known.
     """
 
-    def __init__(self, file: Any, known: Callable[[str, str], Any]) -> None:
-        """`known` gives what a module and a name stand for, None where they are foreign."""
-        super().__init__(file, encoding="utf-8")
+    def __init__(self, content: bytes, known: Callable[[str, str], Any]) -> None:
+        """`known` gives what a module and a name stand for, None where they are foreign.
+
+        Raises:
+            ValueError: The pickle is cut short, or asks for memory that its size does not explain.
+        """
+        for operation, argument, _ in genops(content):
+            if operation.name in _NUMBERED and int(argument or 0) > len(content):
+                raise ValueError(f"object number {argument} in a pickle of {len(content)} bytes")
+        super().__init__(BytesIO(content), encoding="utf-8")
         self.foreign: set[str] = set()
         self._known = known
 
@@ -235,9 +244,9 @@ class PlainReader(pickle.Unpickler):
 class _TensorReader(PlainReader):
     """Reads tensors and plain containers."""
 
-    def __init__(self, file: Any, archive: zipfile.ZipFile, root: str) -> None:
+    def __init__(self, content: bytes, archive: zipfile.ZipFile, root: str) -> None:
         names = _known_names()
-        super().__init__(file, lambda module, name: names.get((module, name)))
+        super().__init__(content, lambda module, name: names.get((module, name)))
         self._archive = archive
         self._root = root
         self._storages: dict[str, Any] = {}

@@ -180,9 +180,9 @@ def read_table(path: Path, report: Report) -> Source:
     """The columns of a `.parquet`: strings are object arrays, absent values None or NaN."""
     try:
         table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+    except (OSError, UnicodeError, pa.ArrowException) as error:
         raise DataError(f"{path}: not a readable Parquet file ({error})", DAMAGED) from error
-    columns = {name: table[name].to_numpy() for name in table.column_names}
     return Source(path.stem, "column", columns, report)
 
 

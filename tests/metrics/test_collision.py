@@ -35,6 +35,19 @@ def test_boxes_collide_where_shapely_says_so(seed: int) -> None:
         assert collide(a, b, np.empty((2, 4, 2))) == one.intersects(other)
 
 
+@given(seeds)
+def test_boxes_that_touch_but_for_rounding_are_decided_on_their_corners(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        heading, size = rng.uniform(-3.0, 3.0), rng.uniform(0.2, 6.0, (2, 2))
+        ahead = 0.5 * (size[0, 0] + size[1, 0]) + rng.choice([-1e-15, 0.0, 1e-15])
+        poses = np.array([[*rng.uniform(-4.0, 4.0, 2), heading]] * 2)
+        poses[1, :2] += ahead * np.array([np.cos(heading), np.sin(heading)])
+        one, other = (shapely.Polygon(c) for c in boxes_to_corners(poses, size))
+        a, b = (made_box(*box) for box in zip(poses, size, strict=True))
+        assert collide(a, b, np.empty((2, 4, 2))) == one.intersects(other)
+
+
 @pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-7, 1e-9, 1e-12])
 @pytest.mark.parametrize("place", [(4.0, 0.0), (0.0, 2.0), (-4.0, 0.3), (0.3, -2.0)])
 def test_boxes_collide_until_the_gap_is_there(gap: float, place: tuple[float, float]) -> None:
@@ -168,6 +181,7 @@ def test_contacts_are_judged_by_type_and_by_the_lanes_at_their_own_sample() -> N
         (7, 0, "active_front", 5.0, True),
     ]
     assert [c.time_us for c in found] == TIMES[[2, 3, 4, 4, 7]].tolist()
+    assert all(type(c.at_fault) is bool for c in found)  # as JSON needs it
 
 
 def hits(kind: AgentKind, *delta_v: float, at_fault: bool = True) -> list[Collision]:

@@ -101,6 +101,14 @@ def test_progress_in_the_lane_is_that_of_a_slow_version(seed: int) -> None:
     np.testing.assert_allclose(out, slow_in_lane(lines, route, points[:, :2]), atol=1e-9)
 
 
+def test_the_first_edge_of_all_is_met_anew_when_the_ego_starts_on_none() -> None:
+    lines = make_polylines([np.array([[0.0, y], [90.0, y]]) for y in (0.0, 4.0)])
+    route = EdgeLists(np.ones((4, 1), np.int64), np.array([0, 1, 1, 1]))
+    points = np.c_[[5.0, 7.0, 10.0, 14.0], np.zeros((4, 2))]
+    out = progress.lane_progress(SimpleNamespace(baselines=lines), route, points)
+    assert out.tolist() == [0.0, 0.0, 0.0, 4.0]
+
+
 def route_of(*lists: list[int]) -> EdgeLists:
     edges = np.full((len(lists), 3), 7)
     for row, found in zip(edges, lists, strict=True):
@@ -126,6 +134,8 @@ BLOCKS = SimpleNamespace(
         ([[0, 2], [2], [3]], [0, 3]),
         ([[2, 3], [3, 4], [4], [0]], [2, 0]),
         ([[2, 3], [2, 0], [3], [1]], [2, 1]),  # as does the third with the first
+        ([[2], [3, 2], [3]], [2, 3]),
+        ([[2], [3, 2], [3, 4]], [2, 3]),  # the last list that counted is the one to compare with
         ([[2], [4, 3]], [2]),  # the first edge of a list decides
         ([[0], [2], [0]], [0, 2, 0]),
         ([[0], [2], [5]], [0, 2, 5]),  # back in the first block

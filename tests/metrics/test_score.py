@@ -34,17 +34,17 @@ def test_multipliers_alone_score_nothing() -> None:
 @pytest.mark.parametrize(
     ("array", "column"), [("poses", n) for n in range(3)] + [("sizes", 0), ("sizes", 1)]
 )
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("value", "sample"), [(np.nan, 7), (np.inf, 19)])
 def test_every_number_of_a_track_must_be_finite_where_it_is_valid(
-    array: str, column: int, value: float
+    array: str, column: int, value: float, sample: int
 ) -> None:
     changed = getattr(LOG.tracks, array).copy()
-    changed[7, 0, column] = value
+    changed[sample, 0, column] = value
     tracks = replace(LOG.tracks, **{array: changed})
-    with pytest.raises(DataError, match="track 't0' at sample 7 has a pose or size"):
+    with pytest.raises(DataError, match=f"track 't0' at sample {sample} has a pose or size"):
         compute_metrics(replace(LOG, tracks=tracks), straight_road())
     valid = LOG.tracks.valid.copy()
-    valid[7, 0] = False
+    valid[sample, 0] = False
     compute_metrics(replace(LOG, tracks=replace(tracks, valid=valid)), straight_road())
 
 

@@ -116,6 +116,14 @@ def test_the_steps_and_the_slowest_speed_are_nuplans(
     np.testing.assert_allclose(ttc.values, expected, rtol=0.0, atol=1e-12)
 
 
+def test_boxes_that_just_touch_are_hit() -> None:
+    # less than 1e-6 m decides: on corners
+    states = states_of(np.zeros((5, 3)), 10.0)
+    for gap, expected in ((5.0 - 5e-7, 0.5), (5.0 + 5e-7, 0.6)):
+        ttc, _ = measured(states, ahead(gap), np.ones(5, np.bool_))
+        np.testing.assert_allclose(ttc.values, expected, rtol=0.0, atol=1e-12)
+
+
 def test_the_nearer_of_two_tracks_is_the_partner_whatever_their_order() -> None:
     states = states_of(np.zeros((5, 3)), 10.0)
     for gaps, partner in (((5.0, 12.0), 0), ((12.0, 5.0), 1)):

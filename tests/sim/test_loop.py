@@ -1,5 +1,7 @@
 """The step loop: what is seen, stored and moved, and in which order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import cruise_scenario
@@ -10,6 +12,7 @@ from shiftsim.sim import loop
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
+from shiftsim.world.script import Finish, Script
 from shiftsim.world.state import NUM_STATE, VX, Command, Trajectory, X
 
 
@@ -284,3 +287,26 @@ def test_the_past_of_the_ego_is_that_of_the_recording(history_rows):
     first = planner.seen[0].history
     np.testing.assert_array_equal(first.ego, scenario.ego[past])
     np.testing.assert_array_equal(first.time_us, scenario.time_us[past])
+
+
+@pytest.mark.parametrize("strange", [0, 1])
+def test_only_the_first_plan_is_doubted(strange):
+    class Elsewhere(Recorder):
+        def plan(self, observation):
+            plan = super().plan(observation)
+            if len(self.seen) == strange + 1:
+                plan.states[:, X] += 42.0
+            return plan
+
+    rollout = Rollout(cruise_scenario(iterations=5), Elsewhere())
+    loop.drive(rollout)
+    assert ("42 m away" in rollout.doubt) == (strange == 0)
+
+
+@pytest.mark.parametrize(("progress", "samples"), [(20.0, 12), (20.5, 13), (500.0, 19)])
+def test_a_rollout_ends_one_sample_after_the_ego_has_reached_the_finish(progress, samples):
+    finish = Finish(np.array([[0.0, 0.0], [600.0, 0.0]]), progress)
+    script = Script("a", "b", "c", (), (), np.zeros(0, np.int64), finish=finish)
+    scenario = replace(cruise_scenario(iterations=20), script=script)
+    log = simulate(scenario, Recorder(), controller="perfect")
+    assert len(log.ego) == samples  # 0.8 m each, from 11.461 m on

@@ -34,10 +34,19 @@ def test_every_name_is_parsed_and_kept(name):
     assert sampled(name).shape == (150, 2)
 
 
-def test_levels_have_the_benchmarks_sigmas():
-    model = parse_noise("ou-high")
+@pytest.mark.parametrize("kind", ["awgn", "ou"])
+@pytest.mark.parametrize(
+    ("level", "accel", "rate"), [("low", 0.5, 0.1), ("mid", 1.0, 0.2), ("high", 1.5, 0.3)]
+)
+def test_levels_have_the_benchmarks_sigmas(kind, level, accel, rate):
+    model = parse_noise(f"{kind}-{level}")
 
-    assert (model.kind, model.sigma_accel, model.sigma_rate, model.theta) == ("ou", 1.5, 0.3, 2.0)
+    assert (model.kind, model.sigma_accel, model.sigma_rate, model.theta) == (
+        kind,
+        accel,
+        rate,
+        2.0,
+    )
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_the_list():

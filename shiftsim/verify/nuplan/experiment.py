@@ -185,10 +185,11 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
     found = {}
     for file in sorted(folder.glob(f"{pattern}.parquet")):
         table = read_table(file, report)
-        for name in (token, "planner_name"):
+        has_means = "num_scenarios" in table
+        for name in (token, "planner_name", *(("scenario_type",) if has_means else ())):
             if name not in table:
                 raise DataError(f"{file}: column {name!r} is missing", OTHER_VERSION)
-        if "num_scenarios" in table:
+        if has_means:
             table = _compare_means(table)
         found[file.stem] = Groups(table, report, (token, "planner_name"))
     return found

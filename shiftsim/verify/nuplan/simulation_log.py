@@ -10,7 +10,6 @@ import lzma
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
 from struct import error as StructError
@@ -141,7 +140,7 @@ def read_simulation_log(path: Path, report: Report) -> Recorded:
     collects = gc.isenabled()
     gc.disable()  # nothing can be collected while hundreds of thousands of objects are made
     try:
-        reader = PlainReader(BytesIO(_unpacked(path)), _known_names())
+        reader = PlainReader(_unpacked(path), _known_names())
         return _recorded(reader.load(), report, frozenset(reader.foreign))
     except AttributeError as error:
         raise DataError(f"{path}: {error}", OTHER_VERSION) from error
