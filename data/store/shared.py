@@ -40,7 +40,11 @@ def shared_map(path: Path) -> VectorMap:
     Raises:
         DataError: The file is missing or damaged.
     """
-    if not path.is_file() or path.stat().st_size < _PACKED:
+    try:
+        is_large = path.stat().st_size >= _PACKED
+    except OSError:  # the reader says what is wrong with it
+        is_large = False
+    if not is_large:
         return read_map_file(path)
     content = digest(path)[:16]
     folder = user_cache("maps")

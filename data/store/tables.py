@@ -239,9 +239,13 @@ class Table:
             for column in found.columns:
                 if pa.types.is_string(column.type):
                     column.validate(full=True)  # that it is UTF-8
-            return found
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
+        for name, column in zip(found.column_names, found.columns, strict=True):
+            if column.null_count:
+                what = f"{column.null_count} of {len(column)} values are missing"
+                raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
+        return found
 
 
 def digest(path: Path) -> str:

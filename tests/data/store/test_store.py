@@ -413,7 +413,7 @@ def test_another_version_is_refused(store: Path) -> None:
         "fixture-town.parquet",
     ],
 )
-@pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "column"])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "column", "null"])
 def test_a_damaged_file_gives_one_error_that_names_it(name: str, damage: str, store: Path) -> None:
     path = next(store.rglob(name))
     DAMAGES[damage](path)
@@ -430,12 +430,27 @@ def _drop_column(path: Path) -> None:
     pq.write_table(table, path)
 
 
+def _put_null(path: Path) -> None:
+    file = pq.ParquetFile(path)
+    table = file.read()
+    column = table.column(1)
+    values = pa.array([*column.to_pylist()[:-1], None], column.type)
+    table = table.set_column(1, table.column_names[1], values)
+    pq.write_table(table.replace_schema_metadata(file.metadata.metadata), path)
+
+
 DAMAGES = {
+    "null": _put_null,
     "missing": Path.unlink,
     "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "empty": lambda path: path.write_bytes(b""),
     "column": _drop_column,
 }
+
+
+def test_a_name_that_no_file_can_have_is_a_missing_map(store: Path) -> None:
+    with pytest.raises(DataError, match="is missing"):
+        open_store(store).map("a" * 300)
 
 
 def test_a_foreign_folder_is_not_overwritten(tmp_path: Path) -> None:
