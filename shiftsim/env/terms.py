@@ -274,7 +274,7 @@ def _find_contacts(course: Course, row: int) -> bool:
             continue
         pose, size = course.poses[row, track], course.sizes[row, track]
         dx, dy = pose[0] - ego[0], pose[1] - ego[1]
-        reach = ego[8] + 0.5 * (size[0] + size[1])
+        reach = ego[7] + 0.5 * (size[0] + size[1])
         if dx * dx + dy * dy > reach * reach:
             continue
         set_box(other, pose, size[0], size[1])
@@ -297,7 +297,7 @@ def _is_contact_ahead(course: Course, row: int, speed: float) -> bool:
             other_speed = np.hypot(velocity[0], velocity[1])
         _set_ego(course, row)
         dx, dy = pose[0] - ego[0], pose[1] - ego[1]
-        reach = ego[8] + 0.5 * (size[0] + size[1]) + TTC_STEP * TTC_TESTS * (speed + other_speed)
+        reach = ego[7] + 0.5 * (size[0] + size[1]) + TTC_STEP * TTC_TESTS * (speed + other_speed)
         if dx * dx + dy * dy > reach * reach:
             continue
         set_box(other, pose, size[0], size[1])
