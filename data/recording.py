@@ -126,19 +126,14 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     index = visible_columns(tracks.valid, tracks.kinds, tracks.tokens, without)
     if len(index) == tracks.num_tracks and (index == np.arange(len(index))).all():
         return tracks
-    shape = (len(tracks), len(index))
-    chosen = Tracks(
-        np.empty(shape, np.bool_),
-        np.empty((*shape, 3)),
-        np.empty((*shape, 2)),
-        np.empty((*shape, 2)),
+    return Tracks(
+        tracks.valid.take(index, axis=1),
+        tracks.poses.take(index, axis=1),
+        tracks.velocities.take(index, axis=1),
+        tracks.sizes.take(index, axis=1),
         tracks.kinds[index],
         tuple(tracks.tokens[i] for i in index.tolist()),
     )
-    arrays = (chosen.valid, chosen.poses, chosen.velocities, chosen.sizes)
-    sources = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
-    _copy_columns(index, *map(np.ascontiguousarray, sources), *arrays)
-    return chosen
 
 
 def visible_columns(
@@ -173,32 +168,6 @@ def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
     first = np.full(len(kinds), len(valid), np.int64)
     _link_columns(valid, kinds, before, first)
     return sort_tracks(before, kinds, first)
-
-
-@kernel
-def _copy_columns(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
-    index: IntArray,
-    valid: BoolArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-    out_valid: BoolArray,
-    out_poses: FloatArray,
-    out_velocities: FloatArray,
-    out_sizes: FloatArray,
-):
-    """Copy the tracks `index` (N',) of dense arrays (R, N, …) into others (R, N', …)."""
-    for row in range(valid.shape[0]):
-        for to in range(len(index)):
-            track = index[to]
-            out_valid[row, to] = valid[row, track]
-            out_poses[row, to, 0] = poses[row, track, 0]
-            out_poses[row, to, 1] = poses[row, track, 1]
-            out_poses[row, to, 2] = poses[row, track, 2]
-            out_velocities[row, to, 0] = velocities[row, track, 0]
-            out_velocities[row, to, 1] = velocities[row, track, 1]
-            out_sizes[row, to, 0] = sizes[row, track, 0]
-            out_sizes[row, to, 1] = sizes[row, track, 1]
 
 
 @kernel

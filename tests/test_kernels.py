@@ -26,6 +26,7 @@ from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.tracks.convert import convert_tracks, look_at
 from shiftsim.files import PACKAGE
+from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.planners.table import PLANNERS
 from shiftsim.sim.loop import simulate
@@ -166,6 +167,9 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "tracks and check": convert_table,
         "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),
         "realism": lambda: measure_realism(scenario),
+        "metrics": lambda: compute_metrics(
+            simulate(scenario, load("constant-velocity")), scenario.map
+        ),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }
 

@@ -205,6 +205,7 @@ class Table:
             if not kind.equals(field.type):
                 raise DataError(f"{column} is {kind}, not {field.type}", hint=REPAIR)
         self.names = expected.names
+        self._full = {field.name for field in expected if not field.nullable}
         self.footer = self._read_footer()
 
     def _read_footer(self) -> dict[str, object]:
@@ -242,7 +243,7 @@ class Table:
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
         for name, column in zip(found.column_names, found.columns, strict=True):
-            if column.null_count:
+            if column.null_count and name in self._full:
                 what = f"{column.null_count} of {len(column)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
         return found
