@@ -8,6 +8,7 @@ from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.sim.loop import Rollout, drive, simulate
 from shiftsim.sim.traffic import LogReplay
 from shiftsim.world.script import Script
@@ -50,8 +51,8 @@ def scene(iterations=20):
     return replace(made, tracks=tracks.rows(slice(0, len(made.time_us))))
 
 
-def stepped(scenario, **changes):
-    rollout = Rollout(scenario, ConstantVelocity(), **changes)
+def stepped(scenario, planner=None, **changes):
+    rollout = Rollout(scenario, planner or ConstantVelocity(), **changes)
     while not rollout.done:
         rollout.advance(rollout.planner.plan(rollout.observe()))
     return rollout.log()
@@ -71,6 +72,25 @@ def test_steps_taken_at_once_are_those_taken_one_by_one(noise, iterations):
     taken = ours.planning_seconds[1:]
     assert (taken > 0.0).all()
     np.testing.assert_array_equal(taken, taken[0])
+
+
+@pytest.mark.parametrize("future", [0, 5, 300])
+@pytest.mark.parametrize("noise", ["none", "ou-high"])
+def test_recorded_plans_are_driven_at_once_as_far_as_they_reach(noise, future, monkeypatch):
+    scenario = cruise_scenario(iterations=40, start=(10.0, 0.0, 0.3), future_rows=future)
+    asked, plan = [], LogFuture.plan
+
+    def noted(planner, observation):
+        asked.append(observation.iteration)
+        return plan(planner, observation)
+
+    monkeypatch.setattr(LogFuture, "plan", noted)
+    ours = simulate(scenario, LogFuture(), noise=noise, seed=3)
+    first = min((70 + future) // 2, 39)  # the first iteration from which 0.5 s were not recorded
+    assert asked == [0, *range(first, 39)]
+    theirs = stepped(scenario, LogFuture(), noise=noise, seed=3)
+    for name in ("ego", "commands", "plans", "degraded"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
 def edited():
