@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing, circle_around
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
 from shiftsim.geometry.polylines import Path, project
+from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import Areas
 from shiftsim.planners.proposals.comfort import comfort
@@ -17,17 +18,16 @@ from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
     Others,
-    first_faults,
-    hits,
-    near_others,
+    is_at_fault,
     project_box,
 )
 from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, Places, find_places
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, in_any
-from shiftsim.world.state import VX, VY, X, Y
+from shiftsim.world.state import HEADING, VX, VY, X, Y
 
 TTC_STEPS = (0, 3, 6, 9)  # how far ahead a pose is projected
+AHEAD_SECONDS = DT * TTC_STEPS[-1]
 MIN_PROGRESS = 0.1  # m, of the best proposal; below it progress is not compared
 
 
@@ -47,6 +47,14 @@ class Scores(NamedTuple):
     flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
 
 
+class Contacts(NamedTuple):
+    """What P proposals hit, see `Scores`."""
+
+    no_collision: FloatArray  # (P,) factor
+    collision_index: FloatArray  # (P,) time index
+    ttc_index: FloatArray  # (P,) time index
+
+
 class Place(NamedTuple):
     """The map as the scorer sees it."""
 
@@ -62,12 +70,9 @@ def score(
     """Score P proposals by their driven states (P, T, 11)."""
     no_limits = np.zeros(len(place.areas.lane))
     at = find_places(states, size, place.areas, place.selected, no_limits, by_center=True)
-    rows = np.arange(states.shape[1]) // 2
-    seen = (rows[-1] * 2 + TTC_STEPS[-1]) // 2 + 1  # forecast maps that are looked at
-    near = near_others(at, others, seen, DT * TTC_STEPS[-1])
-    # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
-    no_collision, collision_index = first_faults(at, others, near, rows, True)
-    ttc_index = _first_violations(at, others, near, place.intersections)
+    contacts = Contacts(*(np.empty(len(states)) for _ in Contacts._fields))
+    _find_contacts(at, others, place.intersections, size, contacts)
+    no_collision, collision_index, ttc_index = contacts
     raw, off_route = _travel(at, place.centerline)
     low, high = params.direction_limits
     direction = np.where(off_route < low, 1.0, np.where(off_route < high, 0.5, 0.0))
@@ -111,39 +116,124 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 
 @kernel
-def _first_violations(
-    places: Places, others: Others, near: IntArray, intersections: Polygons
-) -> FloatArray:
-    """First time indices (P,) at which the time to collision is too short, inf if none."""
-    first = np.full(len(places.states), NEVER)
-    box, forgiven = np.empty((4, 2)), np.empty(len(near), np.bool_)
-    for proposal in range(len(first)):
-        for entry in range(len(near)):
-            forgiven[entry] = False
-        for step in range(places.states.shape[1]):
-            state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
-            speed = np.hypot(state[VX], state[VY])
-            if speed < TTC_STOPPED:
+def _find_contacts(
+    at: Places, others: Others, intersections: Polygons, size: EgoBox, made: Contacts
+) -> None:
+    """Fill in the contacts; each of the others counts until its first one, of either kind."""
+    num_steps, num_others = at.states.shape[1], len(others.radii)
+    last, radius = (num_steps - 1 + TTC_STEPS[-1]) // 2, 0.5 * np.hypot(size.length, size.width)
+    box, motion = np.empty((4, 2)), np.empty((num_steps, 3))  # speed, and where it leads to
+    for proposal in range(len(made.no_collision)):
+        made.no_collision[proposal] = 1.0
+        made.collision_index[proposal] = made.ttc_index[proposal] = NEVER
+        low_x = low_y = np.inf
+        high_x = high_y = -np.inf
+        for step in range(num_steps):
+            state, center = at.states[proposal, step], at.centers[proposal, step]
+            speed = abs(state[VX]) if state[VY] == 0.0 else np.hypot(state[VX], state[VY])
+            motion[step, 0] = speed
+            reach = radius + AHEAD_SECONDS * speed
+            low_x, high_x = min(low_x, center[0] - reach), max(high_x, center[0] + reach)
+            low_y, high_y = min(low_y, center[1] - reach), max(high_y, center[1] + reach)
+        has_courses = False
+        for index in range(num_others):
+            if others.ignored[index]:
                 continue
-            for ahead in TTC_STEPS:
-                project_box(places.corners[proposal, step], state, 0.1 * ahead * speed, box)
-                row, circle = (step + ahead) // 2, circle_around(box)
-                for entry in range(len(near)):
-                    index = near[entry]
-                    if forgiven[entry] or not hits(others, row, index, box, circle):
-                        continue
-                    middle = others.centroids[row, index]
-                    angle = bearing(state, middle[0], middle[1])
-                    counts = angle < AHEAD
-                    if not counts and not angle > BEHIND:
-                        counts = off_lane or in_any(intersections, state[X], state[Y])
-                    if counts:
-                        first[proposal] = min(first[proposal], float(step))
-                    else:
-                        forgiven[entry] = True
-            if first[proposal] < NEVER:
-                break
-    return first
+            # boxes of others move in straight lines
+            first, end, slack = others.centers[0, index], others.centers[last, index], SLACK
+            slack += others.radii[index]
+            if (
+                max(first[0], end[0]) + slack < low_x
+                or min(first[0], end[0]) - slack > high_x
+                or max(first[1], end[1]) + slack < low_y
+                or min(first[1], end[1]) - slack > high_y
+            ):
+                continue
+            if not has_courses:
+                has_courses = True
+                for step in range(num_steps):
+                    heading = at.states[proposal, step, HEADING]
+                    motion[step, 1], motion[step, 2] = np.cos(heading), np.sin(heading)
+            _meet(at, others, intersections, proposal, index, size, motion, box, made)
+
+
+@lean_kernel
+def _is_beside(
+    center: FloatArray, motion: FloatArray, travel: float, size: EgoBox, box: FloatArray
+) -> bool:
+    """Whether a box (4, 2) clearly lies on one side of the ego, whose centre is moved ahead.
+
+    `motion` (3,) as for `_meet`; most boxes that are near do.
+    """
+    least = left = np.inf
+    most = right = -np.inf
+    for corner in range(4):
+        dx, dy = box[corner, 0] - center[0], box[corner, 1] - center[1]
+        along, across = motion[1] * dx + motion[2] * dy - travel, motion[1] * dy - motion[2] * dx
+        least, most = min(least, along), max(most, along)
+        left, right = min(left, across), max(right, across)
+    half_length, half_width = 0.5 * size.length + SLACK, 0.5 * size.width + SLACK
+    return least > half_length or most < -half_length or left > half_width or right < -half_width
+
+
+@lean_kernel
+def _meet(
+    at: Places,
+    others: Others,
+    intersections: Polygons,
+    proposal: int,
+    index: int,
+    size: EgoBox,
+    motion: FloatArray,  # (T, 3) speed [m/s], cosine and sine of the heading
+    box: FloatArray,  # (4, 2) scratch
+    made: Contacts,
+) -> None:
+    """Note the first contacts of a proposal with one of the others."""
+    is_decided = is_forgiven = False
+    touching = 0.5 * np.hypot(size.length, size.width) + others.radii[index] + SLACK
+    for step in range(len(motion)):
+        if is_decided and (is_forgiven or step > made.ttc_index[proposal]):
+            return
+        speed, center = motion[step, 0], at.centers[proposal, step]
+        reach = touching + AHEAD_SECONDS * speed + (AHEAD_SECONDS + DT) * others.speeds[0, index]
+        dx = others.centers[step // 2, index, 0] - center[0]
+        dy = others.centers[step // 2, index, 1] - center[1]
+        if dx * dx + dy * dy > reach * reach:
+            continue
+        state, off_lane = at.states[proposal, step], at.off_lane[proposal, step]
+        for ahead in TTC_STEPS:
+            row, travel = (step + ahead) // 2, 0.1 * ahead * speed
+            dx = others.centers[row, index, 0] - (center[0] + travel * motion[step, 1])
+            dy = others.centers[row, index, 1] - (center[1] + travel * motion[step, 2])
+            if dx * dx + dy * dy > touching * touching:
+                continue
+            is_now = ahead == 0 and not is_decided
+            is_soon = not is_forgiven and not speed < TTC_STOPPED
+            if not is_now and not is_soon:
+                continue
+            other = others.boxes[row, index]
+            if _is_beside(center, motion[step], travel, size, other):
+                continue
+            project_box(at.corners[proposal, step], state, travel, box)
+            if not convex_intersect(box, other):
+                continue
+            if is_now:
+                # nuPlan rule 195: what is not at fault when it is first touched is not looked at
+                # again
+                is_decided = True
+                if is_at_fault(state, box, off_lane, others, row, index):
+                    worth = 0.0 if others.is_agent[index] else 0.5
+                    made.no_collision[proposal] = min(made.no_collision[proposal], worth)
+                    made.collision_index[proposal] = min(made.collision_index[proposal], step)
+            if is_soon:
+                middle = others.centroids[row, index]
+                angle = bearing(state, middle[0], middle[1])
+                counts = angle < AHEAD
+                if not counts and not angle > BEHIND:
+                    counts = off_lane or in_any(intersections, state[X], state[Y])
+                is_forgiven = True  # or nothing later matters
+                if counts:
+                    made.ttc_index[proposal] = min(made.ttc_index[proposal], step)
 
 
 @kernel
@@ -151,12 +241,13 @@ def _travel(places: Places, centerline: Path) -> tuple[FloatArray, FloatArray]:
     """Progress along the centerline and longest way off the route, both (P,) [m]."""
     centers, last = places.centers, places.centers.shape[1] - 1
     progress, off_route = np.empty(len(centers)), np.empty(len(centers))
-    start = (0.0, 0.0, 0)
+    start, end = (0.0, 0.0, 0), (0.0, 0.0, 0)
     for row in range(len(centers)):
         x, y = centers[row, 0, 0], centers[row, 0, 1]
         if row == 0 or x != centers[row - 1, 0, 0] or y != centers[row - 1, 0, 1]:  # rarely
             start = project(centerline, x, y, start[2])
-        end = project(centerline, centers[row, last, 0], centers[row, last, 1], start[2])
+        guess = start[2] if row == 0 else end[2]
+        end = project(centerline, centers[row, last, 0], centers[row, last, 1], guess)
         progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
         for step in range(last + 1):

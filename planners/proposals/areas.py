@@ -127,33 +127,14 @@ def _joined(lists: Lists, chosen: IntArray) -> IntArray:
     return out
 
 
-@kernel
-def near_areas(bounds: FloatArray, selected: IntArray, corners: FloatArray) -> IntArray:
-    """Those of the selected areas whose bounds overlap the bounds of boxes (P, T, 4, 2)."""
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for x, y in corners.reshape(-1, 2):
-        low_x, high_x = min(low_x, x), max(high_x, x)
-        low_y, high_y = min(low_y, y), max(high_y, y)
-    out, count = np.empty_like(selected), 0
-    for area in selected:
-        if (
-            bounds[area, 0] <= high_x
-            and bounds[area, 2] >= low_x
-            and bounds[area, 1] <= high_y
-            and bounds[area, 3] >= low_y
-        ):
-            out[count] = area
-            count += 1
-    return out[:count]
-
-
 @part_kernel
-def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
-    """Which points (K, 2) lie in the interior of an area, and which on its boundary: bits."""
+def held_points(
+    slabs: Slabs, area: int, points: FloatArray, first: int, stop: int
+) -> tuple[int, int]:
+    """Which of some points (K, 2) lie in the interior of an area, which on its boundary: bits."""
     bounds, scale, slab_ptr, edge_ptr, ends = slabs
     inside = on_boundary = 0
-    for point in range(len(points)):
+    for point in range(first, stop):
         x, y, bit = points[point, 0], points[point, 1], 1 << point
         if not (
             bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
@@ -186,7 +167,7 @@ def covering(slabs: Slabs, selected: IntArray, points: FloatArray) -> IntArray:
     """The selected areas that hold a point (1, 2), boundary included, in their order."""
     out, count = np.empty_like(selected), 0
     for area in selected:
-        if held_points(slabs, area, points) != (0, 0):
+        if held_points(slabs, area, points, 0, 1) != (0, 0):
             out[count] = area
             count += 1
     return out[:count]

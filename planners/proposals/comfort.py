@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.planners.proposals.tracker import DT, SCORED
 from shiftsim.world.state import AX, AY, HEADING
 
 SIGNALS = ("lon_accel", "lat_accel", "jerk", "lon_jerk", "yaw_accel", "yaw_rate")
+ROWS, COLUMNS, BLOCK, BAND = 44, 48, 4, 16  # of padded filters, see `Filters`
+_SMOOTH, _BRIEFLY, _SLOPE, _SLOPE_OF_ANGLE, _BEND_OF_ANGLE = range(5)  # filters
 
 
 class ComfortBounds(NamedTuple):
@@ -28,13 +30,15 @@ class ComfortBounds(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """Savitzky-Golay filters as matrices (41, 41): output = input @ filter."""
+    """Savitzky-Golay filters as matrices: output = input @ matrix.
 
-    smooth: FloatArray
-    smooth_briefly: FloatArray
-    slope: FloatArray
-    slope_of_angle: FloatArray
-    bend_of_angle: FloatArray
+    Blocks of rows and columns that the processor takes at once; what is beyond 41 is zero.
+    """
+
+    matrices: FloatArray  # (5, 44, 48) those numbered above
+    # (5, 11, 4, 16) the columns that the rows of a block reach, of the short filters
+    bands: FloatArray
+    starts: IntArray  # (5, 11) first of these columns
 
 
 @functools.cache
@@ -42,17 +46,19 @@ def make_filters() -> Filters:
     """The filters; never changed."""
     from scipy.signal import savgol_filter
 
-    def matrix(window: int, order: int, derivative: int = 0) -> FloatArray:
-        samples = np.eye(SCORED + 1)
-        made = savgol_filter(samples, window, order, deriv=derivative, delta=DT, axis=-1)
-        return np.ascontiguousarray(made)
-
     # nuPlan rule 183: one parabola over the whole horizon, and 5 samples for the yaw signals,
     # because the length of the window is not passed on
     long = SCORED + 1
-    return Filters(
-        matrix(long, 2), matrix(8, 2), matrix(long, 2, 1), matrix(5, 2, 1), matrix(5, 3, 2)
-    )
+    windows = ((long, 2, 0), (8, 2, 0), (long, 2, 1), (5, 2, 1), (5, 3, 2))
+    matrices = np.zeros((len(windows), ROWS, COLUMNS))
+    for matrix, (window, order, derivative) in zip(matrices, windows, strict=True):
+        matrix[:long, :long] = savgol_filter(
+            np.eye(long), window, order, deriv=derivative, delta=DT, axis=-1
+        )
+    blocks = matrices.reshape(len(windows), -1, BLOCK, COLUMNS)
+    starts = np.minimum((blocks != 0.0).any(axis=2).argmax(axis=2), COLUMNS - BAND)
+    columns = starts[:, :, None, None] + np.arange(BAND)
+    return Filters(matrices, np.take_along_axis(blocks, columns, axis=3), starts)
 
 
 class Comfort(NamedTuple):
@@ -75,7 +81,7 @@ def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
 @kernel
 def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: Comfort) -> None:
     count = states.shape[1]
-    raw, brief = np.empty((4, count)), np.empty(count)
+    raw, brief, sums = np.zeros((4, ROWS)), np.zeros(ROWS), np.empty(COLUMNS)
     highs = (
         bounds.lon_accel_max,
         bounds.lat_accel,
@@ -89,20 +95,20 @@ def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: 
         for step in range(count):
             state = states[row, step]
             raw[0, step], raw[1, step] = state[AX], state[AY]
-            raw[2, step] = np.hypot(state[AX], state[AY])
+            raw[2, step] = abs(state[AX]) if state[AY] == 0.0 else np.hypot(state[AX], state[AY])
             if step > 0:
                 change = state[HEADING] - states[row, step - 1, HEADING]
                 turn -= 2.0 * np.pi * np.rint(change / (2.0 * np.pi))
             raw[3, step] = state[HEADING] + turn
         out = made.signals[row]
-        _filter(raw[0], filters.smooth, out[0])
-        _filter(raw[1], filters.smooth, out[1])
-        _filter(raw[2], filters.smooth_briefly, brief)
-        _filter(brief, filters.slope, out[2])
-        _filter(raw[0], filters.smooth_briefly, brief)
-        _filter(brief, filters.slope, out[3])
-        _filter(raw[3], filters.bend_of_angle, out[4])
-        _filter(raw[3], filters.slope_of_angle, out[5])
+        _filter(raw[0], filters, _SMOOTH, sums, out[0])
+        _filter(raw[1], filters, _SMOOTH, sums, out[1])
+        _filter(raw[2], filters, _BRIEFLY, sums, brief[:count])
+        _filter(brief, filters, _SLOPE, sums, out[2])
+        _filter(raw[0], filters, _BRIEFLY, sums, brief[:count])
+        _filter(brief, filters, _SLOPE, sums, out[3])
+        _filter(raw[3], filters, _BEND_OF_ANGLE, sums, out[4])
+        _filter(raw[3], filters, _SLOPE_OF_ANGLE, sums, out[5])
         for signal in range(6):
             low = bounds.lon_accel_min if signal == 0 else -highs[signal]
             within = True
@@ -112,14 +118,36 @@ def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: 
 
 
 @lean_kernel
-def _filter(samples: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
-    """Write samples @ matrix into `out`, rounded to 8 decimals."""
+def _filter(
+    samples: FloatArray, filters: Filters, number: int, sums: FloatArray, out: FloatArray
+) -> None:
+    """Write samples (44,) times a matrix into `out` (41,), rounded to 8 decimals.
+
+    `sums` (48,) is scratch.
+    """
+    is_short = number != _SMOOTH and number != _SLOPE
+    for row in range(ROWS):
+        # nothing is left out where it would not be 0
+        is_short = is_short and samples[row] - samples[row] == 0.0
+    for column in range(COLUMNS):
+        sums[column] = 0.0
+    for block in range(filters.starts.shape[1]):
+        row = BLOCK * block
+        a, b, c, d = samples[row], samples[row + 1], samples[row + 2], samples[row + 3]
+        if a == 0.0 and b == 0.0 and c == 0.0 and d == 0.0:
+            continue
+        if is_short:
+            band, start = filters.bands[number, block], filters.starts[number, block]
+            _add(band, a, b, c, d, sums[start : start + BAND])
+        else:
+            _add(filters.matrices[number, row : row + BLOCK], a, b, c, d, sums)
     for column in range(len(out)):
-        out[column] = 0.0
-    for row in range(len(samples)):
-        value = samples[row]
-        if value != 0.0:
-            for column in range(len(out)):
-                out[column] += value * matrix[row, column]
-    for column in range(len(out)):
-        out[column] = np.rint(out[column] * 1e8) / 1e8
+        out[column] = np.rint(sums[column] * 1e8) / 1e8
+
+
+@lean_kernel
+def _add(rows: FloatArray, a: float, b: float, c: float, d: float, sums: FloatArray) -> None:
+    """Add four samples times four rows of a matrix (4, K), one after the other, to `sums` (K,)."""
+    for column in range(rows.shape[1]):
+        total = sums[column] + a * rows[0, column] + b * rows[1, column]
+        sums[column] = total + c * rows[2, column] + d * rows[3, column]

@@ -114,12 +114,11 @@ def is_at_fault(
 
 @kernel
 def first_faults(
-    places: Places, others: Others, near: IntArray, rows: IntArray, forgives: bool
+    places: Places, others: Others, near: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of the others that are near.
 
-    `rows` (T,) is the row of time of each time index, -1 where it is not looked at. With `forgives`
-    a first contact without fault makes all later ones count as such.
+    `rows` (T,) is the row of time of each time index, -1 where it is not looked at.
 
     Returns:
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
@@ -143,7 +142,5 @@ def first_faults(
                     worth = 0.0 if others.is_agent[index] else 0.5
                     scores[proposal] = min(scores[proposal], worth)
                     first[proposal] = min(first[proposal], float(step))
-                    decided[entry] = True
-                elif forgives:
                     decided[entry] = True
     return scores, first

@@ -215,12 +215,16 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     """
     num_runs = len(path.runs)
     guess = min(max(guess, 0), num_runs - 1)
-    bound = _project_on_run(path, guess, x, y)[0] + SLACK
+    least, along = _project_on_run(path, guess, x, y)
+    bound = least + SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        if not is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+        if run == guess:
+            distance, progress = least, along
+        elif is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+            distance, progress = _project_on_run(path, run, x, y)
+        else:
             continue
-        distance, progress = _project_on_run(path, run, x, y)
         if distance < best:
             best, found, run_found = distance, progress, run
     return found, best, run_found
