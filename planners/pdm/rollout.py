@@ -3,16 +3,23 @@
 Array axes: L paths, F target speeds, 81 time indices.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
-from shiftsim.geometry.polylines import HIT, Path, pose_at, project
+from shiftsim.geometry.polylines import CLEAR, OPEN, Path, pose_at, project
 from shiftsim.geometry.rings import ring_distance
-from shiftsim.planners.pdm.corridor import Corridor, fill_corridor, make_corridor
+from shiftsim.planners.pdm.corridor import (
+    Corridors,
+    Paths,
+    corridor_shape,
+    decide,
+    fill_corridor,
+    make_corridors,
+)
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks
 from shiftsim.planners.pdm.parameters import FollowingModel
 from shiftsim.planners.proposals.places import EgoBox
@@ -20,85 +27,81 @@ from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS
 from shiftsim.world.state import VX
 
 MIN_PROGRESS = 1e-5  # m, nuPlan rule 190: keeps clear of a duplicate vertex at the very start
-_DONE = -1
 _TIED = -2  # instead of what is nearest
+_DONE = -3  # instead of what must be known to go on
 
 
 class Scene(NamedTuple):
     """What proposals are rolled out in."""
 
-    paths: Sequence[Path]  # the centerline and those beside it
+    paths: Paths  # the centerline and those beside it
     forecast: Forecast  # what is around
     size: EgoBox  # of the ego
     model: FollowingModel  # the longitudinal policy
 
 
-class Rows(NamedTuple):
-    """Policies of one path; zeros where not rolled out yet."""
-
-    targets: FloatArray  # (F,) target speeds [m/s]
-    poses: FloatArray  # (F, 81, 3) x [m], y [m], heading [rad]
-    motion: FloatArray  # (F, 81, 2) progress [m], speed [m/s]
-    leads: FloatArray  # (F, 81, 3) progress [m], speed [m/s], rear length [m]
-
-
 class Proposals(NamedTuple):
-    """Rear-axle poses, motion along the path, and leads, as in `Rows`, of all paths."""
+    """Policies of all paths; zeros where not rolled out yet."""
 
     targets: FloatArray  # (F,) target speeds [m/s]
-    poses: FloatArray  # (L, F, 81, 3)
-    motion: FloatArray  # (L, F, 81, 2)
-    leads: FloatArray  # (L, F, 81, 3)
-    corridors: tuple[Corridor, ...]  # one per path
-
-    def rows(self, path: int, chosen: slice = slice(None)) -> Rows:
-        """Some of the policies of a path."""
-        arrays = (self.poses, self.motion, self.leads)
-        return Rows(self.targets[chosen], *(array[path, chosen] for array in arrays))
+    poses: FloatArray  # (L, F, 81, 3) rear axle x [m], y [m], heading [rad]
+    motion: FloatArray  # (L, F, 81, 2) progress [m], speed [m/s]
+    leads: FloatArray  # (L, F, 81, 3) progress [m], speed [m/s], rear length [m]
+    corridors: Corridors  # what stands in the way
+    ranks: IntArray  # (41, M) order of what is around on a forecast map, -1 where not known
 
 
-def start_proposals(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
-    """Proposals at time index 0: on the paths, beside the ego (11,)."""
-    shape = (len(scene.paths), len(targets), STEPS + 1)
-    poses, motion = np.zeros((*shape, 3)), np.zeros((*shape, 2))
-    reach = STEPS * DT * abs(float(targets.max()))
-    half_width, count = 0.5 * scene.size.width, len(scene.forecast.ignored)
-    corridors = []
-    for index, path in enumerate(scene.paths):
-        progress = project(path, ego[0], ego[1], 0)[0]
-        read_pose(path, progress, poses[index, 0, 0])
-        poses[index, :, 0] = poses[index, 0, 0]
-        motion[index, :, 0] = progress, ego[VX]
-        corridors.append(make_corridor(progress, progress + reach, half_width, count))
-    return Proposals(targets, poses, motion, np.zeros((*shape, 3)), tuple(corridors))
+class Part(NamedTuple):
+    """Which proposals are rolled on, and how far; ends are included."""
+
+    paths: tuple[int, int]
+    policies: tuple[int, int]
+    steps: tuple[int, int]  # time indices to fill; those before are filled
 
 
-def roll_out(proposals: Proposals, scene: Scene) -> None:
-    """Fill time indices 1 … 40 of all proposals."""
-    for index in range(len(scene.paths)):
-        _roll_path(proposals, scene, index, proposals.rows(index), range(1, SCORED + 1))
+def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
+    """Time indices 0 … 40 of all proposals, from beside the ego (11,)."""
+    num_paths, num_targets = len(scene.paths.xy), len(targets)
+    shape, count = (num_paths, num_targets, STEPS + 1), len(scene.forecast.ignored)
+    proposals = Proposals(
+        targets,
+        np.zeros((*shape, 3)),
+        np.zeros((*shape, 2)),
+        np.zeros((*shape, 3)),
+        make_corridors(num_paths, 0.5 * scene.size.width, count),
+        np.full((NUM_FORECASTS, count), -1),
+    )
+    whole = Part((0, num_paths - 1), (0, num_targets - 1), (1, SCORED))
+    _roll_on(proposals, scene, ego, whole)
+    return proposals
 
 
-def extend(proposals: Proposals, scene: Scene, best: int) -> FloatArray:
+def extend(proposals: Proposals, scene: Scene, ego: FloatArray, best: int) -> FloatArray:
     """Fill time indices 41 … 80 of the proposal numbered `best`; its poses (81, 3)."""
-    index, speed = divmod(best, len(proposals.targets))
-    chosen = proposals.rows(index, slice(speed, speed + 1))
-    _roll_path(proposals, scene, index, chosen, range(SCORED + 1, STEPS + 1))
-    return proposals.poses[index, speed]
+    path, policy = divmod(best, len(proposals.targets))
+    _roll_on(proposals, scene, ego, Part((path, path), (policy, policy), (SCORED + 1, STEPS)))
+    return proposals.poses[path, policy]
 
 
-def _roll_path(proposals: Proposals, scene: Scene, index: int, rows: Rows, steps: range) -> None:
-    path, corridor, forecast = scene.paths[index], proposals.corridors[index], scene.forecast
-    last = steps[-1]
-    fill_corridor(path, corridor, forecast, (steps[0] + 1) // 2, last // 2 + 1)
-    ranks = np.full((NUM_FORECASTS, len(forecast.ignored)), -1)
-    around, scratch = (path, corridor, forecast, ranks), (np.empty((4, 2)), ranks[0].copy())
-    step = steps[0]
+def _roll_on(proposals: Proposals, scene: Scene, ego: FloatArray, part: Part) -> None:
+    paths, forecast, corridors = scene.paths, scene.forecast, proposals.corridors
+    scratch = np.empty((4, 2)), np.empty(len(forecast.ignored), np.int64)
+    at, step, wanted, shape = part.paths[0], 0, _DONE, None
     while True:
-        step = _roll(step, last, *around, scene.size, scene.model, rows, *scratch)
-        if step == _DONE:
+        before = at
+        at, step, wanted = _roll(
+            at, step, part, ego, paths, forecast, scene.size, scene.model, proposals, *scratch
+        )
+        if wanted == _DONE:
             return
-        ranks[step // 2] = forecast_ranks(forecast, step // 2)
+        if wanted == _TIED:
+            proposals.ranks[step // 2] = forecast_ranks(forecast, step // 2)
+            continue
+        if shape is None or before != at:
+            low, high = corridors.spans[at].tolist()
+            shape = corridor_shape(paths.at(at), low, high, corridors.half_width)
+            shapely.prepare(shape)
+        decide(shape, corridors, forecast, at, step // 2, wanted)
 
 
 @lean_kernel
@@ -114,71 +117,145 @@ def read_pose(path: Path, progress: float, out: FloatArray) -> None:
 
 @lean_kernel
 def _roll(
-    first: int,  # first time index to fill; the one before it is filled
-    last: int,  # last time index to fill
-    path: Path,
-    corridor: Corridor,  # what stands in its way
+    first_path: int,  # where to go on
+    first_step: int,  # likewise; 0 where the path is new
+    part: Part,
+    ego: FloatArray,  # (11,) ego state
+    paths: Paths,
     forecast: Forecast,
-    ranks: IntArray,  # (41, M) order of what is around on a forecast map, -1 where not known
     size: EgoBox,
     model: FollowingModel,  # the longitudinal policy
-    rows: Rows,
+    made: Proposals,
     footprint: FloatArray,  # (4, 2) scratch
     hits: IntArray,  # (M,) scratch
-) -> int:
-    """Roll the policies of one path on, from time index `first` to `last`.
+) -> tuple[int, int, int]:
+    """Roll proposals on.
 
     Returns:
-        _DONE, or the time index whose ranks are needed to break a tie.
+        Path and time index to go on from, and what must be known first: _TIED for the ranks, or
+        whether the corridor of the path holds something that is OPEN; _DONE where nothing is left.
     """
-    others, num_boxes = forecast.others, len(forecast.headings)
-    for step in range(first, last + 1):
-        row = step // 2
-        num_hits, farthest = 0, -np.inf
+    begin, last = part.steps
+    step = first_step
+    for number in range(first_path, part.paths[1] + 1):
+        path = Path(
+            paths.xy[number], paths.heading[number], paths.progress[number], paths.runs[number]
+        )
+        if step == 0:
+            step = begin
+            if begin == 1:
+                _start(path, made, number, ego)
+            fill_corridor(path, made.corridors, forecast, number, (begin + 1) // 2, last // 2 + 1)
+        sides, along = made.corridors.sides[number], made.corridors.progress[number]
+        while step <= last:
+            wanted = _follow_leads(
+                step,
+                path,
+                forecast,
+                size,
+                model,
+                made.targets,
+                part.policies,
+                made.poses[number],
+                made.motion[number],
+                made.leads[number],
+                sides[step // 2],
+                along[step // 2],
+                made.ranks[step // 2],
+                footprint,
+                hits,
+            )
+            if wanted != _DONE:
+                return number, step, wanted
+            step += 1
+        step = 0
+    return part.paths[1], 0, _DONE
+
+
+@lean_kernel
+def _start(path: Path, made: Proposals, number: int, ego: FloatArray) -> None:
+    """Fill time index 0 of a path's proposals: on the path, beside the ego."""
+    progress = project(path, ego[0], ego[1], 0)[0]
+    poses, motion, targets = made.poses[number], made.motion[number], made.targets
+    for policy in range(len(targets)):
+        if policy == 0:
+            read_pose(path, progress, poses[0, 0])
+        for column in range(3):
+            poses[policy, 0, column] = poses[0, 0, column]
+        motion[policy, 0, 0], motion[policy, 0, 1] = progress, ego[VX]
+    fastest = targets[0]
+    for target in targets:
+        fastest = max(fastest, target)
+    made.corridors.spans[number, 0] = progress
+    made.corridors.spans[number, 1] = progress + STEPS * DT * abs(fastest)
+
+
+@part_kernel
+def _follow_leads(
+    step: int,
+    path: Path,
+    forecast: Forecast,
+    size: EgoBox,
+    model: FollowingModel,
+    targets: FloatArray,  # (F,)
+    policies: tuple[int, int],  # the first and the last one
+    poses: FloatArray,  # (F, 81, 3) as in `Proposals`
+    motion: FloatArray,  # (F, 81, 2)
+    leads: FloatArray,  # (F, 81, 3)
+    sides: IntArray,  # (M,) on the forecast map
+    along: FloatArray,  # (M,) progress
+    ranks: IntArray,  # (M,)
+    footprint: FloatArray,
+    hits: IntArray,
+) -> int:
+    """Fill one time index of a path's proposals; what must be known first, or _DONE."""
+    others, num_boxes, row = forecast.others, len(forecast.headings), step // 2
+    num_hits, farthest = 0, -np.inf
+    if step % 2 == 0:
         for index in range(len(hits)):
-            if corridor.sides[row, index] == HIT and not forecast.ignored[index]:
+            if sides[index] != CLEAR and not forecast.ignored[index]:
                 hits[num_hits] = index
                 num_hits += 1
-                farthest = max(farthest, corridor.progress[row, index])
-        # nuPlan rule 192: one lead for all policies of a path, cleared once per time index; what a
-        # policy does not overwrite it inherits from the one before
-        lead_speed, rear = 0.0, 0.0
-        for policy in range(len(rows.targets)):
-            before, pose = rows.motion[policy, step - 1], rows.poses[policy, step - 1]
-            progress, lead = before[0], rows.leads[policy, step]
-            if step % 2 == 1:
-                for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
-                    lead[column] = rows.leads[policy, step - 1, column]
+                farthest = max(farthest, along[index])
+    # nuPlan rule 192: one lead for all policies of a path, cleared once per time index; what a
+    # policy does not overwrite it inherits from the one before
+    lead_speed, rear = 0.0, 0.0
+    for policy in range(policies[0], policies[1] + 1):
+        before, pose, lead = motion[policy, step - 1], poses[policy, step - 1], leads[policy, step]
+        progress = before[0]
+        if step % 2 == 1:
+            for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
+                lead[column] = leads[policy, step - 1, column]
+        else:
+            lead[0] = path.progress[-1]
+            if farthest > progress:
+                x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
+                y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
+                box_corners(x, y, pose[2], size.length, size.width, footprint)
+                found, distance = _nearest(
+                    hits[:num_hits],
+                    along,
+                    progress,
+                    footprint,
+                    others.boxes[row],
+                    others.centers[row],
+                    others.radii,
+                    forecast.light_xy,
+                    forecast.light_ptr,
+                    forecast.light_bounds,
+                    ranks,
+                )
+                if found == _TIED or sides[found] == OPEN:
+                    return found
+                lead[0] = progress + distance
+                if found < num_boxes:
+                    turn = wrap_angle(forecast.headings[found] - pose[2])
+                    lead_speed = others.speeds[row, found] * np.cos(turn)
             else:
-                lead[0] = path.progress[-1]
-                if farthest > progress:
-                    x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
-                    y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
-                    box_corners(x, y, pose[2], size.length, size.width, footprint)
-                    found, distance = _nearest(
-                        hits[:num_hits],
-                        corridor.progress[row],
-                        progress,
-                        footprint,
-                        others.boxes[row],
-                        others.centers[row],
-                        others.radii,
-                        forecast.light_xy,
-                        forecast.light_ptr,
-                        forecast.light_bounds,
-                        ranks[row],
-                    )
-                    if found == _TIED:
-                        return step
-                    lead[0] = progress + distance
-                    if found < num_boxes:
-                        turn = wrap_angle(forecast.headings[found] - pose[2])
-                        lead_speed = others.speeds[row, found] * np.cos(turn)
-                else:
-                    rear = 0.5 * size.length
-                lead[1], lead[2] = lead_speed, rear
-            follow(before, lead, rows.targets[policy], model, rows.motion[policy, step])
-            read_pose(path, rows.motion[policy, step, 0], rows.poses[policy, step])
+                rear = 0.5 * size.length
+            lead[1], lead[2] = lead_speed, rear
+        follow(before, lead, targets[policy], model, motion[policy, step])
+        read_pose(path, motion[policy, step, 0], poses[policy, step])
     return _DONE
 
 
