@@ -162,15 +162,18 @@ def held_points(
     return inside & ~on_boundary, on_boundary
 
 
-@kernel
-def covering(slabs: Slabs, selected: IntArray, points: FloatArray) -> IntArray:
-    """The selected areas that hold a point (1, 2), boundary included, in their order."""
-    out, count = np.empty_like(selected), 0
+@lean_kernel
+def covering(slabs: Slabs, selected: IntArray, points: FloatArray, out: IntArray) -> int:
+    """Write the selected areas that hold a point (1, 2), or have it on their boundary, into `out`.
+
+    They keep their order; how many they are.
+    """
+    count = 0
     for area in selected:
         if held_points(slabs, area, points, 0, 1) != (0, 0):
             out[count] = area
             count += 1
-    return out[:count]
+    return count
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

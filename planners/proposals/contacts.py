@@ -42,13 +42,20 @@ def project_box(corners: FloatArray, state: FloatArray, travel: float, out: Floa
 @kernel
 def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
     """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
-    out = np.zeros(len(boxes), np.bool_)
-    x, y, radius = circle_around(footprint)
+    out = np.empty(len(boxes), np.bool_)
+    circle = circle_around(footprint)
     for index in range(len(boxes)):
-        other_x, other_y, other_radius = circle_around(boxes[index])
-        if np.hypot(x - other_x, y - other_y) <= radius + other_radius:
-            out[index] = convex_intersect(boxes[index], footprint)
+        out[index] = touches_box(footprint, circle, boxes[index])
     return out
+
+
+@lean_kernel
+def touches_box(footprint: FloatArray, circle: tuple[float, float, float], box: FloatArray) -> bool:
+    """Whether a box (4, 2), with the circle around it, touches another one."""
+    x, y, radius = circle_around(box)
+    if np.hypot(circle[0] - x, circle[1] - y) > circle[2] + radius:
+        return False
+    return convex_intersect(box, footprint)
 
 
 @kernel

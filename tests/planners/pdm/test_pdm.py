@@ -205,3 +205,22 @@ def test_the_nearest_of_each_kind_are_seen_static_objects_first():
     tracks = standing_tracks(1, np.array(poses), [VEHICLE] * 55 + [CONE] * 5)
     chosen = select_tracks(tracks, 0.0, 0.0, {f"{2:016x}"}, replace(DEFAULT, map_radius=58.0))
     assert chosen.tolist() == [55, 56, 57, *(i for i in range(51) if i != 2)]
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_tracks_are_seen_by_group_and_distance_also_where_some_are_equally_far(seed, is_tied):
+    rng = np.random.default_rng(seed)
+    poses = rng.uniform(-60.0, 60.0, (120, 3))
+    if is_tied:
+        poses = np.rint(poses / 10.0)
+    kinds = rng.integers(0, 7, 120)
+    tracks = standing_tracks(1, poses, [AgentKind(kind) for kind in kinds.tolist()])
+    tracks.valid[0] = rng.uniform(size=120) < 0.8
+    distance = np.hypot(poses[:, 0], poses[:, 1])
+    expected = []
+    for members, most in ((kinds > 2, 50), (kinds == 0, 50), (kinds == 1, 25), (kinds == 2, 10)):
+        here = np.flatnonzero(members & tracks.valid[0] & (distance <= DEFAULT.map_radius))
+        here = here[np.argsort(kinds[here], kind="stable")]
+        expected += here[np.argsort(distance[here])[:most]].tolist()
+    assert select_tracks(tracks, 0.0, 0.0, set(), DEFAULT).tolist() == expected

@@ -22,7 +22,8 @@ def test_areas_and_their_order_are_those_of_the_map():
         (195.0, 1.75, ["10", "11"]),
         (195.0, 5.3, []),
     ):
-        under = covering(areas.slabs, selected, np.array([[x, y]]))
+        found = np.empty_like(selected)
+        under = found[: covering(areas.slabs, selected, np.array([[x, y]]), found)]
         assert [road.edges.ids[i] for i in under] == expected
 
 
