@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from worlds import straight_road
 
 from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
-from shiftsim.planners.proposals.tracker import fit_speed
+from shiftsim.planners.proposals.tracker import factor_speed_fit, fit_speed
 
 
 def test_areas_and_their_order_are_those_of_the_map():
@@ -51,6 +51,7 @@ def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
     regular[np.arange(37), np.arange(1, 38)] = 1.0
     regular[37, 38], regular[37, 39] = -1.0, 1.0
     solved = np.linalg.solve(matrix.T @ matrix + penalty * regular.T @ regular, matrix.T @ right)
-    out = np.empty(40)
-    fit_speed(poses, dt, penalty, out)
+    out, factors = np.empty(40), np.empty((3, 40))
+    factor_speed_fit(dt, penalty, factors)
+    fit_speed(poses, np.empty((41, 2)), dt, factors, out)
     np.testing.assert_allclose(out, unknowns @ solved, rtol=0, atol=1e-9)
