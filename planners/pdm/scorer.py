@@ -55,6 +55,14 @@ class Contacts(NamedTuple):
     ttc_index: FloatArray  # (P,) time index
 
 
+class Travel(NamedTuple):
+    """Where P proposals go, see `Scores`."""
+
+    progress: FloatArray  # (P,) along the centerline [m]
+    drivable: FloatArray  # (P,) factor
+    direction: FloatArray  # (P,) factor
+
+
 class Place(NamedTuple):
     """The map as the scorer sees it."""
 
@@ -70,13 +78,10 @@ def score(
     """Score P proposals by their driven states (P, T, 11)."""
     no_limits = np.zeros(len(place.areas.lane))
     at = find_places(states, size, place.areas, place.selected, no_limits, by_center=True)
-    contacts = Contacts(*(np.empty(len(states)) for _ in Contacts._fields))
+    no_collision, collision_index, ttc_index = contacts = Contacts(*np.empty((3, len(states))))
     _find_contacts(at, others, place.intersections, size, contacts)
-    no_collision, collision_index, ttc_index = contacts
-    raw, off_route = _travel(at, place.centerline)
-    low, high = params.direction_limits
-    direction = np.where(off_route < low, 1.0, np.where(off_route < high, 0.5, 0.0))
-    drivable = np.where(at.flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
+    raw, drivable, direction = travel = Travel(*np.empty((3, len(states))))
+    _travel(at, place.centerline, params.direction_limits, travel)
     factor = no_collision * drivable * direction
     progress = normalise(raw, factor)
     ttc = np.where(np.isfinite(ttc_index), 0.0, 1.0)
@@ -236,11 +241,10 @@ def _meet(
                     made.ttc_index[proposal] = min(made.ttc_index[proposal], step)
 
 
-@kernel
-def _travel(places: Places, centerline: Path) -> tuple[FloatArray, FloatArray]:
-    """Progress along the centerline and longest way off the route, both (P,) [m]."""
-    centers, last = places.centers, places.centers.shape[1] - 1
-    progress, off_route = np.empty(len(centers)), np.empty(len(centers))
+@lean_kernel
+def _travel(at: Places, centerline: Path, limits: tuple[float, float], made: Travel) -> None:
+    """Fill in where proposals go; `limits` [m] as in `PdmParameters`."""
+    centers, last = at.centers, at.centers.shape[1] - 1
     start, end = (0.0, 0.0, 0), (0.0, 0.0, 0)
     for row in range(len(centers)):
         x, y = centers[row, 0, 0], centers[row, 0, 1]
@@ -248,15 +252,17 @@ def _travel(places: Places, centerline: Path) -> tuple[FloatArray, FloatArray]:
             start = project(centerline, x, y, start[2])
         guess = start[2] if row == 0 else end[2]
         end = project(centerline, centers[row, last, 0], centers[row, last, 1], guess)
-        progress[row] = max(0.0, end[0] - start[0])
+        made.progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
+        is_on_road = True
         for step in range(last + 1):
-            if not places.flags[row, step, OFF_ROUTE]:
+            is_on_road = is_on_road and not at.flags[row, step, OFF_ROAD]
+            if not at.flags[row, step, OFF_ROUTE]:
                 stretch = 0.0
             elif step > 0:
                 dx = centers[row, step, 0] - centers[row, step - 1, 0]
                 dy = centers[row, step, 1] - centers[row, step - 1, 1]
                 stretch += np.hypot(dx, dy)
             longest = max(longest, stretch)
-        off_route[row] = longest
-    return progress, off_route
+        made.drivable[row] = 1.0 if is_on_road else 0.0
+        made.direction[row] = 1.0 if longest < limits[0] else (0.5 if longest < limits[1] else 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
-from shiftsim.geometry.rings import ray_crossings
+from shiftsim.geometry.rings import SLACK, ray_crossings
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
@@ -28,6 +28,9 @@ class Slabs(NamedTuple):
     slab_ptr: IntArray  # (M + 1,) first slab of each area, the lowest one
     edge_ptr: IntArray  # (S + 1,) first edge of each slab
     ends: FloatArray  # (2 E, 2) start and end of each edge in turn [m]
+    # (S, 4) x within each slab: up to which and from which all is outside (first and last), and
+    # between which all is inside [m]
+    spans: FloatArray
 
 
 class Areas(NamedTuple):
@@ -74,7 +77,9 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
     vertices = np.empty(2 * edge_ptr[-1], np.int64)
     _slice(polygons, scale, slab_ptr, edge_ptr[:-1].copy(), vertices)
-    slabs = Slabs(polygons.bounds, scale, slab_ptr, edge_ptr, polygons.xy[vertices])
+    spans, scratch = np.empty((len(counts), 4)), np.empty((2, counts.max(initial=0)))
+    slabs = Slabs(polygons.bounds, scale, slab_ptr, edge_ptr, polygons.xy[vertices], spans)
+    _span(slabs, scratch[0], scratch[1])
     return Areas(polygons, slabs, on_route, lane)
 
 
@@ -99,6 +104,52 @@ def _slice(
                         vertices[2 * fill[slab]], vertices[2 * fill[slab] + 1] = before, vertex
                     fill[slab] += 1
                 before = vertex
+
+
+@lean_kernel
+def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
+    """Fill in the spans; `lows` and `highs` are scratch for the edges of a slab."""
+    ends, spans = slabs.ends, slabs.spans
+    for area in range(len(slabs.scale)):
+        for slab in range(slabs.slab_ptr[area], slabs.slab_ptr[area + 1]):
+            bottom, height = slabs.bounds[area, 1], slabs.bounds[area, 3] - slabs.bounds[area, 1]
+            if slabs.scale[area] > 0.0:
+                height = 1.0 / slabs.scale[area]
+                bottom += (slab - slabs.slab_ptr[area]) * height
+            first, count = slabs.edge_ptr[slab], slabs.edge_ptr[slab + 1] - slabs.edge_ptr[slab]
+            spans[slab, 0], spans[slab, 3] = np.inf, -np.inf
+            for edge in range(count):
+                a, b = ends[2 * (first + edge)], ends[2 * (first + edge) + 1]
+                low, high = _reach(a, b, bottom - SLACK, bottom + height + SLACK)
+                lows[edge], highs[edge] = low - SLACK, high + SLACK
+                spans[slab, 0] = min(spans[slab, 0], lows[edge])
+                spans[slab, 3] = max(spans[slab, 3], highs[edge])
+            # the widest gap between edges, of those that are inside
+            spans[slab, 1], spans[slab, 2] = np.inf, -np.inf
+            middle, widest = bottom + 0.5 * height, 0.0
+            for edge in range(count):
+                left, right, is_inside = highs[edge], np.inf, False
+                for other in range(count):
+                    if lows[other] > left:
+                        right = min(right, lows[other])
+                        y, after = ends[2 * (first + other), 1], ends[2 * (first + other) + 1, 1]
+                        is_inside = is_inside != ((y > middle) != (after > middle))
+                    elif highs[other] > left:
+                        right = left  # there is no gap
+                if is_inside and right - left > widest:
+                    spans[slab, 1], spans[slab, 2], widest = left, right, right - left
+
+
+@lean_kernel
+def _reach(a: FloatArray, b: FloatArray, bottom: float, top: float) -> tuple[float, float]:
+    """Least and greatest x of the edge between points (2,), where its y is in a range it meets."""
+    low, high = min(a[0], b[0]), max(a[0], b[0])
+    if a[1] == b[1]:
+        return low, high
+    slope = (b[0] - a[0]) / (b[1] - a[1])
+    first = a[0] + slope * (max(min(a[1], b[1]), bottom) - a[1])
+    last = a[0] + slope * (min(max(a[1], b[1]), top) - a[1])
+    return max(low, min(first, last)), min(high, max(first, last))
 
 
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
@@ -132,7 +183,7 @@ def held_points(
     slabs: Slabs, area: int, points: FloatArray, first: int, stop: int
 ) -> tuple[int, int]:
     """Which of some points (K, 2) lie in the interior of an area, which on its boundary: bits."""
-    bounds, scale, slab_ptr, edge_ptr, ends = slabs
+    bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
     inside = on_boundary = 0
     for point in range(first, stop):
         x, y, bit = points[point, 0], points[point, 1], 1 << point
@@ -142,6 +193,11 @@ def held_points(
             continue  # also where a coordinate is NaN
         slab = slab_ptr[area] + int((y - bounds[area, 1]) * scale[area])
         slab = min(slab, slab_ptr[area + 1] - 1)
+        if spans[slab, 1] < x < spans[slab, 2]:
+            inside |= bit
+            continue
+        if x < spans[slab, 0] or x > spans[slab, 3]:
+            continue
         for edge in range(2 * edge_ptr[slab], 2 * edge_ptr[slab + 1], 2):
             ay, by = ends[edge, 1], ends[edge + 1, 1]
             if ay != y and by != y:  # nearly always

@@ -6,8 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
-from shiftsim.planners.proposals.areas import covering, index_ranks, make_areas, select_areas
+from shiftsim.planners.proposals.areas import (
+    areas_of,
+    covering,
+    index_ranks,
+    make_areas,
+    select_areas,
+)
 from shiftsim.planners.proposals.tracker import factor_speed_fit, fit_speed
+from shiftsim.world.layers import make_polygons
 
 
 def test_areas_and_their_order_are_those_of_the_map():
@@ -25,6 +32,32 @@ def test_areas_and_their_order_are_those_of_the_map():
         found = np.empty_like(selected)
         under = found[: covering(areas.slabs, selected, np.array([[x, y]]), found)]
         assert [road.edges.ids[i] for i in under] == expected
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_what_covers_a_point_is_what_shapely_says(seed):
+    rng = np.random.default_rng(seed)
+    rings = []
+    for count in rng.integers(2, 60, 12).tolist():
+        heading = np.cumsum(rng.normal(0.0, 0.1, count)) + rng.uniform(-3.0, 3.0)
+        steps = np.column_stack([np.cos(heading), np.sin(heading)]) * rng.uniform(0.1, 9.0)
+        middle = np.cumsum(steps, axis=0) + rng.uniform(-20.0, 20.0, 2)
+        aside = rng.uniform(0.5, 2.0) * steps[:, ::-1] / np.hypot(*steps[0]) * [-1.0, 1.0]
+        rings.append(np.concatenate([middle + aside, (middle - aside)[::-1]]))
+    rings += [np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [5.0, 9.0], [5.0, 4.0], [0.0, 9.0]])]
+    rings = [ring for ring in rings if shapely.Polygon(ring).is_valid]
+    shapes = [shapely.Polygon(ring) for ring in rings]
+    numbers = np.arange(len(rings))
+    areas = areas_of(make_polygons([[ring] for ring in rings]), numbers >= 0, numbers)
+    corners = np.concatenate(rings)
+    points = [corners, corners + np.array([1.0, 0.0]), 0.5 * (corners[:-1] + corners[1:])]
+    points = np.concatenate([*points, rng.uniform(-30.0, 30.0, (300, 2))])
+    expected = shapely.intersects(np.array(shapes)[:, None], shapely.points(points))
+    for point, covers in zip(points, expected.T, strict=True):
+        found = np.empty_like(numbers)
+        under = found[: covering(areas.slabs, numbers, point[None], found)]
+        assert under.tolist() == np.flatnonzero(covers).tolist()
 
 
 @settings(max_examples=20)
