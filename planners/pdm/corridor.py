@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.polylines import (
     BAND,
     CLEAR,
@@ -16,6 +16,7 @@ from shiftsim.geometry.polylines import (
     Path,
     Stretch,
     corridor_polygon,
+    is_run_near,
     is_run_within,
     project,
     side_of,
@@ -46,6 +47,15 @@ class Corridors(NamedTuple):
     half_width: float  # radius of the buffer [m]
     sides: IntArray  # (L, 41, M) CLEAR, HIT or OPEN on every forecast map
     progress: FloatArray  # (L, 41, M) projection of the centroid on the path, where not CLEAR [m]
+
+
+class BoxFrame(NamedTuple):
+    """Axes and size of a box."""
+
+    cos: float  # cosine of its heading
+    sin: float  # sine of its heading
+    half_length: float  # [m]
+    half_width: float  # [m]
 
 
 def make_corridors(num_paths: int, half_width: float, count: int) -> Corridors:
@@ -95,7 +105,6 @@ def fill_corridor(
     stretch = Stretch(path.xy, path.runs, begin, end, corridors.half_width)
     has_length = end - begin > 1
     reach = 1.5 * (1.0 + BAND) * stretch.half_width  # covers the corners of the square ends
-    bounds = _bounds(stretch, reach)
     num_boxes = len(others.radii)
     for index in range(num_boxes):
         stop = last
@@ -104,34 +113,34 @@ def fill_corridor(
                 _repeat(sides, progress, index, first, last)
                 continue
             stop = first + 1
-        guess, radius = -1, others.radii[index]
         # boxes move in straight lines
         start, there = others.centers[first, index], others.centers[stop - 1, index]
-        slack = radius + SLACK
-        if has_length and (
-            max(start[0], there[0]) + slack < bounds[0]
-            or min(start[0], there[0]) - slack > bounds[2]
-            or max(start[1], there[1]) + slack < bounds[1]
-            or min(start[1], there[1]) - slack > bounds[3]
-        ):
+        swept = (
+            *(min(start[0], there[0]), min(start[1], there[1])),
+            *(max(start[0], there[0]), max(start[1], there[1])),
+        )
+        radius = others.radii[index] + SLACK
+        near, farthest = _runs_near(stretch, swept, reach + radius)
+        if has_length and near > farthest:
             continue
+        box, guess = others.boxes[first, index], near
+        frame = BoxFrame(
+            np.cos(forecast.headings[index]),
+            np.sin(forecast.headings[index]),
+            0.5 * np.hypot(box[0, 0] - box[1, 0], box[0, 1] - box[1, 1]),
+            0.5 * np.hypot(box[1, 0] - box[2, 0], box[1, 1] - box[2, 1]),
+        )
         for row in range(first, stop):
-            center = others.centers[row, index]
-            run = _run_near(stretch, center[0], center[1], reach + slack) if has_length else 0
-            if run < 0:
+            side = OPEN
+            if has_length:
+                center = others.centers[row, index]
+                side = _side_of_frame(path, stretch, near, farthest, radius, center, frame)
+            if side == CLEAR:
                 continue
-            if guess < 0:
-                guess = run
             middle = others.centroids[row, index]
-            along, distance, guess = project(path, middle[0], middle[1], guess)
-            if has_length and distance > reach + radius:
-                continue
-            is_inside = (
-                has_length
-                and path.progress[begin] <= along <= path.progress[end - 1]
-                and distance <= (1.0 - BAND) * stretch.half_width
-            )
-            side = HIT if is_inside else side_of(stretch, others.boxes[row, index])
+            along, _, guess = project(path, middle[0], middle[1], guess)
+            if side == OPEN:
+                side = side_of(stretch, others.boxes[row, index])
             sides[row, index], progress[row, index] = side, along
         if stop < last:
             _repeat(sides, progress, index, first, last)
@@ -154,20 +163,57 @@ def _repeat(sides: IntArray, progress: FloatArray, index: int, first: int, last:
             sides[row, index], progress[row, index] = sides[known, index], progress[known, index]
 
 
+@part_kernel
+def _side_of_frame(
+    path: Path,
+    stretch: Stretch,
+    first: int,  # run that may be near
+    last: int,  # likewise; those outside are not
+    radius: float,  # of a circle around the box [m]
+    center: FloatArray,  # (2,) of the box [m]
+    frame: BoxFrame,
+) -> int:
+    """As `side_of`, from distances of a box from vertices alone: OPEN where these say nothing."""
+    inner, outer = (1.0 - BAND) * stretch.half_width - SLACK, (1.0 + BAND) * stretch.half_width
+    x, y, begin, end = center[0], center[1], stretch.begin, stretch.end - 1
+    cap = 1.5 * outer  # to the corners of the square ends
+    side = CLEAR
+    if (
+        _square_from(frame, stretch.xy[begin, 0] - x, stretch.xy[begin, 1] - y) <= cap * cap
+        or _square_from(frame, stretch.xy[end, 0] - x, stretch.xy[end, 1] - y) <= cap * cap
+    ):
+        side = OPEN
+    for run in range(first, last + 1):
+        if not is_run_within(stretch.runs, run, x, y, radius + outer):
+            continue
+        for vertex in range(max(begin, run * RUN), min(end, (run + 1) * RUN) + 1):
+            square = _square_from(frame, stretch.xy[vertex, 0] - x, stretch.xy[vertex, 1] - y)
+            if square <= inner * inner:
+                return HIT
+            # no point of the segments beside it is farther from one of their ends
+            step = path.progress[vertex] - path.progress[max(vertex - 1, begin)]
+            step = max(step, path.progress[min(vertex + 1, end)] - path.progress[vertex])
+            limit = outer + 0.5 * step + SLACK
+            if square <= limit * limit:
+                side = OPEN
+    return side
+
+
 @lean_kernel
-def _run_near(stretch: Stretch, x: float, y: float, limit: float) -> int:
-    """The first run of a stretch whose bounds come within `limit` [m] of a point, or -1."""
+def _square_from(frame: BoxFrame, dx: float, dy: float) -> float:
+    """Square of the distance of a box from a point, given from its centre [m^2]."""
+    along = max(abs(frame.cos * dx + frame.sin * dy) - frame.half_length, 0.0)
+    across = max(abs(frame.cos * dy - frame.sin * dx) - frame.half_width, 0.0)
+    return along * along + across * across
+
+
+@lean_kernel
+def _runs_near(
+    stretch: Stretch, bounds: tuple[float, float, float, float], reach: float
+) -> tuple[int, int]:
+    """The first and the last run of a stretch near to bounds; where none is, the last is less."""
+    first, last = len(stretch.runs), -1
     for run in range(stretch.begin // RUN, (stretch.end - 2) // RUN + 1):
-        if is_run_within(stretch.runs, run, x, y, limit):
-            return run
-    return -1
-
-
-@lean_kernel
-def _bounds(stretch: Stretch, reach: float) -> tuple[float, float, float, float]:
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for run in range(stretch.begin // RUN, max(stretch.end - 2, stretch.begin) // RUN + 1):
-        low_x, high_x = min(low_x, stretch.runs[run, 0]), max(high_x, stretch.runs[run, 2])
-        low_y, high_y = min(low_y, stretch.runs[run, 1]), max(high_y, stretch.runs[run, 3])
-    return low_x - reach, low_y - reach, high_x + reach, high_y + reach
+        if is_run_near(stretch.runs, run, bounds, reach):
+            first, last = min(first, run), run
+    return first, last

@@ -10,7 +10,7 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
-from shiftsim.geometry.polylines import CLEAR, OPEN, Path, pose_at, project
+from shiftsim.geometry.polylines import CLEAR, OPEN, Path, pose_before, project
 from shiftsim.geometry.rings import ring_distance
 from shiftsim.planners.pdm.corridor import (
     Corridors,
@@ -49,6 +49,7 @@ class Proposals(NamedTuple):
     leads: FloatArray  # (L, F, 81, 3) progress [m], speed [m/s], rear length [m]
     corridors: Corridors  # what stands in the way
     ranks: IntArray  # (41, M) order of what is around on a forecast map, -1 where not known
+    last: FloatArray  # (F, 3) where policies are on the path under way, see `read_pose`
 
 
 class Part(NamedTuple):
@@ -70,6 +71,7 @@ def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
         np.zeros((*shape, 3)),
         make_corridors(num_paths, 0.5 * scene.size.width, count),
         np.full((NUM_FORECASTS, count), -1),
+        np.empty((num_targets, 3)),
     )
     whole = Part((0, num_paths - 1), (0, num_targets - 1), (1, SCORED))
     _roll_on(proposals, scene, ego, whole)
@@ -105,14 +107,28 @@ def _roll_on(proposals: Proposals, scene: Scene, ego: FloatArray, part: Part) ->
 
 
 @lean_kernel
-def read_pose(path: Path, progress: float, out: FloatArray) -> None:
-    """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN."""
+def read_pose(path: Path, progress: float, last: FloatArray, out: FloatArray) -> None:
+    """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN.
+
+    `last` (3,) is of the last call, to go on from: vertex, heading, the same wrapped; NaN before.
+    """
     if progress != progress:
         # nuPlan rule 191: a speed limit of 0 makes progress undefined
         out[0], out[1], out[2] = 0.0, 0.0, 0.0
         return
-    out[0], out[1], turn = pose_at(path, max(progress, MIN_PROGRESS))
-    out[2] = np.arctan2(np.sin(turn), np.cos(turn))
+    end = len(path.progress) - 1
+    s = min(max(progress, MIN_PROGRESS, path.progress[0]), path.progress[end])
+    if last[0] != last[0]:
+        last[0] = np.searchsorted(path.progress, s)
+    upper = min(max(int(last[0]), 1), end)
+    while upper < end and path.progress[upper] < s:
+        upper += 1
+    while upper > 1 and path.progress[upper - 1] >= s:
+        upper -= 1
+    out[0], out[1], turn = pose_before(path, upper, s)
+    if turn != last[1]:  # it is the same along straight lines
+        last[1], last[2] = turn, np.arctan2(np.sin(turn), np.cos(turn))
+    last[0], out[2] = upper, last[2]
 
 
 @lean_kernel
@@ -143,6 +159,7 @@ def _roll(
         )
         if step == 0:
             step = begin
+            made.last[:] = np.nan
             if begin == 1:
                 _start(path, made, number, ego)
             fill_corridor(path, made.corridors, forecast, number, (begin + 1) // 2, last // 2 + 1)
@@ -162,6 +179,7 @@ def _roll(
                 sides[step // 2],
                 along[step // 2],
                 made.ranks[step // 2],
+                made.last,
                 footprint,
                 hits,
             )
@@ -179,7 +197,7 @@ def _start(path: Path, made: Proposals, number: int, ego: FloatArray) -> None:
     poses, motion, targets = made.poses[number], made.motion[number], made.targets
     for policy in range(len(targets)):
         if policy == 0:
-            read_pose(path, progress, poses[0, 0])
+            read_pose(path, progress, made.last[0], poses[0, 0])
         for column in range(3):
             poses[policy, 0, column] = poses[0, 0, column]
         motion[policy, 0, 0], motion[policy, 0, 1] = progress, ego[VX]
@@ -205,6 +223,7 @@ def _follow_leads(
     sides: IntArray,  # (M,) on the forecast map
     along: FloatArray,  # (M,) progress
     ranks: IntArray,  # (M,)
+    last: FloatArray,  # (F, 3) where they are, see `read_pose`
     footprint: FloatArray,
     hits: IntArray,
 ) -> int:
@@ -255,7 +274,7 @@ def _follow_leads(
                 rear = 0.5 * size.length
             lead[1], lead[2] = lead_speed, rear
         follow(before, lead, targets[policy], model, motion[policy, step])
-        read_pose(path, motion[policy, step, 0], poses[policy, step])
+        read_pose(path, motion[policy, step, 0], last[policy], poses[policy, step])
     return _DONE
 
 

@@ -196,9 +196,14 @@ def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
     s = min(max(progress, path.progress[0]), path.progress[last])
-    upper = min(max(int(np.searchsorted(path.progress, s)), 1), last)
+    return pose_before(path, min(max(int(np.searchsorted(path.progress, s)), 1), last), s)
+
+
+@lean_kernel
+def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, float]:
+    """As `pose_at`, between a vertex and the one before, which have the progress between them."""
     lower = upper - 1
-    ahead = s - path.progress[lower]
+    ahead = progress - path.progress[lower]
     span = path.progress[upper] - path.progress[lower]
     return (
         interpolate(path.xy[lower, 0], path.xy[upper, 0], span, ahead),
