@@ -32,6 +32,8 @@ class Forecast(NamedTuple):
     light_xy: FloatArray  # (V, 2) vertices of the red connectors, not closed [m]
     light_ptr: IntArray  # (lights + 1,) first vertex of each
     light_bounds: FloatArray  # (lights, 4) min x, min y, max x, max y of each [m]
+    light_runs: FloatArray  # (R, 4) likewise of runs of edges, as in `RedLights`
+    light_run_ptr: IntArray  # (lights + 1,) first run of each
 
 
 def select_tracks(
@@ -118,6 +120,8 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
         lights.xy,
         lights.ptr,
         lights.bounds,
+        lights.runs,
+        lights.run_ptr,
     )
     arrays = tracks.poses, tracks.velocities, tracks.sizes
     _forecast(chosen, *(array[-1].copy() for array in arrays), made)

@@ -10,8 +10,22 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
-from shiftsim.geometry.polylines import CLEAR, OPEN, Path, pose_before, project
-from shiftsim.geometry.rings import ring_distance
+from shiftsim.geometry.polylines import (
+    CLEAR,
+    OPEN,
+    RUN,
+    Path,
+    is_run_near,
+    pose_before,
+    project,
+)
+from shiftsim.geometry.rings import (
+    SLACK,
+    point_segment_distance,
+    ring_bounds,
+    ring_distance,
+    rings_touch,
+)
 from shiftsim.planners.pdm.corridor import (
     Corridors,
     Paths,
@@ -252,17 +266,7 @@ def _follow_leads(
                 y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
                 box_corners(x, y, pose[2], size.length, size.width, footprint)
                 found, distance = _nearest(
-                    hits[:num_hits],
-                    along,
-                    progress,
-                    footprint,
-                    others.boxes[row],
-                    others.centers[row],
-                    others.radii,
-                    forecast.light_xy,
-                    forecast.light_ptr,
-                    forecast.light_bounds,
-                    ranks,
+                    hits, num_hits, along, progress, footprint, forecast, row, ranks
                 )
                 if found == _TIED or sides[found] == OPEN:
                     return found
@@ -278,54 +282,88 @@ def _follow_leads(
     return _DONE
 
 
-@lean_kernel
+@part_kernel
 def _nearest(
     hits: IntArray,
+    num_hits: int,
     along: FloatArray,
     progress: float,
     footprint: FloatArray,
-    boxes: FloatArray,
-    centers: FloatArray,
-    radii: FloatArray,
-    light_xy: FloatArray,
-    light_ptr: IntArray,
-    light_bounds: FloatArray,
+    forecast: Forecast,
+    row: int,
     ranks: IntArray,
 ) -> tuple[int, float]:
     """What is nearest to the footprint (4, 2) of all ahead, by rank on ties, and its distance [m].
 
-    Something is ahead; it is _TIED where ranks are needed and not known. The rows of the forecast
-    map are handed over because the whole forecast takes longer to hand over than to use.
+    Something is ahead; it is _TIED where ranks are needed and not known.
     """
+    others = forecast.others
     x, y, radius = circle_around(footprint)
     best, found, is_tied = np.inf, -1, False
-    for index in hits:
+    for entry in range(num_hits):
+        index = hits[entry]
         if not along[index] > progress:
             continue
-        light = index - len(radii)
+        light = index - len(others.radii)
         if light >= 0:
-            bounds = light_bounds[light]
-            apart_x = max(bounds[0] - x, x - bounds[2])
-            apart_y = max(bounds[1] - y, y - bounds[3])
-            if max(apart_x, apart_y) - radius > best:
-                continue
-            ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
+            distance = _light_distance(footprint, forecast, light, best)
         else:
-            ring, center = boxes[index], centers[index]
-            if np.hypot(center[0] - x, center[1] - y) - radius - radii[index] > best:
+            dx, dy = others.centers[row, index, 0] - x, others.centers[row, index, 1] - y
+            if np.hypot(dx, dy) - radius - others.radii[index] > best:
                 continue
-        distance = ring_distance(footprint, ring)
+            distance = ring_distance(footprint, others.boxes[row, index])
         if distance < best:
             best, found, is_tied = distance, index, False
         elif distance == best:
             if ranks[index] < 0:
                 # which of two lights it is makes no difference
-                is_tied = is_tied or light < 0 or found < len(radii)
+                is_tied = is_tied or light < 0 or found < len(others.radii)
             elif ranks[index] < ranks[found]:
                 found = index
     if is_tied:
         return _TIED, best
     return found, best
+
+
+@lean_kernel
+def _light_distance(footprint: FloatArray, forecast: Forecast, light: int, limit: float) -> float:
+    """As `ring_distance`, of a footprint (4, 2) and a red light; anything more beyond `limit`."""
+    low_x, low_y, high_x, high_y = ring_bounds(footprint)
+    bounds, start = forecast.light_bounds[light], forecast.light_ptr[light]
+    ring = forecast.light_xy[start : forecast.light_ptr[light + 1]]
+    apart_x = max(bounds[0] - high_x, low_x - bounds[2])
+    apart_y = max(bounds[1] - high_y, low_y - bounds[3])
+    if max(apart_x, apart_y) > limit:
+        return np.inf
+    if max(apart_x, apart_y) <= 0.0 and rings_touch(footprint, ring):
+        return 0.0
+    square, guess = np.inf, 0  # the run that is probably nearest is the first one
+    for vertex in range(0, len(ring), RUN):
+        dx, dy = ring[vertex, 0] - footprint[0, 0], ring[vertex, 1] - footprint[0, 1]
+        if dx * dx + dy * dy < square:
+            square, guess = dx * dx + dy * dy, vertex // RUN
+    around, best = (low_x, low_y, high_x, high_y), np.inf
+    first, stop = forecast.light_run_ptr[light], forecast.light_run_ptr[light + 1]
+    for turn in range(-1, stop - first):
+        run = guess if turn < 0 else turn
+        reach = min(limit, np.sqrt(square), best) + SLACK
+        if turn == guess or not is_run_near(forecast.light_runs, first + run, around, reach):
+            continue
+        for vertex in range(run * RUN, min((run + 1) * RUN, len(ring))):
+            c, d = ring[vertex - 1], ring[vertex]
+            if (
+                max(c[0], d[0]) < low_x - reach
+                or min(c[0], d[0]) > high_x + reach
+                or max(c[1], d[1]) < low_y - reach
+                or min(c[1], d[1]) > high_y + reach
+            ):
+                continue
+            for corner in range(4):
+                p, q = footprint[corner - 1], footprint[corner]
+                best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
+                best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
+            reach = min(reach, best + SLACK)
+    return best
 
 
 @lean_kernel
