@@ -102,14 +102,13 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
     count = len(chosen)
     shape = (NUM_FORECASTS, count)
     ignored = np.zeros(count + len(lights.bounds), np.bool_)
-    is_agent = tracks.kinds[chosen] <= LAST_AGENT_KIND
     others = Others(
         boxes=np.empty((*shape, 4, 2)),
         centers=np.empty((*shape, 2)),
         centroids=np.empty((*shape, 2)),
         speeds=np.empty(shape),
         radii=np.empty(count),
-        is_agent=is_agent,
+        is_agent=np.empty(count, np.bool_),
         ignored=ignored[:count],
     )
     made = Forecast(
@@ -123,14 +122,19 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
         lights.runs,
         lights.run_ptr,
     )
-    arrays = tracks.poses, tracks.velocities, tracks.sizes
-    _forecast(chosen, *(array[-1].copy() for array in arrays), made)
+    now = (array[-1].copy() for array in (tracks.poses, tracks.velocities, tracks.sizes))
+    _forecast(chosen, tracks.kinds.copy(), *now, made)
     return made
 
 
 @lean_kernel
 def _forecast(
-    chosen: IntArray, poses: FloatArray, velocities: FloatArray, sizes: FloatArray, out: Forecast
+    chosen: IntArray,
+    kinds: IntArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    out: Forecast,
 ) -> None:
     """Fill in the boxes of all forecast maps."""
     others = out.others
@@ -139,6 +143,7 @@ def _forecast(
         x, y, heading = poses[track, 0], poses[track, 1], poses[track, 2]
         length, width = sizes[track, 0], sizes[track, 1]
         vx, vy = velocities[track, 0], velocities[track, 1]
+        others.is_agent[index] = kinds[track] <= LAST_AGENT_KIND
         speed = np.hypot(vx, vy) if others.is_agent[index] else 0.0
         # nuPlan rule 186: boxes move along their own axis with the full speed
         is_forward = abs(wrap_angle(heading - np.arctan2(vy, vx))) < np.pi / 2.0

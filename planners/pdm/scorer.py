@@ -28,6 +28,7 @@ from shiftsim.world.state import HEADING, VX, VY, X, Y
 
 TTC_STEPS = (0, 3, 6, 9)  # how far ahead a pose is projected
 AHEAD_SECONDS = DT * TTC_STEPS[-1]
+_NO_LIMITS = np.zeros(0)  # m/s
 MIN_PROGRESS = 0.1  # m, of the best proposal; below it progress is not compared
 
 
@@ -47,20 +48,16 @@ class Scores(NamedTuple):
     flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
 
 
-class Contacts(NamedTuple):
-    """What P proposals hit, see `Scores`."""
+class Findings(NamedTuple):
+    """What P proposals hit and where they go, as in `Scores`."""
 
-    no_collision: FloatArray  # (P,) factor
-    collision_index: FloatArray  # (P,) time index
-    ttc_index: FloatArray  # (P,) time index
-
-
-class Travel(NamedTuple):
-    """Where P proposals go, see `Scores`."""
-
-    progress: FloatArray  # (P,) along the centerline [m]
-    drivable: FloatArray  # (P,) factor
-    direction: FloatArray  # (P,) factor
+    no_collision: FloatArray
+    drivable: FloatArray
+    direction: FloatArray
+    ttc: FloatArray
+    raw_progress: FloatArray
+    collision_index: FloatArray
+    ttc_index: FloatArray
 
 
 class Place(NamedTuple):
@@ -76,28 +73,16 @@ def score(
     states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    no_limits = np.zeros(len(place.areas.lane))
-    at = find_places(states, size, place.areas, place.selected, no_limits, by_center=True)
-    no_collision, collision_index, ttc_index = contacts = Contacts(*np.empty((3, len(states))))
-    _find_contacts(at, others, place.intersections, size, contacts)
-    raw, drivable, direction = travel = Travel(*np.empty((3, len(states))))
-    _travel(at, place.centerline, params.direction_limits, travel)
-    factor = no_collision * drivable * direction
-    progress = normalise(raw, factor)
-    ttc = np.where(np.isfinite(ttc_index), 0.0, 1.0)
-    comfortable = np.where(comfort(states, params.comfort).is_within.all(axis=1), 1.0, 0.0)
+    at = find_places(states, size, place.areas, place.selected, _NO_LIMITS, by_center=True)
+    found = Findings(*np.empty((len(Findings._fields), len(states))))
+    lines = place.intersections, place.centerline
+    _judge(at, others, *lines, size, params.direction_limits, found)
+    factor = found.no_collision * found.drivable * found.direction
+    progress = normalise(found.raw_progress, factor)
+    comfortable = comfort(states, params.comfort).score
+    total = factor * weigh(progress, found.ttc, comfortable, params)
     return Scores(
-        total=factor * weigh(progress, ttc, comfortable, params),
-        no_collision=no_collision,
-        drivable=drivable,
-        direction=direction,
-        progress=progress,
-        ttc=ttc,
-        comfort=comfortable,
-        raw_progress=raw,
-        collision_index=collision_index,
-        ttc_index=ttc_index,
-        flags=at.flags,
+        total=total, progress=progress, comfort=comfortable, flags=at.flags, **found._asdict()
     )
 
 
@@ -121,13 +106,34 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 
 @kernel
+def _judge(
+    at: Places,
+    others: Others,
+    intersections: Polygons,
+    centerline: Path,
+    size: EgoBox,
+    direction_limits: tuple[float, float],
+    made: Findings,
+) -> None:
+    """Fill in the findings."""
+    box, motion = np.empty((4, 2)), np.empty((at.states.shape[1], 3))
+    _find_contacts(at, others, intersections, size, box, motion, made)
+    _follow_route(at, centerline, direction_limits, made)
+
+
+@lean_kernel
 def _find_contacts(
-    at: Places, others: Others, intersections: Polygons, size: EgoBox, made: Contacts
+    at: Places,
+    others: Others,
+    intersections: Polygons,
+    size: EgoBox,
+    box: FloatArray,  # (4, 2) scratch
+    motion: FloatArray,  # (T, 3) scratch
+    made: Findings,
 ) -> None:
     """Fill in the contacts; each of the others counts until its first one, of either kind."""
     num_steps, num_others = at.states.shape[1], len(others.radii)
     last, radius = (num_steps - 1 + TTC_STEPS[-1]) // 2, 0.5 * np.hypot(size.length, size.width)
-    box, motion = np.empty((4, 2)), np.empty((num_steps, 3))  # speed, and where it leads to
     for proposal in range(len(made.no_collision)):
         made.no_collision[proposal] = 1.0
         made.collision_index[proposal] = made.ttc_index[proposal] = NEVER
@@ -160,6 +166,7 @@ def _find_contacts(
                     heading = at.states[proposal, step, HEADING]
                     motion[step, 1], motion[step, 2] = np.cos(heading), np.sin(heading)
             _meet(at, others, intersections, proposal, index, size, motion, box, made)
+        made.ttc[proposal] = 1.0 if made.ttc_index[proposal] == NEVER else 0.0
 
 
 @lean_kernel
@@ -191,7 +198,7 @@ def _meet(
     size: EgoBox,
     motion: FloatArray,  # (T, 3) speed [m/s], cosine and sine of the heading
     box: FloatArray,  # (4, 2) scratch
-    made: Contacts,
+    made: Findings,
 ) -> None:
     """Note the first contacts of a proposal with one of the others."""
     is_decided = is_forgiven = False
@@ -242,7 +249,9 @@ def _meet(
 
 
 @lean_kernel
-def _travel(at: Places, centerline: Path, limits: tuple[float, float], made: Travel) -> None:
+def _follow_route(
+    at: Places, centerline: Path, limits: tuple[float, float], made: Findings
+) -> None:
     """Fill in where proposals go; `limits` [m] as in `PdmParameters`."""
     centers, last = at.centers, at.centers.shape[1] - 1
     start, end = (0.0, 0.0, 0), (0.0, 0.0, 0)
@@ -252,7 +261,7 @@ def _travel(at: Places, centerline: Path, limits: tuple[float, float], made: Tra
             start = project(centerline, x, y, start[2])
         guess = start[2] if row == 0 else end[2]
         end = project(centerline, centers[row, last, 0], centers[row, last, 1], guess)
-        made.progress[row] = max(0.0, end[0] - start[0])
+        made.raw_progress[row] = max(0.0, end[0] - start[0])
         longest = stretch = 0.0
         is_on_road = True
         for step in range(last + 1):

@@ -66,13 +66,16 @@ class Comfort(NamedTuple):
 
     signals: FloatArray  # (P, 6, 41) filtered signals named by `SIGNALS`
     is_within: BoolArray  # (P, 6) whether each stays strictly within its bounds
+    score: FloatArray  # (P,) 1 where all do, else 0
 
 
 def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
     """The comfort test of driven states (P, 41, 11)."""
     count, steps = states.shape[:2]
     made = Comfort(
-        np.empty((count, len(SIGNALS), steps)), np.empty((count, len(SIGNALS)), np.bool_)
+        np.empty((count, len(SIGNALS), steps)),
+        np.empty((count, len(SIGNALS)), np.bool_),
+        np.empty(count),
     )
     _comfort(states, make_filters(), bounds, made)
     return made
@@ -109,12 +112,15 @@ def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: 
         _filter(brief, filters, _SLOPE, sums, out[3])
         _filter(raw[3], filters, _BEND_OF_ANGLE, sums, out[4])
         _filter(raw[3], filters, _SLOPE_OF_ANGLE, sums, out[5])
+        made.score[row] = 1.0
         for signal in range(6):
             low = bounds.lon_accel_min if signal == 0 else -highs[signal]
             within = True
             for step in range(count):
                 within = within and low < out[signal, step] < highs[signal]
             made.is_within[row, signal] = within
+            if not within:
+                made.score[row] = 0.0
 
 
 @lean_kernel

@@ -46,7 +46,7 @@ def find_places(
     size: EgoBox,
     areas: Areas,  # all areas of the map
     selected: IntArray,  # those of this step
-    limits: FloatArray,  # (M,) speed limits of all areas [m/s]
+    limits: FloatArray,  # (M,) speed limits of all areas, or none of them [m/s]
     *,
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
 ) -> Places:
@@ -79,7 +79,8 @@ def _find(
     """Fill in the places."""
     bounds, flags = slabs.bounds, at.flags
     num_near, highest = _place_ego(at, size, bounds, selected, near), 0.0
-    for entry in range(num_near):
+    has_limits = len(limits) > 0
+    for entry in range(num_near if has_limits else 0):
         highest = max(highest, limits[near[entry]])
     points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
     guess = -1  # the area that held the whole ego last is tried first
@@ -126,7 +127,7 @@ def _find(
                 first, stop = 4 if is_settled else 0, 4 if is_known else 5
                 within = held_points(slabs, area, points, first, stop)[0]
                 if within & _MIDDLE != 0:
-                    limit = max(limit, limits[area])
+                    limit = max(limit, limits[area]) if has_limits else limit
                     is_on_route = is_on_route or on_route[area]
                 within &= _ALL_CORNERS
                 if within == _ALL_CORNERS:

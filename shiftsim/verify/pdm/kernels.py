@@ -57,7 +57,7 @@ def _tracker(case: Source, where: str) -> None:
 
 
 def _comfort(case: Source, where: str) -> None:
-    signals, bounded = comfort(case.take("states", SCORED + 1, NUM_STATE)[None], DEFAULT.comfort)
+    signals, bounded, _ = comfort(case.take("states", SCORED + 1, NUM_STATE)[None], DEFAULT.comfort)
     ours = {"is_comfortable": bounded[0], **dict(zip(SIGNALS, signals[0], strict=True))}
     case.match(where, ours, SIGNAL_TOLERANCE)
     case.note("states: all but heading, ax and ay are not read by the test")
