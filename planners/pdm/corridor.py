@@ -106,61 +106,59 @@ def fill_corridor(
     has_length = end - begin > 1
     reach = 1.5 * (1.0 + BAND) * stretch.half_width  # covers the corners of the square ends
     num_boxes = len(others.radii)
-    for index in range(num_boxes):
-        stop = last
-        if not forecast.moves[index]:
-            if first > 1:
-                _repeat(sides, progress, index, first, last)
+    for index in range(sides.shape[1]):
+        light = index - num_boxes
+        stop = last if light < 0 and forecast.moves[index] else first + 1
+        if stop < last and first > 1:
+            stop = first  # all is known
+        ring = (
+            others.boxes[first, index]
+            if light < 0
+            else forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
+        )
+        near, farthest, radius, frame = 0, 0, 0.0, BoxFrame(1.0, 0.0, 0.0, 0.0)
+        is_box = has_length and light < 0 and stop > first
+        if is_box:
+            # boxes move in straight lines
+            start, there = others.centers[first, index], others.centers[stop - 1, index]
+            swept = (
+                *(min(start[0], there[0]), min(start[1], there[1])),
+                *(max(start[0], there[0]), max(start[1], there[1])),
+            )
+            radius = others.radii[index] + SLACK
+            near, farthest = _runs_near(stretch, swept, reach + radius)
+            if near > farthest:
                 continue
-            stop = first + 1
-        # boxes move in straight lines
-        start, there = others.centers[first, index], others.centers[stop - 1, index]
-        swept = (
-            *(min(start[0], there[0]), min(start[1], there[1])),
-            *(max(start[0], there[0]), max(start[1], there[1])),
-        )
-        radius = others.radii[index] + SLACK
-        near, farthest = _runs_near(stretch, swept, reach + radius)
-        if has_length and near > farthest:
-            continue
-        box, guess = others.boxes[first, index], near
-        frame = BoxFrame(
-            np.cos(forecast.headings[index]),
-            np.sin(forecast.headings[index]),
-            0.5 * np.hypot(box[0, 0] - box[1, 0], box[0, 1] - box[1, 1]),
-            0.5 * np.hypot(box[1, 0] - box[2, 0], box[1, 1] - box[2, 1]),
-        )
+            frame = BoxFrame(
+                np.cos(forecast.headings[index]),
+                np.sin(forecast.headings[index]),
+                0.5 * np.hypot(ring[0, 0] - ring[1, 0], ring[0, 1] - ring[1, 1]),
+                0.5 * np.hypot(ring[1, 0] - ring[2, 0], ring[1, 1] - ring[2, 1]),
+            )
+        guess = near
         for row in range(first, stop):
             side = OPEN
-            if has_length:
+            if is_box:
                 center = others.centers[row, index]
                 side = _side_of_frame(path, stretch, near, farthest, radius, center, frame)
             if side == CLEAR:
                 continue
-            middle = others.centroids[row, index]
-            along, _, guess = project(path, middle[0], middle[1], guess)
+            if light < 0:
+                ring = others.boxes[row, index]
+                x, y = others.centroids[row, index, 0], others.centroids[row, index, 1]
+            else:
+                x, y = centroid(ring)
+            along, _, guess = project(path, x, y, guess)
             if side == OPEN:
-                side = side_of(stretch, others.boxes[row, index])
+                side = side_of(stretch, ring)
             sides[row, index], progress[row, index] = side, along
-        if stop < last:
-            _repeat(sides, progress, index, first, last)
-    for light in range(len(forecast.light_ptr) - 1):
-        index = num_boxes + light
-        if first <= 1:
-            ring = forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
-            x, y = centroid(ring)
-            sides[first, index] = side_of(stretch, ring)
-            progress[first, index] = project(path, x, y, 0)[0]
-        _repeat(sides, progress, index, first, last)
-
-
-@lean_kernel
-def _repeat(sides: IntArray, progress: FloatArray, index: int, first: int, last: int) -> None:
-    """Write what is known of something that stands still on maps `first` … `last` - 1."""
-    known = first - 1 if first > 1 else first
-    if sides[known, index] != CLEAR:
-        for row in range(first, last):
-            sides[row, index], progress[row, index] = sides[known, index], progress[known, index]
+        known = stop - 1
+        if stop < last and sides[known, index] != CLEAR:
+            for row in range(stop, last):
+                sides[row, index], progress[row, index] = (
+                    sides[known, index],
+                    progress[known, index],
+                )
 
 
 @part_kernel

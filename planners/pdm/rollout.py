@@ -306,7 +306,10 @@ def _nearest(
             continue
         light = index - len(others.radii)
         if light >= 0:
-            distance = _light_distance(footprint, forecast, light, best)
+            start, stop = forecast.light_ptr[light], forecast.light_ptr[light + 1]
+            first, end = forecast.light_run_ptr[light], forecast.light_run_ptr[light + 1]
+            ring, runs = forecast.light_xy[start:stop], forecast.light_runs[first:end]
+            distance = _light_distance(footprint, ring, forecast.light_bounds[light], runs, best)
         else:
             dx, dy = others.centers[row, index, 0] - x, others.centers[row, index, 1] - y
             if np.hypot(dx, dy) - radius - others.radii[index] > best:
@@ -326,11 +329,14 @@ def _nearest(
 
 
 @lean_kernel
-def _light_distance(footprint: FloatArray, forecast: Forecast, light: int, limit: float) -> float:
-    """As `ring_distance`, of a footprint (4, 2) and a red light; anything more beyond `limit`."""
+def _light_distance(
+    footprint: FloatArray, ring: FloatArray, bounds: FloatArray, runs: FloatArray, limit: float
+) -> float:
+    """As `ring_distance`, of a footprint (4, 2) and a red light; anything more beyond `limit`.
+
+    `bounds` (4,) are those of the light, `runs` (R, 4) those of runs of its edges.
+    """
     low_x, low_y, high_x, high_y = ring_bounds(footprint)
-    bounds, start = forecast.light_bounds[light], forecast.light_ptr[light]
-    ring = forecast.light_xy[start : forecast.light_ptr[light + 1]]
     apart_x = max(bounds[0] - high_x, low_x - bounds[2])
     apart_y = max(bounds[1] - high_y, low_y - bounds[3])
     if max(apart_x, apart_y) > limit:
@@ -343,11 +349,10 @@ def _light_distance(footprint: FloatArray, forecast: Forecast, light: int, limit
         if dx * dx + dy * dy < square:
             square, guess = dx * dx + dy * dy, vertex // RUN
     around, best = (low_x, low_y, high_x, high_y), np.inf
-    first, stop = forecast.light_run_ptr[light], forecast.light_run_ptr[light + 1]
-    for turn in range(-1, stop - first):
+    for turn in range(-1, len(runs)):
         run = guess if turn < 0 else turn
         reach = min(limit, np.sqrt(square), best) + SLACK
-        if turn == guess or not is_run_near(forecast.light_runs, first + run, around, reach):
+        if turn == guess or not is_run_near(runs, run, around, reach):
             continue
         for vertex in range(run * RUN, min((run + 1) * RUN, len(ring))):
             c, d = ring[vertex - 1], ring[vertex]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import PlannerError
 from shiftsim.planners.proposals.areas import Areas, Slabs, covering, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
@@ -77,12 +77,13 @@ def lanes_at(
     areas = route.areas
     under, errors = np.empty_like(selected), np.empty(len(selected))
     count = _lanes_at(
-        areas.slabs, areas.on_route, areas.lane, selected, road.baselines, ego, under, errors
+        *(areas.slabs, areas.on_route, areas.lane, selected, road.baselines),
+        *(ego, ego[None, :2], under, errors),
     )
     return under[:count].tolist(), errors[:count].tolist()
 
 
-@kernel
+@lean_kernel
 def _lanes_at(
     slabs: Slabs,
     on_route: BoolArray,
@@ -90,12 +91,14 @@ def _lanes_at(
     selected: IntArray,
     baselines: Polylines,
     ego: FloatArray,
+    point: FloatArray,  # (1, 2) its rear axle
     under: IntArray,  # receives the areas
     errors: FloatArray,  # receives their heading errors
 ) -> int:
     """Find areas of the route under the rear axle; how many."""
     count = 0
-    for area in under[: covering(slabs, selected, ego[:2].reshape(1, 2), under)]:
+    for entry in range(covering(slabs, selected, point, under)):
+        area = under[entry]
         if on_route[area]:
             under[count] = area
             error = deviation(baselines, lane[area], 1, ego[X], ego[Y], ego[HEADING])[1]

@@ -7,13 +7,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
 from shiftsim.geometry.polylines import Path, project
 from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.planners.pdm.parameters import PdmParameters
-from shiftsim.planners.proposals.areas import Areas
-from shiftsim.planners.proposals.comfort import comfort
+from shiftsim.planners.proposals.areas import Areas, Slabs
+from shiftsim.planners.proposals.comfort import (
+    Comfort,
+    ComfortBounds,
+    Filters,
+    empty_comfort,
+    feel,
+    make_filters,
+)
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
@@ -21,14 +28,20 @@ from shiftsim.planners.proposals.contacts import (
     is_at_fault,
     project_box,
 )
-from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, Places, find_places
+from shiftsim.planners.proposals.places import (
+    OFF_ROAD,
+    OFF_ROUTE,
+    EgoBox,
+    Places,
+    empty_places,
+    find,
+)
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.state import HEADING, VX, VY, X, Y
 
 TTC_STEPS = (0, 3, 6, 9)  # how far ahead a pose is projected
 AHEAD_SECONDS = DT * TTC_STEPS[-1]
-_NO_LIMITS = np.zeros(0)  # m/s
 MIN_PROGRESS = 0.1  # m, of the best proposal; below it progress is not compared
 
 
@@ -73,16 +86,18 @@ def score(
     states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    at = find_places(states, size, place.areas, place.selected, _NO_LIMITS, by_center=True)
+    at, felt, near = empty_places(states), empty_comfort(states), np.empty_like(place.selected)
     found = Findings(*np.empty((len(Findings._fields), len(states))))
-    lines = place.intersections, place.centerline
-    _judge(at, others, *lines, size, params.direction_limits, found)
+    areas, bounds = place.areas, (params.direction_limits, params.comfort)
+    _judge(
+        *(areas.slabs, areas.on_route, place.selected, near, place.intersections),
+        *(place.centerline, others, size, make_filters(), bounds, at, felt, found),
+    )
     factor = found.no_collision * found.drivable * found.direction
     progress = normalise(found.raw_progress, factor)
-    comfortable = comfort(states, params.comfort).score
-    total = factor * weigh(progress, found.ttc, comfortable, params)
+    total = factor * weigh(progress, found.ttc, felt.score, params)
     return Scores(
-        total=total, progress=progress, comfort=comfortable, flags=at.flags, **found._asdict()
+        total=total, progress=progress, comfort=felt.score, flags=at.flags, **found._asdict()
     )
 
 
@@ -107,171 +122,187 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 @kernel
 def _judge(
-    at: Places,
-    others: Others,
+    slabs: Slabs,
+    on_route: BoolArray,
+    selected: IntArray,
+    near: IntArray,  # scratch for some of them
     intersections: Polygons,
     centerline: Path,
-    size: EgoBox,
-    direction_limits: tuple[float, float],
-    made: Findings,
-) -> None:
-    """Fill in the findings."""
-    box, motion = np.empty((4, 2)), np.empty((at.states.shape[1], 3))
-    _find_contacts(at, others, intersections, size, box, motion, made)
-    _follow_route(at, centerline, direction_limits, made)
-
-
-@lean_kernel
-def _find_contacts(
-    at: Places,
     others: Others,
-    intersections: Polygons,
     size: EgoBox,
-    box: FloatArray,  # (4, 2) scratch
-    motion: FloatArray,  # (T, 3) scratch
-    made: Findings,
+    filters: Filters,
+    bounds: tuple[tuple[float, float], ComfortBounds],  # of the direction, of comfort
+    at: Places,
+    felt: Comfort,
+    found: Findings,
 ) -> None:
-    """Fill in the contacts; each of the others counts until its first one, of either kind."""
-    num_steps, num_others = at.states.shape[1], len(others.radii)
+    """Fill in the places, the comfort test and the findings."""
+    find(slabs, on_route, selected, np.empty(0), True, size, near, at)
+    states, corners, centers, flags, off_lane, _ = at
+    no_collision, drivable, direction, ttc, raw_progress, collision_index, ttc_index = found
+    _follow_route(centers, flags, centerline, bounds[0], raw_progress, drivable, direction)
+    feel(states, filters, bounds[1], felt)
+    num_steps, (boxes, others_at, centroids, speeds, radii, is_agent, ignored) = (
+        len(states[0]),
+        others,
+    )
+    box, motion = np.empty((4, 2)), np.empty((num_steps, 3))  # speed, cosine, sine
     last, radius = (num_steps - 1 + TTC_STEPS[-1]) // 2, 0.5 * np.hypot(size.length, size.width)
-    for proposal in range(len(made.no_collision)):
-        made.no_collision[proposal] = 1.0
-        made.collision_index[proposal] = made.ttc_index[proposal] = NEVER
+    for proposal in range(len(states)):
+        worth, fault, violation = 1.0, NEVER, NEVER
         low_x = low_y = np.inf
         high_x = high_y = -np.inf
         for step in range(num_steps):
-            state, center = at.states[proposal, step], at.centers[proposal, step]
-            speed = abs(state[VX]) if state[VY] == 0.0 else np.hypot(state[VX], state[VY])
-            motion[step, 0] = speed
-            reach = radius + AHEAD_SECONDS * speed
-            low_x, high_x = min(low_x, center[0] - reach), max(high_x, center[0] + reach)
-            low_y, high_y = min(low_y, center[1] - reach), max(high_y, center[1] + reach)
+            vx, vy = states[proposal, step, VX], states[proposal, step, VY]
+            motion[step, 0] = abs(vx) if vy == 0.0 else np.hypot(vx, vy)
+            x, y = centers[proposal, step, 0], centers[proposal, step, 1]
+            reach = radius + AHEAD_SECONDS * motion[step, 0]
+            low_x, high_x = min(low_x, x - reach), max(high_x, x + reach)
+            low_y, high_y = min(low_y, y - reach), max(high_y, y + reach)
         has_courses = False
-        for index in range(num_others):
-            if others.ignored[index]:
-                continue
+        for index in range(len(radii)):
             # boxes of others move in straight lines
-            first, end, slack = others.centers[0, index], others.centers[last, index], SLACK
-            slack += others.radii[index]
+            x, y, slack = others_at[0, index, 0], others_at[0, index, 1], radii[index] + SLACK
+            to_x, to_y = others_at[last, index, 0], others_at[last, index, 1]
             if (
-                max(first[0], end[0]) + slack < low_x
-                or min(first[0], end[0]) - slack > high_x
-                or max(first[1], end[1]) + slack < low_y
-                or min(first[1], end[1]) - slack > high_y
+                ignored[index]
+                or max(x, to_x) + slack < low_x
+                or min(x, to_x) - slack > high_x
+                or max(y, to_y) + slack < low_y
+                or min(y, to_y) - slack > high_y
             ):
                 continue
-            if not has_courses:
-                has_courses = True
-                for step in range(num_steps):
-                    heading = at.states[proposal, step, HEADING]
-                    motion[step, 1], motion[step, 2] = np.cos(heading), np.sin(heading)
-            _meet(at, others, intersections, proposal, index, size, motion, box, made)
-        made.ttc[proposal] = 1.0 if made.ttc_index[proposal] == NEVER else 0.0
+            for step in range(0 if has_courses else num_steps):
+                heading = states[proposal, step, HEADING]
+                motion[step, 1], motion[step, 2] = np.cos(heading), np.sin(heading)
+            has_courses = True
+            # each of the others counts until its first contact, of either kind
+            step, ttc_step = _meet(
+                states[proposal],
+                corners[proposal],
+                centers[proposal],
+                off_lane[proposal],
+                motion,
+                size,
+                index,
+                boxes,
+                others_at,
+                centroids,
+                speeds,
+                radii,
+                intersections,
+                violation,
+                box,
+            )
+            violation = min(violation, ttc_step)
+            if step < NEVER:
+                fault, worth = min(fault, step), min(worth, 0.0 if is_agent[index] else 0.5)
+        no_collision[proposal], ttc[proposal] = worth, 1.0 if violation == NEVER else 0.0
+        collision_index[proposal], ttc_index[proposal] = fault, violation
 
 
-@lean_kernel
-def _is_beside(
-    center: FloatArray, motion: FloatArray, travel: float, size: EgoBox, box: FloatArray
-) -> bool:
-    """Whether a box (4, 2) clearly lies on one side of the ego, whose centre is moved ahead.
-
-    `motion` (3,) as for `_meet`; most boxes that are near do.
-    """
-    least = left = np.inf
-    most = right = -np.inf
-    for corner in range(4):
-        dx, dy = box[corner, 0] - center[0], box[corner, 1] - center[1]
-        along, across = motion[1] * dx + motion[2] * dy - travel, motion[1] * dy - motion[2] * dx
-        least, most = min(least, along), max(most, along)
-        left, right = min(left, across), max(right, across)
-    half_length, half_width = 0.5 * size.length + SLACK, 0.5 * size.width + SLACK
-    return least > half_length or most < -half_length or left > half_width or right < -half_width
-
-
-@lean_kernel
+@part_kernel
 def _meet(
-    at: Places,
-    others: Others,
-    intersections: Polygons,
-    proposal: int,
-    index: int,
-    size: EgoBox,
+    states: FloatArray,  # (T, 11) of a proposal
+    corners: FloatArray,  # (T, 4, 2)
+    centers: FloatArray,  # (T, 2)
+    off_lane: BoolArray,  # (T,)
     motion: FloatArray,  # (T, 3) speed [m/s], cosine and sine of the heading
+    size: EgoBox,
+    index: int,  # of one of the others
+    boxes: FloatArray,  # of the others, as in `Others`
+    others_at: FloatArray,
+    centroids: FloatArray,
+    speeds: FloatArray,
+    radii: FloatArray,
+    intersections: Polygons,
+    limit: float,  # time index after which violations do not matter
     box: FloatArray,  # (4, 2) scratch
-    made: Findings,
-) -> None:
-    """Note the first contacts of a proposal with one of the others."""
-    is_decided = is_forgiven = False
-    touching = 0.5 * np.hypot(size.length, size.width) + others.radii[index] + SLACK
+) -> tuple[float, float]:
+    """Time indices of an at-fault collision and of a violation, inf if none."""
+    is_decided, fault, violation = False, NEVER, NEVER
+    is_forgiven = False
+    half_length, half_width = 0.5 * size.length, 0.5 * size.width
+    touching = np.hypot(half_length, half_width) + radii[index] + SLACK
     for step in range(len(motion)):
-        if is_decided and (is_forgiven or step > made.ttc_index[proposal]):
-            return
-        speed, center = motion[step, 0], at.centers[proposal, step]
-        reach = touching + AHEAD_SECONDS * speed + (AHEAD_SECONDS + DT) * others.speeds[0, index]
-        dx = others.centers[step // 2, index, 0] - center[0]
-        dy = others.centers[step // 2, index, 1] - center[1]
+        if is_decided and (is_forgiven or step > limit):
+            break
+        speed, cos, sin = motion[step, 0], motion[step, 1], motion[step, 2]
+        x, y, state = centers[step, 0], centers[step, 1], states[step]
+        reach = touching + AHEAD_SECONDS * speed + (AHEAD_SECONDS + DT) * speeds[0, index]
+        dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
         if dx * dx + dy * dy > reach * reach:
             continue
-        state, off_lane = at.states[proposal, step], at.off_lane[proposal, step]
         for ahead in TTC_STEPS:
             row, travel = (step + ahead) // 2, 0.1 * ahead * speed
-            dx = others.centers[row, index, 0] - (center[0] + travel * motion[step, 1])
-            dy = others.centers[row, index, 1] - (center[1] + travel * motion[step, 2])
-            if dx * dx + dy * dy > touching * touching:
-                continue
+            dx = others_at[row, index, 0] - (x + travel * cos)
+            dy = others_at[row, index, 1] - (y + travel * sin)
             is_now = ahead == 0 and not is_decided
             is_soon = not is_forgiven and not speed < TTC_STOPPED
-            if not is_now and not is_soon:
+            if dx * dx + dy * dy > touching * touching or not (is_now or is_soon):
                 continue
-            other = others.boxes[row, index]
-            if _is_beside(center, motion[step], travel, size, other):
+            # most boxes that are near clearly lie on one side of the ego
+            other = boxes[row, index]
+            least = left = np.inf
+            most = right = -np.inf
+            for corner in range(4):
+                dx, dy = other[corner, 0] - x, other[corner, 1] - y
+                along, across = cos * dx + sin * dy - travel, cos * dy - sin * dx
+                least, most = min(least, along), max(most, along)
+                left, right = min(left, across), max(right, across)
+            if max(least, -most) > half_length + SLACK or max(left, -right) > half_width + SLACK:
                 continue
-            project_box(at.corners[proposal, step], state, travel, box)
+            project_box(corners[step], state, travel, box)
             if not convex_intersect(box, other):
                 continue
+            middle = centroids[row, index]
             if is_now:
                 # nuPlan rule 195: what is not at fault when it is first touched is not looked at
                 # again
                 is_decided = True
-                if is_at_fault(state, box, off_lane, others, row, index):
-                    worth = 0.0 if others.is_agent[index] else 0.5
-                    made.no_collision[proposal] = min(made.no_collision[proposal], worth)
-                    made.collision_index[proposal] = min(made.collision_index[proposal], step)
+                if is_at_fault(state, box, off_lane[step], speeds[row, index], middle, other):
+                    fault = float(step)
             if is_soon:
-                middle = others.centroids[row, index]
+                is_forgiven = True  # or nothing later matters
                 angle = bearing(state, middle[0], middle[1])
                 counts = angle < AHEAD
                 if not counts and not angle > BEHIND:
-                    counts = off_lane or in_any(intersections, state[X], state[Y])
-                is_forgiven = True  # or nothing later matters
+                    counts = off_lane[step] or in_any(intersections, state[X], state[Y])
                 if counts:
-                    made.ttc_index[proposal] = min(made.ttc_index[proposal], step)
+                    violation = float(step)
+    return fault, violation
 
 
 @lean_kernel
 def _follow_route(
-    at: Places, centerline: Path, limits: tuple[float, float], made: Findings
+    centers: FloatArray,
+    flags: BoolArray,
+    centerline: Path,
+    limits: tuple[float, float],
+    progress: FloatArray,
+    drivable: FloatArray,
+    direction: FloatArray,
 ) -> None:
     """Fill in where proposals go; `limits` [m] as in `PdmParameters`."""
-    centers, last = at.centers, at.centers.shape[1] - 1
-    start, end = (0.0, 0.0, 0), (0.0, 0.0, 0)
+    last, guess, start, end = centers.shape[1] - 1, 0, 0.0, 0.0
     for row in range(len(centers)):
         x, y = centers[row, 0, 0], centers[row, 0, 1]
-        if row == 0 or x != centers[row - 1, 0, 0] or y != centers[row - 1, 0, 1]:  # rarely
-            start = project(centerline, x, y, start[2])
-        guess = start[2] if row == 0 else end[2]
-        end = project(centerline, centers[row, last, 0], centers[row, last, 1], guess)
-        made.raw_progress[row] = max(0.0, end[0] - start[0])
+        is_same = row > 0 and x == centers[row - 1, 0, 0] and y == centers[row - 1, 0, 1]
+        for step in range(last if is_same else 0, last + 1, last):
+            end, _, guess = project(centerline, centers[row, step, 0], centers[row, step, 1], guess)
+            if step == 0:
+                start = end
+        progress[row] = max(0.0, end - start)
         longest = stretch = 0.0
         is_on_road = True
         for step in range(last + 1):
-            is_on_road = is_on_road and not at.flags[row, step, OFF_ROAD]
-            if not at.flags[row, step, OFF_ROUTE]:
+            is_on_road = is_on_road and not flags[row, step, OFF_ROAD]
+            if not flags[row, step, OFF_ROUTE]:
                 stretch = 0.0
             elif step > 0:
                 dx = centers[row, step, 0] - centers[row, step - 1, 0]
                 dy = centers[row, step, 1] - centers[row, step - 1, 1]
                 stretch += np.hypot(dx, dy)
             longest = max(longest, stretch)
-        made.drivable[row] = 1.0 if is_on_road else 0.0
-        made.direction[row] = 1.0 if longest < limits[0] else (0.5 if longest < limits[1] else 0.0)
+        drivable[row] = 1.0 if is_on_road else 0.0
+        direction[row] = 1.0 if longest < limits[0] else (0.5 if longest < limits[1] else 0.0)

@@ -17,6 +17,7 @@ from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, squa
 from shiftsim.world.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
+_NOTHING = np.empty((2, 0))
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
@@ -72,23 +73,22 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     slab_ptr = np.concatenate([[0], np.cumsum(num_slabs)])
     height = polygons.bounds[:, 3] - polygons.bounds[:, 1]
     scale = np.where(height > 0.0, num_slabs / np.where(height > 0.0, height, 1.0), 0.0)
-    counts = np.zeros(slab_ptr[-1], np.int64)
-    _slice(polygons, scale, slab_ptr, counts, np.zeros(0, np.int64))
+    counts, fixed = np.zeros(slab_ptr[-1], np.int64), (polygons.bounds, scale, slab_ptr)
+    _slice(polygons, Slabs(*fixed, counts, np.empty((0, 2)), np.empty((0, 4))), counts, _NOTHING)
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
-    vertices = np.empty(2 * edge_ptr[-1], np.int64)
-    _slice(polygons, scale, slab_ptr, edge_ptr[:-1].copy(), vertices)
-    spans, scratch = np.empty((len(counts), 4)), np.empty((2, counts.max(initial=0)))
-    slabs = Slabs(polygons.bounds, scale, slab_ptr, edge_ptr, polygons.xy[vertices], spans)
-    _span(slabs, scratch[0], scratch[1])
+    ends, spans = np.empty((2 * edge_ptr[-1], 2)), np.empty((len(counts), 4))
+    slabs, scratch = Slabs(*fixed, edge_ptr, ends, spans), np.empty((2, counts.max(initial=0)))
+    _slice(polygons, slabs, edge_ptr[:-1].copy(), scratch)
     return Areas(polygons, slabs, on_route, lane)
 
 
 @lean_kernel
-def _slice(
-    polygons: Polygons, scale: FloatArray, slab_ptr: IntArray, fill: IntArray, vertices: IntArray
-) -> None:
-    """Add the edges of every slab to `fill`; write their ends to `vertices` unless it is empty."""
-    xy = polygons.xy
+def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray) -> None:
+    """Add the edges of every slab to `fill`; write their ends and the spans, unless there are none.
+
+    `scratch` (2, E) is for the edges of a slab.
+    """
+    xy, slab_ptr, scale, ends = polygons.xy, slabs.slab_ptr, slabs.scale, slabs.ends
     for area in range(len(scale)):
         low, last_slab = polygons.bounds[area, 1], slab_ptr[area + 1] - slab_ptr[area] - 1
         for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
@@ -100,27 +100,38 @@ def _slice(
                 first = min(int((bottom - low) * scale[area]), last_slab)
                 last = min(int((top - low) * scale[area]), last_slab)
                 for slab in range(slab_ptr[area] + first, slab_ptr[area] + last + 1):
-                    if len(vertices) > 0:
-                        vertices[2 * fill[slab]], vertices[2 * fill[slab] + 1] = before, vertex
+                    edge = 2 * fill[slab]
+                    for column in range(2 if len(ends) > 0 else 0):
+                        ends[edge, column] = xy[before, column]
+                        ends[edge + 1, column] = xy[vertex, column]
                     fill[slab] += 1
                 before = vertex
+    if len(slabs.spans) > 0:
+        _span(slabs, scratch[0], scratch[1])
 
 
-@lean_kernel
+@part_kernel
 def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
     """Fill in the spans; `lows` and `highs` are scratch for the edges of a slab."""
-    ends, spans = slabs.ends, slabs.spans
-    for area in range(len(slabs.scale)):
-        for slab in range(slabs.slab_ptr[area], slabs.slab_ptr[area + 1]):
-            bottom, height = slabs.bounds[area, 1], slabs.bounds[area, 3] - slabs.bounds[area, 1]
-            if slabs.scale[area] > 0.0:
-                height = 1.0 / slabs.scale[area]
-                bottom += (slab - slabs.slab_ptr[area]) * height
-            first, count = slabs.edge_ptr[slab], slabs.edge_ptr[slab + 1] - slabs.edge_ptr[slab]
+    bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
+    for area in range(len(scale)):
+        height = 1.0 / scale[area] if scale[area] > 0.0 else 0.0
+        for slab in range(slab_ptr[area], slab_ptr[area + 1]):
+            bottom = bounds[area, 1] + (slab - slab_ptr[area]) * height
+            first, count = edge_ptr[slab], edge_ptr[slab + 1] - edge_ptr[slab]
             spans[slab, 0], spans[slab, 3] = np.inf, -np.inf
             for edge in range(count):
-                a, b = ends[2 * (first + edge)], ends[2 * (first + edge) + 1]
-                low, high = _reach(a, b, bottom - SLACK, bottom + height + SLACK)
+                # least and greatest x where the edge is in the slab
+                start = 2 * (first + edge)
+                x, y, low, high = ends[start, 0], ends[start, 1], np.inf, -np.inf
+                slope = (ends[start + 1, 0] - x) / (ends[start + 1, 1] - y)
+                for end in range(2):
+                    at, level = ends[start + end, 0], ends[start + end, 1]
+                    if level < bottom - SLACK:
+                        at = x + slope * (bottom - SLACK - y)
+                    elif level > bottom + height + SLACK:
+                        at = x + slope * (bottom + height + SLACK - y)
+                    low, high = min(low, at), max(high, at)
                 lows[edge], highs[edge] = low - SLACK, high + SLACK
                 spans[slab, 0] = min(spans[slab, 0], lows[edge])
                 spans[slab, 3] = max(spans[slab, 3], highs[edge])
@@ -132,24 +143,13 @@ def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
                 for other in range(count):
                     if lows[other] > left:
                         right = min(right, lows[other])
-                        y, after = ends[2 * (first + other), 1], ends[2 * (first + other) + 1, 1]
-                        is_inside = is_inside != ((y > middle) != (after > middle))
+                        start = 2 * (first + other)
+                        is_above = ends[start, 1] > middle
+                        is_inside = is_inside != (is_above != (ends[start + 1, 1] > middle))
                     elif highs[other] > left:
                         right = left  # there is no gap
                 if is_inside and right - left > widest:
                     spans[slab, 1], spans[slab, 2], widest = left, right, right - left
-
-
-@lean_kernel
-def _reach(a: FloatArray, b: FloatArray, bottom: float, top: float) -> tuple[float, float]:
-    """Least and greatest x of the edge between points (2,), where its y is in a range it meets."""
-    low, high = min(a[0], b[0]), max(a[0], b[0])
-    if a[1] == b[1]:
-        return low, high
-    slope = (b[0] - a[0]) / (b[1] - a[1])
-    first = a[0] + slope * (max(min(a[1], b[1]), bottom) - a[1])
-    last = a[0] + slope * (min(max(a[1], b[1]), top) - a[1])
-    return max(low, min(first, last)), min(high, max(first, last))
 
 
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
@@ -157,23 +157,25 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
 
     Lanes come by block, in the order of the blocks.
     """
-    square = square_around(x, y, half_width)
-    lanes = _joined(road.block_edges, meeting(road.blocks.polygons, square))
+    lanes: IntArray = _select(road.blocks.polygons, road.block_edges, x, y, half_width)
     if not len(road.car_parks):
         return lanes
-    return np.concatenate([lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
+    parks = meeting(road.car_parks.polygons, square_around(x, y, half_width))
+    return np.concatenate([lanes, parks + len(road.edges)])
 
 
 @kernel
-def _joined(lists: Lists, chosen: IntArray) -> IntArray:
-    """Some of the lists, one after the other."""
-    count = 0
-    for index in chosen:
-        count += lists.ptr[index + 1] - lists.ptr[index]
+def _select(
+    blocks: Polygons, block_edges: Lists, x: float, y: float, half_width: float
+) -> IntArray:
+    """Lanes of the blocks that touch a square."""
+    near, count = meeting(blocks, square_around(x, y, half_width)), 0
+    for block in near:
+        count += block_edges.ptr[block + 1] - block_edges.ptr[block]
     out, count = np.empty(count, np.int64), 0
-    for index in chosen:
-        for entry in range(lists.ptr[index], lists.ptr[index + 1]):
-            out[count] = lists.items[entry]
+    for block in near:
+        for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
+            out[count] = block_edges.items[entry]
             count += 1
     return out
 

@@ -8,13 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, part_kernel
 from shiftsim.planners.proposals.tracker import DT, SCORED
 from shiftsim.world.state import AX, AY, HEADING
 
 SIGNALS = ("lon_accel", "lat_accel", "jerk", "lon_jerk", "yaw_accel", "yaw_rate")
 ROWS, COLUMNS, BLOCK, BAND = 44, 48, 4, 16  # of padded filters, see `Filters`
 _SMOOTH, _BRIEFLY, _SLOPE, _SLOPE_OF_ANGLE, _BEND_OF_ANGLE = range(5)  # filters
+# accelerations ahead, aside and of any direction, heading, two of them filtered once, then SIGNALS
+_AHEAD, _ASIDE, _ANY, _TURN, _BRIEF_ANY, _BRIEF_AHEAD, _TESTED = range(7)
+_STAGES = (  # what is filtered, by which filter, to what
+    (_AHEAD, _SMOOTH, _TESTED),
+    (_ASIDE, _SMOOTH, _TESTED + 1),
+    (_ANY, _BRIEFLY, _BRIEF_ANY),
+    (_BRIEF_ANY, _SLOPE, _TESTED + 2),
+    (_AHEAD, _BRIEFLY, _BRIEF_AHEAD),
+    (_BRIEF_AHEAD, _SLOPE, _TESTED + 3),
+    (_TURN, _BEND_OF_ANGLE, _TESTED + 4),
+    (_TURN, _SLOPE_OF_ANGLE, _TESTED + 5),
+)
 
 
 class ComfortBounds(NamedTuple):
@@ -71,20 +83,25 @@ class Comfort(NamedTuple):
 
 def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
     """The comfort test of driven states (P, 41, 11)."""
+    made = empty_comfort(states)
+    feel(states, make_filters(), bounds, made)
+    return made
+
+
+def empty_comfort(states: FloatArray) -> Comfort:
+    """Arrays for the comfort test of driven states (P, 41, 11)."""
     count, steps = states.shape[:2]
-    made = Comfort(
+    return Comfort(
         np.empty((count, len(SIGNALS), steps)),
         np.empty((count, len(SIGNALS)), np.bool_),
         np.empty(count),
     )
-    _comfort(states, make_filters(), bounds, made)
-    return made
 
 
 @kernel
-def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: Comfort) -> None:
+def feel(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: Comfort) -> None:
+    """Fill in the comfort test."""
     count = states.shape[1]
-    raw, brief, sums = np.zeros((4, ROWS)), np.zeros(ROWS), np.empty(COLUMNS)
     highs = (
         bounds.lon_accel_max,
         bounds.lat_accel,
@@ -93,41 +110,38 @@ def _comfort(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: 
         bounds.yaw_accel,
         bounds.yaw_rate,
     )
+    signals, sums = np.zeros((_TESTED + len(highs), ROWS)), np.empty(COLUMNS)
     for row in range(len(states)):
         turn = 0.0
         for step in range(count):
             state = states[row, step]
-            raw[0, step], raw[1, step] = state[AX], state[AY]
-            raw[2, step] = abs(state[AX]) if state[AY] == 0.0 else np.hypot(state[AX], state[AY])
+            signals[_AHEAD, step], signals[_ASIDE, step] = state[AX], state[AY]
+            magnitude = abs(state[AX]) if state[AY] == 0.0 else np.hypot(state[AX], state[AY])
+            signals[_ANY, step] = magnitude
             if step > 0:
                 change = state[HEADING] - states[row, step - 1, HEADING]
                 turn -= 2.0 * np.pi * np.rint(change / (2.0 * np.pi))
-            raw[3, step] = state[HEADING] + turn
-        out = made.signals[row]
-        _filter(raw[0], filters, _SMOOTH, sums, out[0])
-        _filter(raw[1], filters, _SMOOTH, sums, out[1])
-        _filter(raw[2], filters, _BRIEFLY, sums, brief[:count])
-        _filter(brief, filters, _SLOPE, sums, out[2])
-        _filter(raw[0], filters, _BRIEFLY, sums, brief[:count])
-        _filter(brief, filters, _SLOPE, sums, out[3])
-        _filter(raw[3], filters, _BEND_OF_ANGLE, sums, out[4])
-        _filter(raw[3], filters, _SLOPE_OF_ANGLE, sums, out[5])
+            signals[_TURN, step] = state[HEADING] + turn
+        for source, number, target in _STAGES:
+            _filter(signals[source], filters, number, sums, signals[target])
         made.score[row] = 1.0
-        for signal in range(6):
+        for signal in range(len(highs)):
             low = bounds.lon_accel_min if signal == 0 else -highs[signal]
             within = True
             for step in range(count):
-                within = within and low < out[signal, step] < highs[signal]
+                value = signals[_TESTED + signal, step]
+                within = within and low < value < highs[signal]
+                made.signals[row, signal, step] = value
             made.is_within[row, signal] = within
             if not within:
                 made.score[row] = 0.0
 
 
-@lean_kernel
+@part_kernel
 def _filter(
     samples: FloatArray, filters: Filters, number: int, sums: FloatArray, out: FloatArray
 ) -> None:
-    """Write samples (44,) times a matrix into `out` (41,), rounded to 8 decimals.
+    """Write samples (44,) times a matrix into `out` (44,), rounded to 8 decimals; the last 3 are 0.
 
     `sums` (48,) is scratch.
     """
@@ -142,18 +156,12 @@ def _filter(
         a, b, c, d = samples[row], samples[row + 1], samples[row + 2], samples[row + 3]
         if a == 0.0 and b == 0.0 and c == 0.0 and d == 0.0:
             continue
+        start = filters.starts[number, block] if is_short else 0
+        rows, part = filters.matrices[number, row : row + BLOCK], sums[start : start + COLUMNS]
         if is_short:
-            band, start = filters.bands[number, block], filters.starts[number, block]
-            _add(band, a, b, c, d, sums[start : start + BAND])
-        else:
-            _add(filters.matrices[number, row : row + BLOCK], a, b, c, d, sums)
-    for column in range(len(out)):
+            rows = filters.bands[number, block]
+        for column in range(min(rows.shape[1], len(part))):
+            total = part[column] + a * rows[0, column] + b * rows[1, column]
+            part[column] = total + c * rows[2, column] + d * rows[3, column]
+    for column in range(ROWS):
         out[column] = np.rint(sums[column] * 1e8) / 1e8
-
-
-@lean_kernel
-def _add(rows: FloatArray, a: float, b: float, c: float, d: float, sums: FloatArray) -> None:
-    """Add four samples times four rows of a matrix (4, K), one after the other, to `sums` (K,)."""
-    for column in range(rows.shape[1]):
-        total = sums[column] + a * rows[0, column] + b * rows[1, column]
-        sums[column] = total + c * rows[2, column] + d * rows[3, column]

@@ -103,20 +103,24 @@ def hits(
 
 @lean_kernel
 def is_at_fault(
-    state: FloatArray, box: FloatArray, is_off_lane: bool, others: Others, row: int, index: int
+    state: FloatArray,
+    box: FloatArray,
+    is_off_lane: bool,
+    speed: float,
+    centroid: FloatArray,
+    other: FloatArray,
 ) -> bool:
-    """Whether the ego causes a collision with one of the others at a row of time.
+    """Whether the ego causes a collision with a box (4, 2) of a speed [m/s] and a centroid (2,).
 
     `state` (11,) and `box` (4, 2) are the ego's; `is_off_lane`: on several lanes or off the road.
     """
     if np.hypot(state[VX], state[VY]) <= STOPPED:
         return False
-    if others.speeds[row, index] <= STOPPED:
+    if speed <= STOPPED:
         return True
-    center = others.centroids[row, index]
-    if bearing(state, center[0], center[1]) > BEHIND:
+    if bearing(state, centroid[0], centroid[1]) > BEHIND:
         return False
-    return is_off_lane or front_touches(box, others.boxes[row, index])
+    return is_off_lane or front_touches(box, other)
 
 
 @kernel
@@ -145,7 +149,8 @@ def first_faults(
                 if decided[entry] or not hits(others, row, index, box, circle):
                     continue
                 state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
-                if is_at_fault(state, box, off_lane, others, row, index):
+                speed, center = others.speeds[row, index], others.centroids[row, index]
+                if is_at_fault(state, box, off_lane, speed, center, others.boxes[row, index]):
                     worth = 0.0 if others.is_agent[index] else 0.5
                     scores[proposal] = min(scores[proposal], worth)
                     first[proposal] = min(first[proposal], float(step))

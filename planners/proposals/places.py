@@ -51,8 +51,15 @@ def find_places(
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
 ) -> Places:
     """Places of driven states (P, T, 11)."""
+    at, near = empty_places(states), np.empty_like(selected)
+    find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
+    return at
+
+
+def empty_places(states: FloatArray) -> Places:
+    """Driven states (P, T, 11) and arrays for their places."""
     shape = states.shape[:2]
-    at = Places(
+    return Places(
         states,
         np.empty((*shape, 4, 2)),
         np.empty((*shape, 2)),
@@ -60,13 +67,10 @@ def find_places(
         np.empty(shape, np.bool_),
         np.empty(shape),
     )
-    near = np.empty_like(selected)
-    _find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
-    return at
 
 
 @kernel
-def _find(
+def find(
     slabs: Slabs,
     on_route: BoolArray,
     selected: IntArray,

@@ -77,7 +77,12 @@ def times_to_collision(places: Places, others: Others, near: IntArray) -> FloatA
                 off_lane = places.off_lane[proposal, number]
                 for index in near:
                     if hits(others, step, index, box, circle):
-                        if is_at_fault(then, box, off_lane, others, number, index):
+                        speed, center = (
+                            others.speeds[number, index],
+                            others.centroids[number, index],
+                        )
+                        other = others.boxes[number, index]
+                        if is_at_fault(then, box, off_lane, speed, center, other):
                             scores[proposal] = 0.0
             if scores[proposal] == 0.0:
                 break
