@@ -220,6 +220,10 @@ AV2_MAP_FAULTS = {
     "'successors', item 0 is 'x', need an integer": lambda found: first(found).update(
         successors=["x"]
     ),
+    "its 'extent': 3000...": lambda found: first(found)["centerline"][0].update(x=3e6),
+    "its 'extent': 5000...": lambda found: next(iter(found["pedestrian_crossings"].values()))[
+        "edge1"
+    ][0].update(y=5e6),
     "item 0: 'x' is missing": lambda found: first(found)["left_lane_boundary"][0].pop("x"),
     "'is_intersection' is 'yes', need true or false": lambda found: first(found).update(
         is_intersection="yes"
