@@ -49,7 +49,11 @@ TESTS_OF = {
     "shiftsim.metrics": METRIC_TESTS,
     "shiftsim.sim.dynamics": DYNAMICS_TESTS,
     "shiftsim.sim.noise": (),
-    "shiftsim.sim.loop": ("sim/test_plan_check.py", "sim/test_lock_step.py"),
+    "shiftsim.sim.loop": (
+        "sim/test_plan_check.py",
+        "sim/test_lock_step.py",
+        "sim/test_drive_on.py",
+    ),
 }
 Name = tuple[str, str]  # a module and a top-level name of it
 

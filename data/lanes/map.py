@@ -46,7 +46,7 @@ def build_lane_map(source: MapSource) -> PieceMap:
     """The semantic map of what a data set tells of its lanes.
 
     Raises:
-        MapError: There is no lane, an id occurs twice, or the lanes spread wider than a map can.
+        MapError: There is no lane, an id occurs twice, or the map spreads wider than one can.
     """
     return _Maker(source).build()
 
@@ -56,11 +56,13 @@ class _Maker:
         if not source.pieces:
             what = f"map {source.name!r} has no lane that cars may use"
             raise MapError(what, "leave this scene out: without lanes there is no route")
-        lines = [line for piece in source.pieces for line in (piece.left, piece.right)]
-        lines += [shapely.get_coordinates(area) for area in source.paved]
-        points = np.concatenate(lines)
+        lines = [line for p in source.pieces for line in (p.left, p.right, p.center)]
+        areas = [*source.drivable_areas, *source.paved, *source.crosswalks, *source.walkways]
+        areas += [*source.car_parks, *(stop.polygon for stop in source.stop_areas)]
+        lines.append(shapely.get_coordinates(areas))
+        points = np.concatenate([line for line in lines if line is not None])
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-        require(MAP_EXTENT, "extent", extent, f"map {source.name!r}: the lanes'", error=MapError)
+        require(MAP_EXTENT, "extent", extent, f"map {source.name!r}: its", error=MapError)
         self.source, self.warnings = source, Counter[str]()
         self.graph = build_graph(source.pieces, self.warnings)
         self.lights = [self._light(connector) for connector in self.graph.connectors]

@@ -12,42 +12,34 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import shapely
 
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import MapSource
 from shiftsim.data.open_data.codes import TYPES
 from shiftsim.data.open_data.lane_names import LaneNames
 from shiftsim.data.open_data.scenes import Scene
-from shiftsim.data.open_data.source import Source, find_below, need
-from shiftsim.data.polygons import largest_part
+from shiftsim.data.open_data.source import Source, find_below
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 
 EGO = "AV"
-# columns of positions, headings and velocities, and the field of `OPEN_DATA` of each
-_MOTION = {
-    name: name.partition("_")[0]
-    for name in ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+_MOTION = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+_COLUMNS = {
+    "observed": pa.bool_(),
+    "track_id": pa.string(),
+    "object_type": pa.string(),
+    "timestep": pa.int64(),
+    **dict.fromkeys(_MOTION, pa.float64()),
+    "start_timestamp": pa.float64(),  # ns
+    "city": pa.string(),
 }
-_COLUMNS = [
-    need("observed", pa.bool_()),
-    need("track_id", pa.string()),
-    need("object_type", pa.string()),
-    need("timestep", pa.int64()),
-    *(need(name, pa.float64()) for name in _MOTION),
-    need("start_timestamp", pa.float64()),  # ns
-    need("city", pa.string()),
-]
 _LINE = [{"x": float, "y": float}]
 _LANE = LaneNames(
-    left="left_lane_boundary",
-    right="right_lane_boundary",
+    line=_LINE,
+    borders=("left_lane_boundary", "right_lane_boundary"),
     center="centerline",  # the data set of sensors has none
     successors="successors",
-    left_neighbor="left_neighbor_id",
-    right_neighbor="right_neighbor_id",
-    line=_LINE,
+    neighbors=("left_neighbor_id", "right_neighbor_id"),
 )
 _MAP = {
     "lane_segments": {str: {**_LANE.form, "id": int, "lane_type": str, "is_intersection": bool}},
@@ -106,9 +98,10 @@ def _read_tracks(source: Source) -> TrackSamples:
     table = table.filter(pc.not_equal(table["object_type"], _LEFT_OUT))
     encoded = pc.dictionary_encode(table["object_type"].combine_chunks())
     types = [str(name) for name in encoded.dictionary.to_pylist()]
-    source.known(types, TYPES, "object_type")
-    sizes = np.array([TYPES[name][1:] for name in types])
-    read = {name: source.numbers(table, name, field) for name, field in _MOTION.items()}
+    sizes = np.array([TYPES[source.known(name, TYPES, "object_type")][1:] for name in types])
+    x, y, heading, *velocity = (
+        source.numbers(table, name, name.partition("_")[0]) for name in _MOTION
+    )
     step = source.numbers(table, "timestep", "step").astype(np.int64)
     category = encoded.indices.to_numpy().astype(np.int64)
     return make_samples(
@@ -117,9 +110,9 @@ def _read_tracks(source: Source) -> TrackSamples:
         ids=table["track_id"].to_numpy(),
         category=category,
         categories=types,
-        xy=np.column_stack([read["position_x"], read["position_y"]]),
-        headings=read["heading"],
-        velocities=np.column_stack([read["velocity_x"], read["velocity_y"]]),
+        xy=np.column_stack([x, y]),
+        headings=heading,
+        velocities=np.column_stack(velocity),
         sizes=sizes[category],
         kind_of={name: kind for name, (kind, *_) in TYPES.items()},
     )
@@ -127,11 +120,7 @@ def _read_tracks(source: Source) -> TrackSamples:
 
 def _read_map(source: Source, name: str) -> MapSource:
     """The map of a scene: what its `log_map_archive_*.json` says."""
-    try:
-        found = json.loads(source.content(_MAX_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise source.fault(f"not readable as JSON ({error})") from error
-    source.expect(found, _MAP, "the file")
+    found = source.unpack(source.content(_MAX_BYTES), json.loads, _MAP, "the JSON")
     return MapSource(
         name=name,
         pieces=[
@@ -140,15 +129,11 @@ def _read_map(source: Source, name: str) -> MapSource:
             if lane["lane_type"] != "BIKE"  # they double the connectors of vehicles
         ],
         drivable_areas=[
-            _area(source, item["area_boundary"], f"drivable_areas {key!r}")
+            source.ring(item["area_boundary"], f"drivable_areas {key!r}")
             for key, item in found["drivable_areas"].items()
         ],
         crosswalks=[
-            _area(source, [*item["edge1"], *item["edge2"][::-1]], f"crossing {key!r}")
+            source.ring([*item["edge1"], *item["edge2"][::-1]], f"crossing {key!r}")
             for key, item in found["pedestrian_crossings"].items()
         ],
     )
-
-
-def _area(source: Source, points: list[object], place: str) -> shapely.Polygon:
-    return largest_part(shapely.Polygon(source.line(points, place, least=3)))

@@ -73,7 +73,7 @@ class _File(Source):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         (self.root,) = xml_elements(self.content(_MAX_BYTES), "commonRoad", self.fault)
-        self.known([self.root.get("commonRoadVersion")], ("2018b", "2020a"), "commonRoadVersion")
+        self.known(self.root.get("commonRoadVersion"), ("2018b", "2020a"), "commonRoadVersion")
         self.warnings: Counter[str] = Counter()
         self.step_s = self.number(self.root.get("timeStepSize"), "step length", "'timeStepSize'")
 

@@ -11,49 +11,40 @@ from shiftsim.data.open_data.source import Source
 class LaneNames:
     """What a data set calls the parts of a lane in the direction of travel."""
 
-    left: str  # border, as `line`
-    right: str
+    line: Any  # form of a line, see `Source.expect`
+    borders: tuple[str, str]  # left and right, as `line`
     center: str  # as `line`; may be missing
     successors: str  # list of ids, may be missing
-    left_neighbor: str  # id, may be missing
-    right_neighbor: str
-    line: Any  # form of a line, see `Source.expect`
+    neighbors: tuple[str, str]  # left and right, ids, may be missing
     speed_limit: str | None = None  # [m/s], may be missing
 
     @property
     def form(self) -> dict[Any, Any]:
         """The form of a lane."""
         return {
-            self.left: self.line,
-            self.right: self.line,
+            **dict.fromkeys(self.borders, self.line),
             self.center: (self.line,),
             self.successors: ([int],),
-            self.left_neighbor: (int,),
-            self.right_neighbor: (int,),
+            **dict.fromkeys(self.neighbors, (int,)),
             self.speed_limit: (float,),
         }
 
     def piece(self, source: Source, lane: dict[Any, Any], name: str, **more: Any) -> LanePiece:
         """The piece that a lane of this form is; `more` are fields with names of their own."""
-        lines: dict[str, Any] = {
-            side: source.line(lane[key], f"lane {name}: {key!r}")
-            for side, key in (("left", self.left), ("right", self.right), ("center", self.center))
-            if lane.get(key) is not None
-        }
+        lines = [key for key in (*self.borders, self.center) if lane.get(key) is not None]
+        left, right, *center = (source.line(lane[i], f"lane {name}: {i!r}") for i in lines)
         limit = lane.get(self.speed_limit)
         if limit is not None:
             source.require("speed limit", limit, f"lane {name}: {self.speed_limit!r}")
+        beside = [None if lane.get(i) is None else str(lane[i]) for i in self.neighbors]
         return LanePiece(
-            id=name,
-            speed_limit=limit,
+            name,
+            left,
+            right,
+            next(iter(center), None),
             successors=tuple(map(str, lane.get(self.successors) or ())),
-            left_neighbor=text_or_none(lane.get(self.left_neighbor)),
-            right_neighbor=text_or_none(lane.get(self.right_neighbor)),
-            **lines,
+            left_neighbor=beside[0],
+            right_neighbor=beside[1],
+            speed_limit=limit,
             **more,
         )
-
-
-def text_or_none(value: Any) -> str | None:
-    """An id as text."""
-    return None if value is None else str(value)

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from shiftsim import __version__
 from shiftsim.data.deepplan.convert import Progress, Spread, one_by_one
@@ -120,7 +120,7 @@ def convert_scenes(
     with alone_in(store):
         writer = StoreWriter(store)
         keys = {str(path): _key(reader, path, vehicles) for path in paths}
-        have = {_stored_key(writer, token) for token in writer.tokens}
+        have = {writer.window(token).metadata.get("source_key") for token in writer.tokens}
         todo = [name for name, key in keys.items() if key not in have]
         report.kept = len(paths) - len(todo)
         maps: set[str] = set()
@@ -195,13 +195,9 @@ class _Converter:
 def _key(reader: Reader, path: Path, vehicles: bool) -> str:
     """Equal where the result is equal."""
     found = [__version__, VERSION, str(path.name), vehicles]
-    with suppress(OSError):  # reading tells what is wrong
+    with suppress(OSError, DataError):  # reading tells what is wrong
         found += [digest(file) for file in reader.files(path)]
     return hashlib.sha256(json.dumps(found).encode()).hexdigest()[:16]
-
-
-def _stored_key(writer: StoreWriter, token: str) -> Any:
-    return writer.window(token).metadata.get("source_key")
 
 
 def _count(report: OpenReport, made: Made) -> None:

@@ -1,28 +1,27 @@
 """A file of an open data set: what is read of it is checked, and faults name it and a remedy.
 
-Every reader says in a table what it needs: of columns the Arrow type, and whether there may be
-nulls (`need`, `maybe`, `items`); of JSON and msgpack the form (`Source.expect`). What passes is
-used without further checks but those of ranges.
+Every reader says what it needs: of columns the Arrow type (`items`: lists without nulls), of JSON
+and msgpack the form (`Source.expect`). What passes is used without further checks but those of
+ranges.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.arrays import FloatArray
+from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.pieces import clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.errors import ConversionError, DataError, readable
 from shiftsim.world.ranges import OPEN_DATA, require
 
-REPAIR = "get the file again from its source, or leave the scene out"
 _MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 8_000_000
 # what JSON and msgpack call a type of Python, and the types of values that will do
@@ -35,15 +34,16 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     dict: ("a map", (dict,)),
     np.ndarray: ("an array", (np.ndarray,)),
 }
-need, maybe = partial(pa.field, nullable=False), pa.field  # columns without and with nulls
 
 
 class Source:
     """A file, and what to do where it is not as expected."""
 
-    def __init__(self, path: Path, remedy: str = REPAIR) -> None:
-        """`remedy` is the hint of all faults that have none of their own."""
-        self.path, self.remedy = path, remedy
+    # hint of all faults that have none of their own
+    remedy = "get the file again from its source, or leave the scene out"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
     def fault(self, what: object, remedy: str = "") -> ConversionError:
         """The error that says what is wrong."""
@@ -88,10 +88,9 @@ class Source:
             self.require(field, number, place)
         return number
 
-    def require(self, field: str, values: Any, place: str, *, may_be_nan: bool = False) -> None:
+    def require(self, field: str, values: Any, place: str) -> None:
         """Numbers are in the range of their field."""
-        where = f"{self.path}: {place} as"
-        require(OPEN_DATA, field, values, where, error=ConversionError, may_be_nan=may_be_nan)
+        require(OPEN_DATA, field, values, f"{self.path}: {place} as", error=ConversionError)
 
     def line(self, points: Any, place: str, least: int = 2) -> FloatArray:
         """(K, 2) a line of points (K', 2 or 3), or maps of x and y, without repeated ones [m]."""
@@ -110,19 +109,35 @@ class Source:
             raise self.fault(f"{place} has {len(line)} points that differ, need {least}")
         return line
 
-    def area(self, shape: shapely.Geometry | None, place: str) -> shapely.Polygon:
+    def ring(self, points: Any, place: str) -> shapely.Polygon:
+        """The largest valid part of the polygon that a line encloses."""
+        return largest_part(shapely.Polygon(self.line(points, place, least=3)))
+
+    def area(self, wkb: bytes, place: str) -> shapely.Polygon:
         """The largest valid part of a polygon."""
+        shape = shapely.from_wkb(wkb, on_invalid="ignore")
         if shape is None or shape.geom_type != "Polygon" or shape.is_empty:
             raise self.fault(f"{place} is no polygon")
         self.require("position", shapely.get_coordinates(shape), place)
         return largest_part(shapely.force_2d(shape))
 
-    def known(self, values: Iterable[Any], all_known: Collection[Any], place: str) -> None:
-        """Every value is one of those that are known."""
-        for value in values:
-            if value not in all_known:
-                hint = f"known are: {', '.join(map(str, all_known))}"
-                raise self.fault(f"{place} {value!r} is unknown", hint)
+    def known(self, value: Any, all_known: Collection[Any], place: str) -> Any:
+        """A value that is one of those that are known."""
+        if value not in all_known:
+            hint = f"known are: {', '.join(map(str, all_known))}"
+            raise self.fault(f"{place} {value!r} is unknown", hint)
+        return value
+
+    def unpack(
+        self, data: bytes | None, load: Callable[[bytes], Any], form: Any, place: str
+    ) -> Any:
+        """What JSON or msgpack holds, of a form as in `expect`; `load` reads it."""
+        try:
+            found = None if data is None else load(data)
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+            raise self.fault(f"{place} cannot be unpacked ({error})") from error
+        self.expect(found, form, place)
+        return found
 
     def expect(self, value: Any, form: Any, place: str) -> None:
         """Raise an error unless what JSON or msgpack holds has a form.
@@ -149,38 +164,34 @@ class Source:
             for key, inner in each.items():
                 self.expect(value.get(key), inner, f"{place}: {key!r}")
 
-    def columns(self, wanted: Sequence[pa.Field], prefix: str = "") -> pa.Table:
-        """Columns of a Parquet file, or of an Arrow IPC file (`.arrow`), by their plain names.
+    def columns(self, wanted: Mapping[str, pa.DataType]) -> pa.Table:
+        """Columns of a Parquet file, or of an Arrow IPC file (`.arrow`), and its metadata.
 
         Args:
-            wanted: Name and type of each column, and where in it there may be nulls.
-            prefix: What their names begin with in the file.
+            wanted: Type of each column; there are no nulls but in lists whose type allows them.
 
         Raises:
             ConversionError: The file is missing, broken or without rows, a column is missing or of
                 another type, or has nulls where it may not.
         """
         self._require_size(_MAX_BYTES)
-        names = [f"{prefix}{field.name}" for field in wanted]
         try:
-            table = _read(self.path, names)
+            table = _read(self.path, wanted)
             table.validate(full=True)
         except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
             raise self.fault(f"cannot be read ({error})") from error
-        if not 0 < len(table) <= _MAX_ROWS and names:
+        if not 0 < len(table) <= _MAX_ROWS:
             what = f"{len(table)} rows, need 1 to {_MAX_ROWS}"
             raise self.fault(what, "split the recording" if len(table) else "")
-        for name, field in zip(names, wanted, strict=True):
-            if name not in table.column_names:
-                raise self.fault(f"column {name!r} is missing")
-            found = table.schema.field(name).type
-            if _bare(found) != _bare(field.type):
-                raise self.fault(f"column {name!r} is {found}, need {_bare(field.type)}")
-            if count := sum(_nulls(chunk, field) for chunk in table[name].chunks):
+        for name, kind in wanted.items():
+            if (count := table.column_names.count(name)) != 1:
+                what = f"there {count} times" if count else "missing"
+                raise self.fault(f"column {name!r} is {what}")
+            if _bare(table[name].type) != _bare(kind):
+                raise self.fault(f"column {name!r} is {table[name].type}, need {_bare(kind)}")
+            if count := sum(_nulls(chunk, kind) for chunk in table[name].chunks):
                 raise self.fault(f"column {name!r} holds {count} nulls, need a value everywhere")
-        notes = table.schema.metadata
-        table = table.select(names).rename_columns([field.name for field in wanted])
-        return table.replace_schema_metadata(notes)
+        return table.select(list(wanted)).replace_schema_metadata(table.schema.metadata)
 
     def numbers(self, table: pa.Table, column: str, field: str) -> FloatArray:
         """(R,) a column as float64, all in the range of the field."""
@@ -188,10 +199,25 @@ class Source:
         self.require(field, values, f"column {column!r}")
         return values
 
+    def lists(self, table: pa.Table) -> tuple[IntArray, list[pa.Array]]:
+        """The row of each item of lists in columns that belong together, and the items."""
+        columns = [column.combine_chunks() for column in table.columns]
+        rows = [pc.list_parent_indices(column).to_numpy() for column in columns]
+        for name, one in zip(table.column_names, rows, strict=True):
+            if not np.array_equal(one, rows[0]):
+                raise self.fault(f"lists of {name!r} have lengths of their own")
+        return rows[0], [column.flatten() for column in columns]
+
 
 def items(kind: pa.DataType, length: int = -1) -> pa.DataType:
     """The type of lists without nulls, all of a length if it is given."""
-    return pa.list_(need("item", kind), length)
+    return pa.list_(pa.field("item", kind, nullable=False), length)
+
+
+def vectors(column: pa.Array, count: int) -> FloatArray:
+    """(R, count) the first parts of a column of vectors; NaN where there is none."""
+    parts = [pc.list_element(column, i).to_numpy(zero_copy_only=False) for i in range(count)]
+    return np.column_stack(parts)
 
 
 def _bare(kind: pa.DataType) -> pa.DataType:
@@ -203,11 +229,11 @@ def _bare(kind: pa.DataType) -> pa.DataType:
     return pa.string() if pa.types.is_large_string(kind) else kind
 
 
-def _nulls(found: pa.Array, wanted: pa.Field) -> int:
+def _nulls(found: pa.Array, kind: pa.DataType, *, allowed: bool = False) -> int:
     """How many nulls there are where there may be none."""
-    count = 0 if wanted.nullable else found.null_count
+    count = 0 if allowed else found.null_count
     if isinstance(found, pa.ListArray | pa.FixedSizeListArray):
-        count += _nulls(found.flatten(), wanted.type.value_field)
+        count += _nulls(found.flatten(), kind.value_type, allowed=kind.value_field.nullable)
     return count
 
 
@@ -219,7 +245,7 @@ def find_below(folder: Path, pattern: str, remedy: str) -> list[Path]:
     return found
 
 
-def _read(path: Path, names: list[str]) -> pa.Table:
+def _read(path: Path, names: Collection[str]) -> pa.Table:
     if path.suffix != ".arrow":
         file = pq.ParquetFile(path)
         known = [name for name in names if name in file.schema_arrow.names]

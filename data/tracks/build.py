@@ -25,6 +25,7 @@ from shiftsim.world.state import AgentKind
 MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
 MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
 MAX_SPAN_S = 1e5  # s from the first row to the last one
+_KINDS = {kind.name.lower(): kind for kind in AgentKind}
 # length and width of objects of unknown size [m]
 SIZES = {
     AgentKind.VEHICLE: (4.6, 1.9),
@@ -43,13 +44,13 @@ def make_samples(
     time_us: IntArray,
     ids: NDArray[Any],
     category: IntArray,
-    categories: Sequence[str],
+    categories: Sequence[str] = tuple(_KINDS),
     xy: FloatArray,
     headings: FloatArray | None = None,
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
     derived: FloatArray | None = None,
-    kind_of: Mapping[str, AgentKind] = CATEGORIES,
+    kind_of: Mapping[str, AgentKind] = CATEGORIES | _KINDS,
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
 
@@ -58,7 +59,7 @@ def make_samples(
         time_us: (A,) time stamps [us].
         ids: (A,) integers or texts that name the objects.
         category: (A,) index into `categories`.
-        categories: Names of categories.
+        categories: Names of categories; by default `category` holds AgentKind codes.
         xy: (A, 2) box centre [m].
         headings: (A,) [rad]; the direction of motion where it is not given.
         velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
@@ -74,7 +75,7 @@ def make_samples(
     """
     warnings: Counter[str] = Counter()
     for what, values in (("position", xy), ("heading", headings)):
-        bad = 0 if values is None else int((~np.isfinite(values)).reshape(len(values), -1).sum())
+        bad = 0 if values is None else int((~np.isfinite(values)).sum())
         if bad:
             raise ConversionError(
                 f"{name}: {bad} values of {what} are not finite", "leave those rows out"

@@ -58,7 +58,7 @@ def kernel(function: Any) -> Any:
     of threads. Division by zero gives inf or NaN, as in NumPy.
     """
     # said although it is the default: a kernel called by a lean one would inherit the opposite
-    return compiled(function, counts_references=True)
+    return compiled(function, counts_references=True, forceinline=False)
 
 
 def lean_kernel(function: Any) -> Any:
@@ -69,7 +69,7 @@ def lean_kernel(function: Any) -> Any:
 
     Counting takes a third of the time of kernels that hand many arrays to small ones.
     """
-    return compiled(function, counts_references=False)
+    return compiled(function, counts_references=False, forceinline=False)
 
 
 def part_kernel(function: Any) -> Any:

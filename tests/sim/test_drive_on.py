@@ -70,7 +70,7 @@ def test_steps_taken_at_once_are_those_taken_one_by_one(noise, iterations):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     assert np.isnan(ours.commands[-1]).all()  # the last plan is not executed
     taken = ours.planning_seconds[1:]
-    assert (taken > 0.0).all()
+    assert ((taken > 0.0) & (taken < 60.0)).all()
     np.testing.assert_array_equal(taken, taken[0])
 
 

@@ -303,6 +303,18 @@ def test_only_the_first_plan_is_doubted(strange):
     assert ("42 m away" in rollout.doubt) == (strange == 0)
 
 
+def test_a_doubt_is_told_where_the_user_calls():
+    class Elsewhere(Recorder):
+        def plan(self, observation):
+            plan = super().plan(observation)
+            plan.states[:, X] += 42.0
+            return plan
+
+    with pytest.warns(UserWarning, match="42 m away") as told:
+        simulate(cruise_scenario(iterations=5), Elsewhere())
+    assert told[0].filename == __file__
+
+
 @pytest.mark.parametrize(("progress", "samples"), [(20.0, 12), (20.5, 13), (500.0, 19)])
 def test_a_rollout_ends_one_sample_after_the_ego_has_reached_the_finish(progress, samples):
     finish = Finish(np.array([[0.0, 0.0], [600.0, 0.0]]), progress)

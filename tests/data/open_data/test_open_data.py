@@ -145,6 +145,15 @@ def test_a_broken_scene_is_skipped_and_named(tmp_path):
     assert "cannot be read" in report.failed[str(bad)]
 
 
+def test_a_log_that_does_not_say_where_its_map_is_is_skipped_and_named(tmp_path):
+    write_py123d(tmp_path / "good")
+    bad = write_py123d(tmp_path / "bad")
+    (bad / "sync.arrow").write_bytes(b"nonsense")
+    report = convert_scenes(Py123dReader(), tmp_path, tmp_path / "store")
+    assert (report.scenes, list(report.failed)) == (1, [str(bad)])
+    assert "sync.arrow: cannot be read" in report.failed[str(bad)]
+
+
 @pytest.mark.slow
 def test_the_command_converts_and_says_what_comes_next(tmp_path):
     write_commonroad(tmp_path / "files")
@@ -185,7 +194,13 @@ AV2_FAULTS = {
     "column 'heading' is missing": without("heading"),
     "column 'timestep' is double, need int64": as_type("timestep", pa.float64()),
     "holds the observed 5 s only": lambda table: table.filter(table["observed"]),
+    "column 'heading' is there 2 times": lambda t: t.append_column("heading", t["heading"]),
     "object_type 'tank' is unknown": with_value("object_type", "tank"),
+    "0 rows at one time": lambda table: table.set_column(
+        table.schema.get_field_index("object_type"),
+        "object_type",
+        pa.array(["background"] * len(table)),
+    ),
     "'position', row 0: nan is not a finite number": with_value("position_x", float("nan")),
 }
 
@@ -205,6 +220,10 @@ AV2_MAP_FAULTS = {
     "'successors', item 0 is 'x', need an integer": lambda found: first(found).update(
         successors=["x"]
     ),
+    "its 'extent': 3000...": lambda found: first(found)["centerline"][0].update(x=3e6),
+    "its 'extent': 5000...": lambda found: next(iter(found["pedestrian_crossings"].values()))[
+        "edge1"
+    ][0].update(y=5e6),
     "item 0: 'x' is missing": lambda found: first(found)["left_lane_boundary"][0].pop("x"),
     "'is_intersection' is 'yes', need true or false": lambda found: first(found).update(
         is_intersection="yes"
@@ -310,6 +329,11 @@ ARROW_FAULTS = {
             pa.array([[9] * len(r) for r in table[3].to_pylist()], table[3].type),
         ),
     ),
+    "column 'box_detections_se3.label' is there 2 times": (
+        BOXES,
+        lambda table: table.append_column(f"{BOXES}.label", table[f"{BOXES}.label"]),
+    ),
+    "lane '1': its id occurs twice": ("map", lambda t: pa.concat_tables([t, t[:1]])),
     "'metadata' is missing": (BOXES, lambda table: table.replace_schema_metadata(None)),
     "cannot be unpacked": ("map", with_value("features", b"\xc1")),
     "lane 1: 'left_boundary' is 'x', need an array": ("map", with_line("x")),
@@ -425,6 +449,10 @@ NOTES_FAULTS = {
     "'split' is '3', need a text": ("sync", {"split": 3}),
     "'length' is 'long', need a number": ("ego_state_se3", {"length": "long"}),
     "box as 'size', row 0: -1 is beyond": ("ego_state_se3", {"length": -1}),
+    "box as 'position', row 0: 1e\\+30": (
+        "ego_state_se3",
+        {"center_to_imu_se3": [1e30, *[0.0] * 6]},
+    ),
     "'center_to_imu_se3' has 6 numbers": ("ego_state_se3", {"center_to_imu_se3": [0.0] * 6}),
     "'center_to_imu_se3', item 0 is 'x'": ("ego_state_se3", {"center_to_imu_se3": ["x"] * 7}),
     "'box_detection_label_class' is '5'": (BOXES, {"box_detection_label_class": 5}),

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
 from shiftsim.sim.dynamics.perfect import (
+    KEPT_US,
     follow_perfectly,
     interpolate,
     sample_poses,
@@ -26,6 +27,11 @@ from shiftsim.world.state import (
 
 def two_states() -> tuple[np.ndarray, np.ndarray]:
     return np.array([0, 1_000_000]), np.zeros((2, NUM_STATE))
+
+
+def test_poses_of_plans_are_kept_every_tenth_of_a_second_and_then_every_second():
+    tenths = [*range(11), *range(20, 90, 10)]
+    np.testing.assert_array_equal(KEPT_US, 100_000 * np.array(tenths))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 30), st.floats(0.0, 1.0))

@@ -8,7 +8,7 @@ runs of segments of their line (`geometry.polylines`).
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel
+from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.polylines import RUN
 from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
 
@@ -72,7 +72,7 @@ def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     return best
 
 
-@lean_kernel
+@part_kernel
 def _box_apart(ring: FloatArray, low_x: float, low_y: float, high_x: float, high_y: float) -> float:
     """Lower bound of the distance from a ring to what lies in an axis-parallel box [m]."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
@@ -82,7 +82,7 @@ def _box_apart(ring: FloatArray, low_x: float, low_y: float, high_x: float, high
     return max(low_x - x1, x0 - high_x, low_y - y1, y0 - high_y)
 
 
-@lean_kernel
+@part_kernel
 def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between two close vertices: an upper bound that makes the search short."""
     found = 0
@@ -105,7 +105,7 @@ def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
     return np.sqrt(best)
 
 
-@lean_kernel
+@part_kernel
 def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best: float) -> float:
     """Distance from the segment p-q to the edges of a ring where it is less than `best`."""
     low_x, high_x = min(px, qx) - best, max(px, qx) + best
@@ -169,7 +169,7 @@ def last_near_run(runs: FloatArray, first: int, reach: float, bounds: FloatArray
     return -1
 
 
-@lean_kernel
+@part_kernel
 def touches_corridor(
     line: FloatArray,
     runs: FloatArray,
@@ -218,7 +218,7 @@ def touches_corridor(
     return answer
 
 
-@lean_kernel
+@part_kernel
 def _touches_segment(
     px: float, py: float, qx: float, qy: float, half_width: float, ring: FloatArray
 ) -> int:
