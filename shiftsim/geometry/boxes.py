@@ -86,7 +86,10 @@ def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
 @lean_kernel
 def wrap_angle(angle: float) -> float:
     """An angle wrapped to [-pi, pi) as nuPlan does: ((angle + pi) mod 2 pi) - pi [rad]."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+    turned = angle + np.pi
+    if not 0.0 <= turned < 2.0 * np.pi:  # few are: most need no division
+        turned %= 2.0 * np.pi
+    return turned - np.pi
 
 
 def wrap_angles(angles: FloatArray) -> FloatArray:
