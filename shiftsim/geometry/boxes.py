@@ -86,10 +86,10 @@ def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
 @lean_kernel
 def wrap_angle(angle: float) -> float:
     """An angle wrapped to [-pi, pi) as nuPlan does: ((angle + pi) mod 2 pi) - pi [rad]."""
-    shifted = angle + np.pi
-    if 0.0 <= shifted < 2.0 * np.pi:  # most often: the remainder is the number itself
-        return shifted - np.pi
-    return shifted % (2.0 * np.pi) - np.pi
+    turned = angle + np.pi
+    if not 0.0 <= turned < 2.0 * np.pi:  # few are: most need no division
+        turned %= 2.0 * np.pi
+    return turned - np.pi
 
 
 def wrap_angles(angles: FloatArray) -> FloatArray:

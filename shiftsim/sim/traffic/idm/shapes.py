@@ -107,7 +107,10 @@ def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
 
 @part_kernel
 def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best: float) -> float:
-    """Distance from the segment p-q to the edges of a ring where it is less than `best`."""
+    """The distance from q to a ring, or from a vertex of it to the segment p-q, if below `best`.
+
+    Or 0, where they meet; p is the q of another segment.
+    """
     low_x, high_x = min(px, qx) - best, max(px, qx) + best
     low_y, high_y = min(py, qy) - best, max(py, qy) + best
     rx, ry = ring[-1, 0], ring[-1, 1]
@@ -121,9 +124,7 @@ def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best
         ):
             if segments_meet(px, py, qx, qy, rx, ry, sx, sy):
                 return 0.0
-            best = _nearer(px, py, rx, ry, sx, sy, best)
             best = _nearer(qx, qy, rx, ry, sx, sy, best)
-            best = _nearer(rx, ry, px, py, qx, qy, best)
             best = _nearer(sx, sy, px, py, qx, qy, best)
         rx, ry = sx, sy
     return best
