@@ -147,7 +147,7 @@ def _lane_states(
     """
     current, previous = np.empty(most, np.int64), np.empty(most, np.int64)
     initial = np.empty(most, np.int64)
-    is_open, num, initial_size = False, 0, np.int64(0)
+    is_open, num, initial_size = False, 0, 0
     for i in range(len(corners.counts)):
         state = _common(corners.edges[i], corners.counts[i], incoming, outgoing, current)
         states[i] = state

@@ -3,8 +3,6 @@
 Everything later metrics ask of the map rests on these lists. Every sample has a short list of
 edges, stored as a row of a (…, C) index array with its length; C is the largest number of edges
 that can hold one point. Lanes come before connectors.
-
-A length handed on starts as np.int64(0): for a literal the callee would be compiled once more.
 """
 
 from typing import NamedTuple
@@ -198,7 +196,7 @@ def _corner_routes(lanes: Lanes, corners: FloatArray, out: EdgeLists) -> int:
     lists, counts = out.edges, out.counts
     known = np.empty(8 * lists.shape[2], np.int64)
     for i in range(len(corners)):
-        size = np.int64(0)
+        size = 0
         if i > 0:
             for corner in range(4):
                 size = _add(known, size, lists[i - 1, corner], counts[i - 1, corner])

@@ -10,7 +10,7 @@ optimised where they end up. That, less search for garbage and no passes for wha
 import gc
 from typing import Any
 
-from numba.core import event
+from numba.core import event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
@@ -53,6 +53,8 @@ class _Kernel(CPUDispatcher):
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """For a kernel that calls this one: what it may be called with, the part being there."""
         pysig, args = self._make.fold_argument_types(args, kws)
+        # a number that is written where it is called is of the same type as all others
+        args = tuple(types.unliteral(arg) for arg in args)  # type: ignore[no-untyped-call]
         if args not in self._parts:
             self._parts[args] = self._part(args)
         signatures = [part.signature for part in self._parts.values()]

@@ -37,7 +37,7 @@ def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float
 def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
     # det = (ax by - ay bx) + (bx cy - by cx) + (cx ay - cy ax), each product exact
     expansion = np.zeros(12)
-    size = np.int64(0)  # not a literal, for which kernels would be compiled a second time
+    size = 0
     size = _add_product(expansion, size, ax, by)
     size = _add_product(expansion, size, -ay, bx)
     size = _add_product(expansion, size, bx, cy)

@@ -149,25 +149,17 @@ def _open_ring(ring: FloatArray) -> FloatArray:
     return xy[:-1] if len(xy) > 1 and (xy[0] == xy[-1]).all() else xy
 
 
-@kernel
 def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntArray, IntArray]:
-    cells = shape[0] * shape[1]
-    ptr = np.zeros(cells + 1, np.int64)
-    for poly in range(len(first)):
-        for ix in range(first[poly, 0], last[poly, 0] + 1):
-            for iy in range(first[poly, 1], last[poly, 1] + 1):
-                ptr[ix * shape[1] + iy + 1] += 1
-    for cell in range(cells):
-        ptr[cell + 1] += ptr[cell]
-    items = np.empty(ptr[-1], np.int64)
-    fill = ptr[:-1].copy()
-    for poly in range(len(first)):
-        for ix in range(first[poly, 0], last[poly, 0] + 1):
-            for iy in range(first[poly, 1], last[poly, 1] + 1):
-                cell = ix * shape[1] + iy
-                items[fill[cell]] = poly
-                fill[cell] += 1
-    return ptr, items
+    """The polygons of every cell, ascending, from the cells (P, 2) that each begins and ends in."""
+    wide, high = (last - first + 1).T
+    counts = wide * high
+    polygon = np.repeat(np.arange(len(counts)), counts)
+    entry = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
+    column, row = np.divmod(entry, high[polygon])
+    cell = (first[polygon, 0] + column) * shape[1] + first[polygon, 1] + row
+    ptr = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    np.cumsum(np.bincount(cell, minlength=len(ptr) - 1), out=ptr[1:])
+    return ptr, polygon[np.argsort(cell, kind="stable")]
 
 
 @lean_kernel

@@ -35,7 +35,7 @@ def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatA
     Returns:
         How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
     """
-    count = np.int64(0)  # not a literal, see `_simplify`
+    count = 0
     for side in range(2):
         _simplify(line, distance * _SIMPLIFY, side == 0, keep)
         count = _offset_side(line, distance, side == 0, keep, out, count)
@@ -48,7 +48,6 @@ def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatA
 def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -> None:
     """Mark the vertices that stay when shallow turns to one side are left out."""
     concave, size = 1 if left else -1, len(line)
-    ahead = np.int64(1)  # not a literal, for which kernels would be compiled a second time
     for vertex in range(size):
         keep[vertex] = (
             vertex == 0
@@ -58,9 +57,9 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
     changed = True
     while changed:
         changed = False
-        index = _walk(keep, size, np.int64(0), ahead)
-        middle = _walk(keep, size, index, ahead)
-        last = _walk(keep, size, middle, ahead)
+        index = _walk(keep, size, 0, 1)
+        middle = _walk(keep, size, index, 1)
+        last = _walk(keep, size, middle, 1)
         while last < size:
             if _is_shallow(line, index, middle, last, tolerance, concave):
                 keep[middle] = False
@@ -68,8 +67,8 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
                 index = last
             else:
                 index = middle
-            middle = _walk(keep, size, index, ahead)
-            last = _walk(keep, size, middle, ahead)
+            middle = _walk(keep, size, index, 1)
+            last = _walk(keep, size, middle, 1)
 
 
 @lean_kernel
