@@ -6,13 +6,13 @@ shorter than the window lie on one fit altogether.
 """
 
 from functools import lru_cache
-from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import DataError
+from shiftsim.geometry.fits import fit_weights
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -211,7 +211,7 @@ def _filters_of(count: int) -> Filters:
         (_YAW_WINDOW, 3, 2),
     )
     smooth, *others = (
-        _with_interior(_fit_matrix(min(window, count), degree, order))
+        _with_interior(fit_weights(min(window, count), degree, order))
         for window, degree, order in windows
     )
     if count >= _SMOOTH_WINDOW:
@@ -227,18 +227,6 @@ def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
     out = np.empty(len(values))
     filter_signal(values, how, scale, out)
     return out
-
-
-def _fit_matrix(window: int, degree: int, order: int) -> FloatArray:
-    """(window, window) that maps samples at unit spacing to derivatives of their fit there."""
-    at = np.arange(window) - 0.5 * (window - 1)
-    powers = at[:, None] ** np.arange(degree + 1)
-    fit = np.linalg.solve(powers.T @ powers, powers.T)  # samples -> coefficients
-    derived = np.zeros_like(powers)
-    for power in range(order, degree + 1):
-        scale = factorial(power) / factorial(power - order)
-        derived[:, power] = scale * at ** (power - order)
-    return np.ascontiguousarray(derived @ fit)
 
 
 @lean_kernel

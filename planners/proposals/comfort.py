@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, part_kernel
+from shiftsim.geometry.fits import fit_weights
 from shiftsim.planners.proposals.tracker import DT, SCORED
 from shiftsim.world.state import AX, AY, HEADING
 
@@ -56,17 +57,20 @@ class Filters(NamedTuple):
 @functools.cache
 def make_filters() -> Filters:
     """The filters; never changed."""
-    from scipy.signal import savgol_filter
-
     # nuPlan rule 183: one parabola over the whole horizon, and 5 samples for the yaw signals,
     # because the length of the window is not passed on
     long = SCORED + 1
     windows = ((long, 2, 0), (8, 2, 0), (long, 2, 1), (5, 2, 1), (5, 3, 2))
     matrices = np.zeros((len(windows), ROWS, COLUMNS))
-    for matrix, (window, order, derivative) in zip(matrices, windows, strict=True):
-        matrix[:long, :long] = savgol_filter(
-            np.eye(long), window, order, deriv=derivative, delta=DT, axis=-1
-        )
+    for matrix, (window, degree, order) in zip(matrices, windows, strict=True):
+        # inside the signal in the middle of a window, at its edges in the first or last window
+        inside = fit_weights(window, degree, order, np.zeros(1))[0] / DT**order
+        edges = fit_weights(window, degree, order) / DT**order
+        for sample in range(long):
+            first = min(max(sample - (window - 1) // 2, 0), long - window)
+            is_edge = sample < window // 2 or sample >= long - window // 2
+            row = edges[sample - first] if is_edge else inside
+            matrix[first : first + window, sample] = row
     blocks = matrices.reshape(len(windows), -1, BLOCK, COLUMNS)
     starts = np.minimum((blocks != 0.0).any(axis=2).argmax(axis=2), COLUMNS - BAND)
     columns = starts[:, :, None, None] + np.arange(BAND)
