@@ -140,16 +140,6 @@ class Source:
             agree &= self.report.compare(label, where, *sides, atol=bound, angle=angle)
         return agree
 
-    def match_rows(
-        self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
-    ) -> None:
-        """`match`, where every row is a case of its own; a `DataError` if ours are not as many."""
-        counts = {len(value) for value in (*ours.values(), *(self[n] for n in ours if n in self))}
-        if len(counts) != 1:
-            raise DataError(f"{self.name}: {', '.join(ours)}: rows are {sorted(counts)}")
-        for row in range(counts.pop()):
-            self.at(row).match(f"{where} {row}", {n: v[row] for n, v in ours.items()}, atol)
-
     def note(self, what: str, *names: str) -> None:
         """Name values that need not be compared."""
         self.used.update(self.prefix + name for name in names)

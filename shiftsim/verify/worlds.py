@@ -1,6 +1,6 @@
 """What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +14,8 @@ from shiftsim.verify.files import Source
 from shiftsim.world import state
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks, TrafficLights
+from shiftsim.world.scenario import Scenario, scenario_of_rows
+from shiftsim.world.state import AgentKind, Tracks, tracks_of_boxes
 
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
@@ -57,28 +57,26 @@ def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str,
     }
 
 
-def make_tracks(
-    shape: tuple[int, int],
-    where: Any,
-    values: FloatArray,
-    kinds: Sequence[str],
-    tokens: Sequence[str],
-) -> Tracks:
-    """Dense tracks of a shape (rows, tracks), with names of their types and their tokens.
+def tracks_of(rows: Source, count: int) -> Tracks:
+    """Dense tracks over `count` iterations from rows of `objects.parquet`."""
+    names, iteration = rows["track_token"].tolist(), rows["iteration"].astype(np.int64)
+    kinds = dict(zip(names, rows["type"].tolist(), strict=True))
+    column = {token: index for index, token in enumerate(kinds)}
+    track = [column[token] for token in names]
+    if not ((iteration >= 0) & (iteration < count)).all():
+        raise DataError(f"objects at iterations which the ego does not have, of {count}")
+    if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
+        raise DataError("an object occurs twice at one iteration")
+    if [kinds[token] for token in names] != rows["type"].tolist():
+        raise DataError("an object changes its type")
+    boxes = np.full((count, len(kinds), len(BOX_COLUMNS)), np.nan)
+    boxes[iteration, track] = np.column_stack([rows[n].astype(np.float64) for n in BOX_COLUMNS])
+    return tracks_of_boxes(boxes, [AgentKind[kind] for kind in kinds.values()], list(kinds))
 
-    `values` (..., 7) are x, y, heading, vx, vy, length, width at the rows and tracks `where` (`...`
-    where they are dense); NaN where a track is absent.
-    """
-    dense = np.full((*shape, 7), np.nan)
-    dense[where] = values
-    return Tracks(
-        valid=~np.isnan(dense[..., 0]),
-        poses=np.ascontiguousarray(dense[..., :3]),
-        velocities=np.ascontiguousarray(dense[..., 3:5]),
-        sizes=np.ascontiguousarray(dense[..., 5:]),
-        kinds=np.array([AgentKind[name.upper()] for name in kinds], np.int64),
-        tokens=tuple(tokens),
-    )
+
+def kind_of(thing: Source) -> AgentKind:
+    """Type of an object that is listed."""
+    return AgentKind[thing["type"].upper()]
 
 
 def read_map(world: Source, *fields: str) -> VectorMap:
@@ -119,35 +117,13 @@ def _areas(rings: Iterable[tuple[object, Any]]) -> list[AreaSpec]:
     return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings]
 
 
-def make_scenario(
-    token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
-) -> Scenario:
-    """A scenario whose iterations are all rows, without lights, route and goal."""
-    return Scenario(
-        token=token,
-        scenario_type="unknown",
-        log_name="world",
-        city=road.name,
-        map=road,
-        time_us=time_us,
-        ego=ego,
-        tracks=tracks,
-        traffic_lights=TrafficLights.empty(len(time_us)),
-        iteration_rows=np.arange(len(time_us)),
-        row_step=1,
-        route=(),
-        mission_goal=None,
-        mapping=(10.0, 0.0, 1.0),
-    )
-
-
 def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
     """The scenario of a world from its map and its ego states (T, 11).
 
     The world also holds `time_us` and `objects`, which list x, y, heading, vx, vy per frame.
     """
     time_us = np.array(world["time_us"], np.int64)
-    objects = sorted(world.each("objects"), key=lambda thing: AgentKind[thing["type"].upper()])
+    objects = sorted(world.each("objects"), key=kind_of)
     counts = {len(ego), *(len(thing["frames"]) for thing in objects)}
     if counts != {len(time_us)}:
         raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
@@ -156,9 +132,9 @@ def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
         for row, frame in enumerate(thing["frames"]):
             if frame is not None:
                 values[row, column] = [*frame, thing["length"], thing["width"]]
-    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
-    tracks = make_tracks(values.shape[:2], ..., values, kinds, tokens)
-    return make_scenario(f"world {world.values.get('world')}", road, time_us, ego, tracks)
+    kinds, tokens = [kind_of(thing) for thing in objects], [thing["token"] for thing in objects]
+    tracks = tracks_of_boxes(values, kinds, tokens)
+    return scenario_of_rows(f"world {world.values.get('world')}", road, time_us, ego, tracks)
 
 
 def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:

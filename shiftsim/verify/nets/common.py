@@ -1,8 +1,9 @@
-"""What is compared of every learned planner: the manifest of its network, its closed loops.
+"""The nets folder: the learned planners with deterministic weights against the official code.
 
-Weights are deterministic: anybody can make them again from the names of the tensors. In a closed
-loop a rollout of ours is moved by what is recorded; the planner sees it, and what it says is
-compared.
+Here is what is compared of all: the manifest of a network, closed loops, routes as the planners
+correct them. Weights are deterministic: anybody can make them again from the names of the tensors.
+In a closed loop a rollout of ours is moved by what is recorded; the planner sees it, and what it
+says is compared.
 """
 
 import hashlib
@@ -10,24 +11,40 @@ import json
 import re
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
+from importlib.util import find_spec
+from inspect import signature
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.checkpoint import load_network
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
+from shiftsim.planners.routes import correction
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import past_rows
-from shiftsim.verify.files import Source
+from shiftsim.verify.files import Source, read_arrays, read_fields, verify_files
+from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import Table, read_tables
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 
 TABLES = read_tables(__file__)
+PARTS = {  # sub-folder → module with `FILES`: what compares a file, by glob pattern
+    "carl": "carl",
+    "diffusion_planner": "diffusion",
+    "plantf": "plantf",
+    "pluto": "pluto",
+    "route_correction": "common",
+}
+SQUARE = 1.0  # m, half width
 STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
 
 # As in state.STATE_COLUMNS, in the words of the files.
@@ -35,6 +52,51 @@ FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_accelerat
 PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
 # how one official planner fails where it has no reference line; ours falls back there
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
+
+
+def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> None:
+    """Compare every file of a folder with sub-folders named as the parts, or of one of these.
+
+    `scenes` holds the logs and maps, by default `nuplan` beside `nets`.
+    """
+    home, part = folder.resolve().parent, _part_of(folder)
+    known = Scenes(scenes or (home.parent if part in PARTS else home) / "nuplan")
+    if part in PARTS:
+        verify_part(part, folder, report, known)
+    else:
+        parts = {name: partial(verify_part, name, report=report, scenes=known) for name in PARTS}
+        verify_files(folder, report, parts)
+
+
+def _part_of(folder: Path) -> str:
+    """Which part a folder is by itself; empty where it holds the parts."""
+    if any(folder.glob("route_correction_*.json")):
+        return "route_correction"
+    manifest = folder / "state_dict.json"
+    return str(read_fields(manifest, Report())["planner"]) if manifest.is_file() else ""
+
+
+def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
+    """Compare every file of a sub-folder, whose name as in `PARTS` is `part`."""
+    is_network = part != "route_correction"
+    if is_network and find_spec("torch") is None:
+        report.skip(f"{part}: torch is not installed")
+        return
+    files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
+    parts = {pattern: partial(_verify, files[pattern], report, scenes) for pattern in files}
+    with import_module("torch").no_grad() if is_network else nullcontext():
+        verify_files(folder, report, parts)
+
+
+def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:
+    """Compare one file, with its scenes if it asks for them and has one that is at hand."""
+    file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
+    scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
+    if scene is not None and scene not in scenes:
+        report.skip(f"{path.name}: scene {scene}, which is not at hand")
+        return
+    compare(file, *([scenes] if "scenes" in signature(compare).parameters else []))
+    file.finish()
 
 
 @cache
@@ -199,3 +261,31 @@ def _compare_scene(loop: Loop, scenes: Scenes, count: int) -> None:
 
 
 _planner = cache(lambda make, weights: make(weights))  # its network serves all files
+
+
+def verify_corrections(file: Source, scenes: Scenes) -> None:
+    """Correct every route of a file as the learned planners do."""
+    scenario = scenes[str(file["scene"])]
+    TABLES["corrected_scene"].match(file, file.name, scenario=scenario)
+    for number, case in enumerate(file.each("cases")):
+        at = f"{file.name} {number} ({case['case']})"
+        with file.report.attempt("corrected route", at):
+            _compare_correction(case, at, scenario)
+
+
+def _compare_correction(case: Source, where: str, scenario: Scenario) -> None:
+    road, rear_axle = scenario.map, np.array(case["rear_axle"], np.float64).reshape(3)
+    if case["case"] == "as_logged":
+        TABLES["logged"].match(case, where, scenario=scenario)
+    blocks = correction.known_blocks(road, case["route"], "of the file", "route correction")
+    size = np.array([state.PACIFICA.length, state.PACIFICA.width])
+    footprint = boxes_to_corners(state.center_poses(rear_axle), size)
+    start = correction.find_start(road, blocks, rear_axle, footprint)
+    ours = {
+        "square": correction.RouteCorrector(road, blocks, SQUARE).at(rear_axle),
+        "footprint": correction.correct_route(road, blocks, start),
+    }
+    TABLES["corrections"].match(case, where, road=road, **ours)
+
+
+FILES = {"route_correction_*.json": verify_corrections}

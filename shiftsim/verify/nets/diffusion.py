@@ -19,8 +19,8 @@ from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common
 from shiftsim.verify.nets.common import Loop, make_network, match_meta
-from shiftsim.verify.nuplan.metrics import tracks_of
 from shiftsim.verify.tables import read_tables
+from shiftsim.verify.worlds import tracks_of
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
 

@@ -22,11 +22,13 @@ from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, POSE, light_columns
-from shiftsim.verify.nuplan.metrics import CATEGORIES, RECORDED, UNITS, tracks_of
 from shiftsim.verify.nuplan.runs import (
+    CATEGORIES,
     CHALLENGES,
     EGO_TOLERANCES,
     OBJECT_TOLERANCES,
+    RECORDED,
+    UNITS,
     Seen,
     observed_columns,
     plan_again,
@@ -39,7 +41,7 @@ from shiftsim.verify.nuplan.simulation_log import (
 )
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, recorded_log
+from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, recorded_log, tracks_of
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
 
