@@ -18,12 +18,11 @@ from importlib import import_module
 from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.planners.learned.checkpoint import load_network
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.routes import correction
@@ -36,6 +35,7 @@ from shiftsim.verify.tables import Table, read_tables
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 
+Tables: TypeAlias = Mapping[str, Table]  # by section
 TABLES = read_tables(__file__)
 PARTS = {  # sub-folder → module with `FILES`: what compares a file, by glob pattern
     "carl": "carl",
@@ -100,9 +100,9 @@ def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:
 
 
 @cache
-def make_network(planner: str, variant: str) -> Any:
-    """The network of a planner with a variant of the deterministic weights, ready to be called."""
-    return load_network(f"deterministic:{variant}", planner)
+def make_planner(make: Callable[[str], Any], variant: str) -> Any:
+    """A planner with a variant of the deterministic weights; its network serves all files."""
+    return make(f"deterministic:{variant}")
 
 
 def match_meta(file: Source, planner: str, **ours: object) -> None:
@@ -117,9 +117,7 @@ def match_case(file: Source, planner: str) -> list[str]:
     return variants
 
 
-def verify_manifest(
-    planner: str, tables: Mapping[str, Table], file: Source, /, **names: Any
-) -> None:
+def verify_manifest(planner: str, tables: Tables, file: Source, /, **names: Any) -> None:
     """Compare `state_dict.json`: names, shapes, types, rules and weights, and the other fields.
 
     Section `manifest` of the tables has these, among `names`; `weights` has by field which weights
@@ -133,18 +131,11 @@ def verify_manifest(
     listed = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
     report.compare(f"{planner} state names", file.name, sorted(built), sorted(listed))
     for name, entry in zip(listed, entries, strict=True):
-        if name not in built:
-            continue
-        ours = {
-            "shape": list(built[name].shape),
-            "dtype": str(built[name].dtype),
-            "kind": "parameter" if name in trained else "buffer",
-            "ckpt_key": module.PREFIXES[0] + name,
-            "rule": rules.get(name) or rule_of(name, built[name].ndim),
-            "value": built[name].tolist(),
-        }
-        ours = {field: value for field, value in ours.items() if field in entry}
-        entry.match(name, ours, quantity=f"{planner} state")
+        if name in built:
+            tensor, kind = built[name], "parameter" if name in trained else "buffer"
+            known = {"tensor": tensor, "kind": kind, "name": name, "network": module}
+            known["rule"] = rules.get(name) or rule_of(name, tensor.ndim)
+            TABLES["tensor"].match(entry, name, f"{planner} state", **known)
     (check,) = file.each("selfcheck")
     if "first3_raw_z" in check:
         where, shape = check["name"], built[check["name"]].shape
@@ -173,13 +164,13 @@ class Loop:
     """One closed-loop file, and its iteration that is compared just now."""
 
     def __init__(
-        self, file: Source, planner: Any, tables: Mapping[str, Table], scenario: Scenario
+        self, file: Source, make: Callable[[str], Any], tables: Tables, scenario: Scenario
     ) -> None:
         self.file, self.tables, self.where = file, {**TABLES, **tables}, file.name
         self.scenario, self.road, self.tracks = scenario, scenario.map, scenario.tracks
-        self.planner, self.name = planner, planner.name  # the planner after this iteration
         self.variant = str(file["meta/variant"])  # of its weights
-        self.rollout = Rollout(scenario, planner)
+        self.planner = make_planner(make, self.variant)  # after this iteration
+        self.name, self.rollout = self.planner.name, Rollout(scenario, self.planner)
 
     def step(self, number: int) -> None:
         """Look at an iteration, which must be that of the rollout, and make its plan again."""
@@ -214,7 +205,7 @@ class Loop:
 
 def verify_loop(
     make: Callable[[str], Any],
-    tables: Mapping[str, Table],
+    tables: Tables,
     compare: Callable[[Loop], None],
     file: Source,
     scenes: Scenes,
@@ -224,8 +215,7 @@ def verify_loop(
     `make` makes the planner from the name of its weights; the arrays of section `iteration` have a
     row for every plan.
     """
-    planner = _planner(make, f"deterministic:{file['meta/variant']}")
-    loop = Loop(file, planner, tables, scenes[str(file["meta/scene"])])
+    loop = Loop(file, make, tables, scenes[str(file["meta/scene"])])
     egos, plans = file["ego/current"], file.below("out/")
     counts = [len(plans[name.partition("[")[0]]) for name in tables["iteration"].rows]
     loop.compare("plans", counts, counts[:1] * len(counts))
@@ -258,9 +248,6 @@ def _compare_scene(loop: Loop, scenes: Scenes, count: int) -> None:
     loop.match("scene", meta, "scene", **names)
     loop.match("sources", meta, "scene", **names)
     loop.match("ego", loop.file.below("ego/"), **names)
-
-
-_planner = cache(lambda make, weights: make(weights))  # its network serves all files
 
 
 def verify_corrections(file: Source, scenes: Scenes) -> None:
