@@ -13,8 +13,8 @@ import pyproj
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.recording import Converted, convert_recording
-from shiftsim.data.deepplan.states import sample_runs
-from shiftsim.data.deepplan.windows import EGO, ConversionConfig, find_runs, judge_windows
+from shiftsim.data.deepplan.states import rows_between, sample_runs
+from shiftsim.data.deepplan.windows import EGO, ROW_S, ConversionConfig, find_runs, judge_windows
 from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site, read_recording
 from shiftsim.data.opendrive.lanes import LaneKey
 from shiftsim.data.opendrive.map import Origin, build_road_map
@@ -27,7 +27,6 @@ from shiftsim.verify.tables import read_tables
 from shiftsim.world.state import center_poses
 
 _POSITION = 2e-2  # m: README of the scripted recordings
-_STEP_S, _ROUNDING = 0.05, 1e-9  # s, steps
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
 Ways = dict[tuple[str, ...], list[list[Any]]]  # lanes that egos pass, by window and track
 FACTS = read_tables(__file__)
@@ -107,12 +106,11 @@ def _compare_samples(file: Source, recording: Annotations) -> None:
     """The bottoms of all boxes at 20 Hz, by track and time."""
     recording = replace(recording, centers=recording.bottom)
     runs = find_runs(recording, ConversionConfig().max_hole_s)
-    first = np.ceil(recording.time[runs.first] / _STEP_S - _ROUNDING)
-    last = np.floor(recording.time[runs.last] / _STEP_S + _ROUNDING)
-    steps = [np.arange(*span) for span in zip(first, last + 1, strict=True)]
-    run, step = np.repeat(np.arange(len(steps)), [*map(len, steps)]), np.concatenate(steps)
-    ids, time = recording.track_ids[runs.track[run]], step * _STEP_S
-    ours = {"ids": ids, "steps": step.astype(np.int64), "time": time}
+    first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
+    run = np.repeat(np.arange(len(first)), last - first + 1)
+    step = np.concatenate([*map(np.arange, first, last + 1)])
+    time = step * ROW_S
+    ours = {"ids": recording.track_ids[runs.track[run]], "steps": step, "time": time}
     samples = sample_runs(recording, runs, run, time)
     FACTS["samples"].match(file, "recording", samples=samples, **ours)
 
@@ -135,7 +133,7 @@ def _compare_summary(
         "to_velocity": np.abs(wrap_angles(yaw - moving)).max(),
         "to_rotation": np.abs(yaw - raw["rotation_z"][order]).max(),
         "alone": [key for key in keys if len(key) == 1],
-        "steps": int(np.floor(recording.duration / _STEP_S + _ROUNDING)) + 1,
+        "steps": int(recording.duration / ROW_S + 1e-9) + 1,
     }
     FACTS["summary"].match(expected, "recording", **facts)
     for number, where, track in _tracks(expected, recording):
