@@ -27,7 +27,7 @@ from shiftsim.files import PACKAGE, fresh_python
 from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import default_workers
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.metric_worlds import read_world
+from shiftsim.verify.worlds import read_world
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, scenario_of_rows
 from shiftsim.world.state import PACIFICA, AgentKind, tracks_of_boxes

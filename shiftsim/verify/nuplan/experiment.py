@@ -20,7 +20,6 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
-from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, POSE, light_columns
 from shiftsim.verify.nuplan.runs import (
     CATEGORIES,
@@ -41,7 +40,14 @@ from shiftsim.verify.nuplan.simulation_log import (
 )
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, recorded_log, tracks_of
+from shiftsim.verify.worlds import (
+    EGO_COLUMNS,
+    SCORE_TOLERANCES,
+    ego_columns,
+    ego_states,
+    recorded_log,
+    tracks_of,
+)
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
 

@@ -18,14 +18,22 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
-from shiftsim.verify import worlds
 from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Source, open_tables
-from shiftsim.verify.metric_worlds import SCORE_TOLERANCES, found_along, known_scores
 from shiftsim.verify.nuplan.logs import verify_nuplan_import
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, tracks_of
+from shiftsim.verify.worlds import (
+    EGO_COLUMNS,
+    SCORE_TOLERANCES,
+    ego_columns,
+    ego_states,
+    found_along,
+    known_scores,
+    object_columns,
+    recorded_log,
+    tracks_of,
+)
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, scenario_of_rows
 from shiftsim.world.state import AgentKind, Tracks, Trajectory
@@ -103,7 +111,7 @@ def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> 
     ego, logged = (ego_states({n: part[n] for n in EGO_COLUMNS}) for part in (rows, expert))
     times, tracks = expert["time_us"].astype(np.int64), tracks_of(objects, len(ego))
     scenario = scenario_of_rows("recorded", road, times, logged, tracks)
-    return replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
+    return replace(recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
 
 
 def _compare_profile(
@@ -185,7 +193,7 @@ def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
     listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
     orders = [listed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
-    return worlds.object_columns(tracks, iteration, np.concatenate(orders))
+    return object_columns(tracks, iteration, np.concatenate(orders))
 
 
 def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
