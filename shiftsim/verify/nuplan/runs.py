@@ -18,22 +18,13 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
+from shiftsim.verify import worlds
 from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Source, open_tables
 from shiftsim.verify.nuplan.logs import verify_nuplan_import
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import (
-    EGO_COLUMNS,
-    SCORE_TOLERANCES,
-    ego_columns,
-    ego_states,
-    found_along,
-    known_scores,
-    object_columns,
-    recorded_log,
-    tracks_of,
-)
+from shiftsim.verify.worlds import EGO_COLUMNS, SCORE_TOLERANCES, ego_columns, ego_states
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, scenario_of_rows
 from shiftsim.world.state import AgentKind, Tracks, Trajectory
@@ -92,7 +83,7 @@ def verify_nuplan_metrics(
             columns |= {name: ego_columns(log.ego)[name] for name in RECORDED}
             tables["ego"].match(run, columns, RECORDED, quantity="recorded")
             measured = measure(log, road)
-            contacts, names = measured.collisions, found_along(measured, road)
+            contacts, names = measured.collisions, worlds.found_along(measured, road)
             names["samples"] = np.arange(len(measured.time_us))
             names["kinds"] = [AgentKind(one.kind).name for one in contacts]
             names["is_time"] = [one.time_us in measured.at_fault_times for one in contacts]
@@ -109,9 +100,9 @@ def verify_nuplan_metrics(
 
 def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> SimulationLog:
     ego, logged = (ego_states({n: part[n] for n in EGO_COLUMNS}) for part in (rows, expert))
-    times, tracks = expert["time_us"].astype(np.int64), tracks_of(objects, len(ego))
+    times, tracks = expert["time_us"].astype(np.int64), worlds.tracks_of(objects, len(ego))
     scenario = scenario_of_rows("recorded", road, times, logged, tracks)
-    return replace(recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
+    return replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
 
 
 def _compare_profile(
@@ -175,7 +166,7 @@ def verify_simulation(
                 objects.match(key, shown, quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                rated = known_scores(judge(measured, profile))
+                rated = worlds.known_scores(judge(measured, profile))
                 columns = {name: [score] for name, score in rated.items()}
                 scores.match((*key, thresholds), columns, quantity="simulated score")
     if mode in (None, "R"):
@@ -193,7 +184,7 @@ def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
     listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
     orders = [listed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
-    return object_columns(tracks, iteration, np.concatenate(orders))
+    return worlds.object_columns(tracks, iteration, np.concatenate(orders))
 
 
 def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
@@ -244,7 +235,7 @@ class Seen:
     def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
         self.scenario = scenario
         self.ego = ego_states({name: ego[name] for name in EGO_COLUMNS})
-        self._tracks = tracks_of(objects, len(self.ego)) if challenge == "R" else None
+        self._tracks = worlds.tracks_of(objects, len(self.ego)) if challenge == "R" else None
 
     def at(self, iteration: int) -> Observation:
         """The present alone; the rule-based planners look at nothing else."""
