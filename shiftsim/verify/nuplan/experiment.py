@@ -199,7 +199,7 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
                 raise DataError(f"{file}: column {name!r} is missing", OTHER_VERSION)
         if has_means:
             table = _compare_means(table)
-        found[file.stem] = Groups(table, report, (token, "planner_name"))
+        found[file.stem] = Groups(table, (token, "planner_name"))
     return found
 
 

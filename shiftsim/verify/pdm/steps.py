@@ -20,7 +20,7 @@ from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
 from shiftsim.sim.planner import scene_info
-from shiftsim.verify.files import Groups, Source, read_arrays, read_fields, read_json
+from shiftsim.verify.files import Source, open_tables, read_arrays, read_fields, read_json
 from shiftsim.verify.nuplan import runs
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
@@ -156,11 +156,8 @@ def verify_calls(
     folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
 ) -> None:
     """Make every planning call of closed loops (of one mode) again from the recorded ego state."""
-    egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
-    steps, proposals = (
-        Groups(folder / f"{name}.parquet", report, ("scene", "challenge"))
-        for name in ("steps", "proposals")
-    )
+    tables = open_tables(folder, report, "ego", "objects", "steps", "proposals")
+    egos, objects, steps, proposals = tables.values()
     static = read_fields(folder / "static.json", report, "static.json")
     for key in egos:
         call, where = key[:2], " ".join(key[:2])
