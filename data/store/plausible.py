@@ -24,6 +24,8 @@ _EGO_LIMITS, BOX_LIMITS = (
     np.array([STORE[name][:2] for name in names]) for names in (EGO_COLUMNS, _BOX)
 )
 
+_SCENE_LIMITS = np.array([*_EGO_LIMITS, STORE["time_us"][:2], STORE["light_status"][:2]])
+
 
 def require_rows(window: Window, where: str) -> None:
     """Refuse a window whose iterations are not increasing rows of it."""
@@ -53,12 +55,35 @@ def require_plausible(scene: Scenario, ego: str, folder: Path, *, boxes: bool = 
 
     Without `boxes`, those of the tracks are known to be good.
     """
-    _require_frames(scene.time_us, scene.traffic_lights, folder)
     if boxes:
         require_boxes(scene.tracks, len(scene.time_us), folder / TRACKS_FILE)
+    lights = scene.traffic_lights.status
+    if _is_plausible(scene.time_us, scene.iteration_rows, lights, scene.ego, _SCENE_LIMITS):
+        return
+    _require_frames(scene.time_us, scene.traffic_lights, folder)
     if (np.diff(scene.iteration_times) <= 0).any():
         raise DataError(f"{folder / FRAMES}: column 'time_us' does not increase", REPAIR)
     require_states(scene.ego, ego_file(folder, ego))
+
+
+@kernel
+def _is_plausible(
+    time_us: IntArray, rows: IntArray, lights: BoolArray, ego: FloatArray, limits: FloatArray
+) -> bool:
+    """Whether times, iterations, lights and ego states are in order and within `limits` (13, 2)."""
+    good = limits[11, 0] <= time_us[0] and time_us[-1] <= limits[11, 1]
+    for row in range(1, len(time_us)):
+        good &= time_us[row - 1] <= time_us[row]
+    for step in range(1, len(rows)):
+        good &= time_us[rows[step - 1]] < time_us[rows[step]]
+    for row in range(lights.shape[0]):
+        for light in range(lights.shape[1]):
+            good &= (lights[row, light] >= limits[12, 0]) & (lights[row, light] <= limits[12, 1])
+    for row in range(len(ego)):
+        for column in range(11):
+            value = ego[row, column]
+            good &= (value >= limits[column, 0]) & (value <= limits[column, 1])
+    return good
 
 
 def require_states(states: FloatArray, file: Path) -> None:
@@ -114,20 +139,6 @@ def require_boxes(tracks: Tracks, num_rows: int, boxes: Path) -> None:
 def _plain(array: Any, kind: Any) -> Any:
     """As the kernel takes it."""
     return read_only(np.ascontiguousarray(array, kind))
-
-
-@kernel
-def all_inside(columns: tuple[FloatArray, ...], limits: FloatArray) -> bool:
-    """Whether all boxes are within `limits` (7, 2), given as their columns, each (A,)."""
-    good = 0
-    for column in range(len(columns)):
-        values, low, high = columns[column], limits[column, 0], limits[column, 1]
-        may_be_nan = 3 <= column < 5  # velocities of static objects
-        for box in range(len(values)):
-            value = values[box]
-            inside = (value >= low) & (value <= high)
-            good += inside | (may_be_nan & (value != value))
-    return good == len(columns) * len(columns[0])
 
 
 @kernel

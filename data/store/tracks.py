@@ -14,7 +14,6 @@ from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
 from shiftsim.data.store.plausible import (
     BOX_LIMITS,
-    all_inside,
     require_boxes,
     require_recording,
     require_states,
@@ -151,23 +150,24 @@ class StoredRecording:
         if blocks[-1] >= self.tracks.num_blocks:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
         row, track, *boxes = _views(self.tracks.read(list(blocks)))
-        if len(row) and not 0 <= track.min() <= track.max() < len(self.tokens):
+        runs = _runs(row, track, first, last)
+        seen = np.unique(runs[:, 0])
+        if len(seen) and not 0 <= seen[0] <= seen[-1] < len(self.tokens):
             raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
-        values = tuple(boxes)
-        place = _places(row, track, first, last, len(self.tokens))
-        seen = np.flatnonzero(place >= 0)
+        place = np.full(len(self.tokens), -1)
+        place[seen] = np.arange(len(seen))
         valid = np.zeros((last - first, len(seen)), np.bool_)
-        _mark(row, track, place, first, valid)
+        _mark(runs, row, place, first, valid)
         order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
         if len(order) < len(seen) or (order != np.arange(len(seen))).any():
             valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
             place[:] = -1
             place[seen] = np.arange(len(seen))
-        poses, velocities, sizes = _dense(valid.shape)
-        _scatter(row, track, place, first, values, valid, poses, velocities, sizes)
+        dense = _dense(valid)
+        inside = _scatter(runs, row, place, first, tuple(boxes), BOX_LIMITS, *dense)
         names = tuple(self.tokens[i] for i in seen.tolist())
-        tracks = Tracks(valid, poses, velocities, sizes, self.kinds[seen], names)
-        if plausible and not all_inside(values, BOX_LIMITS):
+        tracks = Tracks(valid, *dense, self.kinds[seen], names)
+        if plausible and not inside:
             require_boxes(tracks, last - first, self.tracks.path)
         return tracks
 
@@ -229,11 +229,8 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     start, stop = ego_span(table)
     if not start <= first < last <= stop:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
-    rows = _rows(table, first - start, last - start)
-    states = np.empty((last - first, NUM_STATE))
-    for index, values in enumerate(_views(rows)):
-        states[:, index] = values
-    return states
+    columns = _views(_rows(table, first - start, last - start))
+    return np.ascontiguousarray(np.array(columns).T)
 
 
 def whole_ego(table: Table) -> tuple[int, FloatArray]:
@@ -250,19 +247,18 @@ def _rows(table: Table, first: int, last: int) -> pa.Table:
     return rows.slice(first - low * schema.FRAME_BLOCK, last - first)
 
 
-def _dense(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), not filled.
+def _dense(valid: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), to be filled where valid (R, N), else NaN.
 
     They share one block: the allocator then keeps it for the next scenario instead of returning it
     to the system, which costs more than reading the file.
     """
-    num = shape[0] * shape[1]
-    block = np.empty(7 * num)
-    return (
-        block[: 3 * num].reshape(*shape, 3),
-        block[3 * num : 5 * num].reshape(*shape, 2),
-        block[5 * num :].reshape(*shape, 2),
-    )
+    block = np.empty(7 * valid.size)
+    if not valid.all():
+        block.fill(np.nan)
+    poses, velocities, sizes = np.split(block, (3 * valid.size, 5 * valid.size))
+    shape = valid.shape
+    return poses.reshape(*shape, 3), velocities.reshape(*shape, 2), sizes.reshape(*shape, 2)
 
 
 def _views(table: pa.Table) -> list[Any]:
@@ -283,54 +279,80 @@ def _nothing(kind: pa.DataType) -> Any:
 
 
 @kernel
-def _places(row: IntArray, track: IntArray, first: int, last: int, num: int) -> IntArray:
-    """(num,) position of each track among those that occur in the rows, -1 for the others."""
-    place = np.full(num, -1)
-    for box in range(len(row)):
-        if first <= row[box] < last:
-            place[track[box]] = 0
+def _runs(row: IntArray, track: IntArray, first: int, last: int) -> IntArray:
+    """(M, 3) track, first box and one past the last one of boxes of one track in order of time.
+
+    Only those in the rows first … last - 1 count.
+    """
     count = 0
-    for index in range(num):
-        if place[index] == 0:
-            place[index] = count
-            count += 1
-    return place
-
-
-@kernel
-def _mark(row: IntArray, track: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
-    """Note in `valid` (R, N), which is false, where there are boxes."""
     for box in range(len(row)):
-        at = row[box] - first
-        if 0 <= at < len(valid):
-            valid[at, place[track[box]]] = True
+        count += box == 0 or track[box] != track[box - 1] or row[box] <= row[box - 1]
+    runs = np.empty((count, 3), np.int64)
+    count, begin = 0, 0
+    for stop in range(1, len(row) + 1):
+        if stop < len(row) and track[stop] == track[stop - 1] and row[stop] > row[stop - 1]:
+            continue
+        end = stop
+        while begin < end and row[begin] < first:
+            begin += 1
+        while begin < end and row[end - 1] >= last:
+            end -= 1
+        if begin < end:
+            runs[count, 0], runs[count, 1], runs[count, 2] = track[begin], begin, end
+            count += 1
+        begin = stop
+    return runs[:count]
 
 
 @kernel
-def _scatter(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
+def _mark(runs: IntArray, row: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
+    """Note in `valid` (R, N), which is false, where there are boxes."""
+    for run in range(len(runs)):
+        to = place[runs[run, 0]]
+        for box in range(runs[run, 1], runs[run, 2]):
+            valid[row[box] - first, to] = True
+
+
+@kernel
+def _scatter(
+    runs: IntArray,
     row: IntArray,
-    track: IntArray,
     place: IntArray,
     first: int,
     values: tuple[FloatArray, ...],
-    valid: BoolArray,
+    limits: FloatArray,
     poses: FloatArray,
     velocities: FloatArray,
     sizes: FloatArray,
-):
-    """Spread boxes of the tracks that have a place over dense arrays; what is not valid is NaN."""
-    for box in range(len(row)):
-        at, to = row[box] - first, place[track[box]]
-        if at < 0 or at >= len(valid) or to < 0:
+) -> bool:
+    """Spread boxes of the tracks that have a place over dense arrays.
+
+    Returns whether all are within `limits` (7, 2).
+    """
+    x, y, heading, vx, vy, length, width = values
+    num = np.uint64(poses.shape[1])
+    flat, speeds, extent = poses.reshape(-1), velocities.reshape(-1), sizes.reshape(-1)
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)  # no index is negative
+    good = True
+    for run in range(len(runs)):
+        to = place[runs[run, 0]]
+        if to < 0:
             continue
-        for axis in range(3):
-            poses[at, to, axis] = values[axis][box]
-        for axis in range(2):
-            velocities[at, to, axis] = values[3 + axis][box]
-            sizes[at, to, axis] = values[5 + axis][box]
-    for at in range(valid.shape[0]):
-        for to in range(valid.shape[1]):
-            if not valid[at, to]:
-                poses[at, to] = np.nan
-                velocities[at, to] = np.nan
-                sizes[at, to] = np.nan
+        for box in range(np.uint64(runs[run, 1]), np.uint64(runs[run, 2])):
+            at = np.uint64(row[box] - first) * num + np.uint64(to)
+            flat[three * at] = x[box]
+            flat[three * at + one] = y[box]
+            flat[three * at + two] = heading[box]
+            speeds[two * at] = vx[box]
+            speeds[two * at + one] = vy[box]
+            extent[two * at] = length[box]
+            extent[two * at + one] = width[box]
+            good &= (x[box] >= limits[0, 0]) & (x[box] <= limits[0, 1])
+            good &= (y[box] >= limits[1, 0]) & (y[box] <= limits[1, 1])
+            good &= (heading[box] >= limits[2, 0]) & (heading[box] <= limits[2, 1])
+            # velocities of static objects are NaN
+            good &= not ((vx[box] < limits[3, 0]) | (vx[box] > limits[3, 1]))
+            good &= not ((vy[box] < limits[4, 0]) | (vy[box] > limits[4, 1]))
+            good &= (length[box] >= limits[5, 0]) & (length[box] <= limits[5, 1])
+            good &= (width[box] >= limits[6, 0]) & (width[box] <= limits[6, 1])
+    return good

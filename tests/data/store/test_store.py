@@ -29,7 +29,7 @@ from shiftsim.world.state import Tracks, TrafficLights
 GOLDEN = places.GOLDEN / "nuplan_format"
 LOG = GOLDEN / "logs" / "fixture_log_0001.db"
 TOKEN = "000000012a05f23c"
-VERSION_1 = places.GOLDEN / "store_version_1"
+VERSION_1, VERSION_2 = (places.GOLDEN / f"store_version_{number}" for number in (1, 2))
 
 
 @pytest.fixture(scope="module")
@@ -253,9 +253,10 @@ def test_windows_of_several_blocks_come_back_to_the_last_bit(
 
 
 @pytest.mark.golden
-def test_stores_of_version_1_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
+def test_stores_of_earlier_versions_are_read(folder: Path) -> None:
     expected = json.loads((VERSION_1 / "expected.json").read_text("utf-8"))
-    store = open_store(VERSION_1 / "store")
+    store = open_store(folder / "store")
     found: dict[str, object] = {}
     for scene in store:
         parts = {name: getattr(scene, name) for name in ("time_us", "ego")}
@@ -273,10 +274,11 @@ def test_stores_of_version_1_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.golden
-def test_a_store_of_version_1_is_added_to(
-    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
+def test_a_store_of_an_earlier_version_is_added_to(
+    folder: Path, tmp_path: Path, road: VectorMap, rng: np.random.Generator
 ) -> None:
-    path = Path(shutil.copytree(VERSION_1 / "store", tmp_path / "s"))
+    path = Path(shutil.copytree(folder / "store", tmp_path / "s"))
     before = open_store(path).read("a")
     recording = dataclasses.replace(make_recording(150, 3, rng), log_name="late")
     with StoreWriter(path) as writer:
