@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, read_only
 from shiftsim.data.recording import Window
-from shiftsim.data.store.schema import EGO_COLUMNS, SCENARIOS, TRACKS
+from shiftsim.data.store.schema import EGO_COLUMNS, MOTION, SCENARIOS
 from shiftsim.data.store.tables import FRAMES, REPAIR, ego_file
 from shiftsim.data.store.tables import TRACKS as TRACKS_FILE
 from shiftsim.errors import DataError
@@ -19,7 +19,7 @@ from shiftsim.world.ranges import MAP_EXTENT, STORE, require
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
-_BOX = TRACKS.names[2:]  # x, y, heading, velocity, size
+_BOX = (*MOTION, "length_m", "width_m")
 _EGO_LIMITS, BOX_LIMITS = (
     np.array([STORE[name][:2] for name in names]) for names in (EGO_COLUMNS, _BOX)
 )

@@ -149,7 +149,7 @@ def write_blocks(
 
 
 def _encodings(described: pa.Schema, repeating: Container[str]) -> dict[str, Any]:
-    """How columns are written: floats as their bytes in planes, integers as their differences.
+    """How columns are written: floats and codes as bytes in planes, integers as differences.
 
     Both compress much better than numbers as they are, and any reader undoes them.
     """
@@ -160,10 +160,10 @@ def _encodings(described: pa.Schema, repeating: Container[str]) -> dict[str, Any
         name = f"{field.name}.list.element" if is_list else field.name
         if field.name in repeating:
             dictionaries.append(name)
+        elif kind == pa.float64() or field.name.endswith(schema.CODED):
+            encodings[name] = "BYTE_STREAM_SPLIT"
         elif kind in (pa.int32(), pa.int64()):
             encodings[name] = "DELTA_BINARY_PACKED"
-        elif kind == pa.float64():
-            encodings[name] = "BYTE_STREAM_SPLIT"
     return {"use_dictionary": dictionaries, "column_encoding": encodings}
 
 

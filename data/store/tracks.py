@@ -9,9 +9,18 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
+from shiftsim.data.store.boxes import (
+    HIGHEST,
+    BoxBlock,
+    find_runs,
+    mark,
+    restored,
+    scatter,
+    second_differences,
+)
 from shiftsim.data.store.plausible import (
     BOX_LIMITS,
     require_boxes,
@@ -25,7 +34,6 @@ from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
 
 # which of some tracks are wanted, in order, from when they are there, their kinds and tokens
 _Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
-_MANY = 8  # rows for every value of a column that is written by a dictionary
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
@@ -64,31 +72,31 @@ def write_ego(folder: Path, ego: EgoTrace) -> None:
         DataError: A number is outside of its range.
     """
     require_states(ego.states, ego_file(folder, ego.name))
-    columns = [pa.array(np.ascontiguousarray(ego.states[:, i])) for i in range(NUM_STATE)]
-    table = pa.Table.from_arrays(columns, schema=schema.EGO)
     footer = {"name": ego.name, "first_row": ego.first_row}
-    few = len(table) // _MANY
-    repeating = [n for n, v in zip(table.column_names, columns, strict=True) if _count(v) <= few]
-    blocks = _split(table, schema.FRAME_BLOCK)
-    write_blocks(ego_file(folder, ego.name), blocks, footer, repeating, codec="lz4")
+    starts = range(0, max(len(ego.states), 1), schema.FRAME_BLOCK)
+    parts = [ego.states[start : start + schema.FRAME_BLOCK] for start in starts]
+    codes = [_codes(part.T.reshape(-1)) for part in parts]
+    blocks = [pa.Table.from_arrays([code], schema=schema.EGO) for code in codes]
+    write_blocks(ego_file(folder, ego.name), blocks, footer, codec="lz4")
+
+
+def _codes(values: FloatArray) -> pa.Array:
+    return pa.array(second_differences(values).view(np.int64))  # unsigned ones read more slowly
 
 
 def _split(table: pa.Table, rows: int) -> list[pa.Table]:
     return [table.slice(start, rows) for start in range(0, max(len(table), 1), rows)]
 
 
-def _count(values: pa.Array) -> int:
-    """How many values there are, each counted once."""
-    return len(np.unique(values.to_numpy().view(np.int64)))
-
-
 def _track_block(tracks: Tracks, rows: slice) -> pa.Table:
     """Boxes of some rows, track by track: neighbours in time compress well."""
     part = tracks.rows(rows)
     track, row = np.nonzero(part.valid.T)
-    columns = [pa.array((row + rows.start).astype(np.int32)), pa.array(track.astype(np.int32))]
-    for values in (part.poses, part.velocities, part.sizes):
-        columns += [pa.array(values[row, track, axis]) for axis in range(values.shape[2])]
+    motion = [part.poses[..., axis] for axis in range(3)]
+    motion += [part.velocities[..., axis] for axis in range(2)]
+    columns = [_codes(values[row, track]) for values in motion]
+    columns += [pa.array((row + rows.start).astype(np.int32)), pa.array(track.astype(np.int32))]
+    columns += [pa.array(part.sizes[row, track, axis]) for axis in range(2)]
     return pa.Table.from_arrays(columns, schema=schema.TRACKS)
 
 
@@ -149,27 +157,51 @@ class StoredRecording:
         blocks = range(first // self.block_rows, (last - 1) // self.block_rows + 1)
         if blocks[-1] >= self.tracks.num_blocks:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
-        row, track, *boxes = _views(self.tracks.read(list(blocks)))
-        runs = _runs(row, track, first, last)
-        seen = np.unique(runs[:, 0])
-        if len(seen) and not 0 <= seen[0] <= seen[-1] < len(self.tokens):
-            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        parts = [self._block(block) for block in blocks]
         place = np.full(len(self.tokens), -1)
+        runs = [find_runs(part.row, part.track, first, last, place) for part in parts]
+        if any(len(found) and found[-1, 0] < 0 for found in runs):
+            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        seen = np.flatnonzero(place >= 0)
         place[seen] = np.arange(len(seen))
         valid = np.zeros((last - first, len(seen)), np.bool_)
-        _mark(runs, row, place, first, valid)
+        for part, found in zip(parts, runs, strict=True):
+            mark(found, part.row, place, first, valid)
         order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
         if len(order) < len(seen) or (order != np.arange(len(seen))).any():
             valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
             place[:] = -1
             place[seen] = np.arange(len(seen))
         dense = _dense(valid)
-        inside = _scatter(runs, row, place, first, tuple(boxes), BOX_LIMITS, *dense)
+        inside = all([scatter(*part, place, first, HIGHEST, BOX_LIMITS, *dense) for part in parts])
         names = tuple(self.tokens[i] for i in seen.tolist())
         tracks = Tracks(valid, *dense, self.kinds[seen], names)
         if plausible and not inside:
             require_boxes(tracks, last - first, self.tracks.path)
         return tracks
+
+    def _block(self, block: int) -> BoxBlock:
+        found, is_plain = self.tracks.read([block]), _is_former(self.tracks)
+        names = schema.MOTION if is_plain else schema.TRACKS.names[: len(schema.MOTION)]
+        row, track, *sizes = (_view(found[n]) for n in ("row", "track", "length_m", "width_m"))
+        motion = tuple(_view(found[name]).view(np.uint64) for name in names)
+        return BoxBlock(row, track, motion, (sizes[0], sizes[1]), is_plain)
+
+    def boxes(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """All boxes as they are stored: rows (A,), tracks (A,) and `schema.MOTION` (A, 5).
+
+        Raises:
+            DataError: The file is damaged.
+        """
+        parts = [self._block(block) for block in range(self.tracks.num_blocks)]
+        motion = [
+            np.column_stack(
+                [c.view(np.float64) if part.is_plain else restored(c) for c in part.motion]
+            )
+            for part in parts
+        ]
+        row, track = (np.concatenate([part[i] for part in parts]).astype(np.int64) for i in (0, 1))
+        return row, track, np.concatenate(motion)
 
 
 def open_recording(folder: Path) -> StoredRecording:
@@ -179,7 +211,7 @@ def open_recording(folder: Path) -> StoredRecording:
         DataError: A file or a column is missing, or is damaged.
     """
     frames = Table(folder / FRAMES, schema.FRAMES)
-    tracks = Table(folder / TRACKS, schema.TRACKS)
+    tracks = Table(folder / TRACKS, schema.TRACKS, schema.FORMER_TRACKS)
     head = _footer(frames, {"log": str, "city": str, "connectors": [str]})
     names = _footer(tracks, {"tokens": [str], "kinds": [int]})
     require(STORE, "kinds", np.array(names["kinds"], np.float64), f"{tracks.path}: footer")
@@ -207,7 +239,11 @@ def _footer(table: Table, kinds: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def open_ego(folder: Path, name: str) -> Table:
     """Open the file of an ego's states."""
-    return Table(ego_file(folder, name), schema.EGO)
+    return Table(ego_file(folder, name), schema.EGO, schema.FORMER_EGO)
+
+
+def _is_former(table: Table) -> bool:
+    return schema.MOTION[0] in table.names
 
 
 def ego_span(table: Table) -> tuple[int, int]:
@@ -217,7 +253,7 @@ def ego_span(table: Table) -> tuple[int, int]:
         DataError: The file is damaged.
     """
     start = int(_footer(table, {"first_row": int})["first_row"])
-    return start, start + table.num_rows
+    return start, start + table.num_rows // (1 if _is_former(table) else NUM_STATE)
 
 
 def ego_states(table: Table, first: int, last: int) -> FloatArray:
@@ -229,22 +265,37 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     start, stop = ego_span(table)
     if not start <= first < last <= stop:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
-    columns = _views(_rows(table, first - start, last - start))
-    return np.ascontiguousarray(np.array(columns).T)
+    blocks = _blocks(table, first - start, last - start)
+    if _is_former(table):
+        columns = np.array(_views(table.read(blocks)))
+    else:
+        codes = [_view(table.read([block]).column(0)).view(np.uint64) for block in blocks]
+        if any(len(code) % NUM_STATE for code in codes):
+            raise DataError(f"{table.path}: a row group holds no whole states", hint=REPAIR)
+        columns = np.concatenate([restored(code).reshape(NUM_STATE, -1) for code in codes], axis=1)
+    low = start + blocks[0] * schema.FRAME_BLOCK
+    if columns.shape[1] < last - low:
+        raise DataError(f"{table.path}: row groups are too short", hint=REPAIR)
+    return np.ascontiguousarray(columns[:, first - low : last - low].T)
 
 
 def whole_ego(table: Table) -> tuple[int, FloatArray]:
     """Row of the recording of the first state, and all states (R, 11) of an ego."""
-    start = int(_footer(table, {"first_row": int})["first_row"])
-    return start, ego_states(table, start, start + table.num_rows)
+    start, stop = ego_span(table)
+    return start, ego_states(table, start, stop)
+
+
+def _blocks(table: Table, first: int, last: int) -> list[int]:
+    """The row groups of frames or states that hold the rows first … last - 1."""
+    blocks = range(first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK + 1)
+    if blocks[-1] >= table.num_blocks:
+        raise DataError(f"{table.path}: row groups are missing", hint=REPAIR)
+    return list(blocks)
 
 
 def _rows(table: Table, first: int, last: int) -> pa.Table:
-    low, high = first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK
-    if high >= table.num_blocks:
-        raise DataError(f"{table.path}: row groups are missing", hint=REPAIR)
-    rows = table.read(list(range(low, high + 1)))
-    return rows.slice(first - low * schema.FRAME_BLOCK, last - first)
+    blocks = _blocks(table, first, last)
+    return table.read(blocks).slice(first - blocks[0] * schema.FRAME_BLOCK, last - first)
 
 
 def _dense(valid: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -276,83 +327,3 @@ def _nothing(kind: pa.DataType) -> Any:
     array = np.empty(0, kind.to_pandas_dtype())
     array.flags.writeable = False
     return array
-
-
-@kernel
-def _runs(row: IntArray, track: IntArray, first: int, last: int) -> IntArray:
-    """(M, 3) track, first box and one past the last one of boxes of one track in order of time.
-
-    Only those in the rows first … last - 1 count.
-    """
-    count = 0
-    for box in range(len(row)):
-        count += box == 0 or track[box] != track[box - 1] or row[box] <= row[box - 1]
-    runs = np.empty((count, 3), np.int64)
-    count, begin = 0, 0
-    for stop in range(1, len(row) + 1):
-        if stop < len(row) and track[stop] == track[stop - 1] and row[stop] > row[stop - 1]:
-            continue
-        end = stop
-        while begin < end and row[begin] < first:
-            begin += 1
-        while begin < end and row[end - 1] >= last:
-            end -= 1
-        if begin < end:
-            runs[count, 0], runs[count, 1], runs[count, 2] = track[begin], begin, end
-            count += 1
-        begin = stop
-    return runs[:count]
-
-
-@kernel
-def _mark(runs: IntArray, row: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
-    """Note in `valid` (R, N), which is false, where there are boxes."""
-    for run in range(len(runs)):
-        to = place[runs[run, 0]]
-        for box in range(runs[run, 1], runs[run, 2]):
-            valid[row[box] - first, to] = True
-
-
-@kernel
-def _scatter(
-    runs: IntArray,
-    row: IntArray,
-    place: IntArray,
-    first: int,
-    values: tuple[FloatArray, ...],
-    limits: FloatArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-) -> bool:
-    """Spread boxes of the tracks that have a place over dense arrays.
-
-    Returns whether all are within `limits` (7, 2).
-    """
-    x, y, heading, vx, vy, length, width = values
-    num = np.uint64(poses.shape[1])
-    flat, speeds, extent = poses.reshape(-1), velocities.reshape(-1), sizes.reshape(-1)
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)  # no index is negative
-    good = True
-    for run in range(len(runs)):
-        to = place[runs[run, 0]]
-        if to < 0:
-            continue
-        for box in range(np.uint64(runs[run, 1]), np.uint64(runs[run, 2])):
-            at = np.uint64(row[box] - first) * num + np.uint64(to)
-            flat[three * at] = x[box]
-            flat[three * at + one] = y[box]
-            flat[three * at + two] = heading[box]
-            speeds[two * at] = vx[box]
-            speeds[two * at + one] = vy[box]
-            extent[two * at] = length[box]
-            extent[two * at + one] = width[box]
-            good &= (x[box] >= limits[0, 0]) & (x[box] <= limits[0, 1])
-            good &= (y[box] >= limits[1, 0]) & (y[box] <= limits[1, 1])
-            good &= (heading[box] >= limits[2, 0]) & (heading[box] <= limits[2, 1])
-            # velocities of static objects are NaN
-            good &= not ((vx[box] < limits[3, 0]) | (vx[box] > limits[3, 1]))
-            good &= not ((vy[box] < limits[4, 0]) | (vy[box] > limits[4, 1]))
-            good &= (length[box] >= limits[5, 0]) & (length[box] <= limits[5, 1])
-            good &= (width[box] >= limits[6, 0]) & (width[box] <= limits[6, 1])
-    return good

@@ -1,0 +1,174 @@
+"""Boxes as they are stored and as dense arrays; numbers as second differences of their bits.
+
+The bits of a float, read as an integer, grow with its size. Where a number changes evenly in time,
+second differences of these integers are small, and compress to much less than the number itself.
+"""
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.data.store.plausible import BOX_LIMITS
+
+BitArray: TypeAlias = NDArray[np.uint64]
+# bits of the largest numbers that are in `BOX_LIMITS`, which are as wide to both sides; of infinity
+HIGHEST = tuple(np.array([*BOX_LIMITS[:5, 1], np.inf]).view(np.uint64))
+
+
+class BoxBlock(NamedTuple):
+    """Boxes of a row group. A boxes, sorted by track, then by row."""
+
+    row: IntArray  # (A,)
+    track: IntArray  # (A,)
+    motion: tuple[BitArray, ...]  # 5 of (A,): `schema.MOTION`, as codes, or as bits where plain
+    sizes: tuple[FloatArray, FloatArray]  # (A,), (A,)
+    is_plain: bool
+
+
+def second_differences(values: FloatArray) -> BitArray:
+    """(n,) codes of numbers (n,), which `restored` gives back bit for bit.
+
+    The difference d is written as 2 d, or -2 d - 1 where it is negative: small ones of either sign
+    have few bytes. The first number follows two zeros.
+    """
+    bits = np.ascontiguousarray(values, np.float64).view(np.int64)
+    bend = np.diff(bits, n=2, prepend=np.zeros(2, np.int64))
+    return ((bend << 1) ^ (bend >> 63)).view(np.uint64)
+
+
+@lean_kernel
+def difference_of(code: np.uint64) -> np.uint64:
+    """The second difference, modulo 2^64, that a code stands for."""
+    one = np.uint64(1)
+    return (code >> one) ^ (np.uint64(0) - (code & one))
+
+
+@kernel
+def restored(codes: BitArray) -> FloatArray:
+    """(n,) numbers of which `second_differences` made these codes (n,)."""
+    bits = np.empty(len(codes), np.uint64)
+    step = value = np.uint64(0)
+    for index in range(len(codes)):
+        step += difference_of(codes[index])
+        value += step
+        bits[index] = value
+    return bits.view(np.float64)
+
+
+@kernel
+def find_runs(row: IntArray, track: IntArray, first: int, last: int, place: IntArray) -> IntArray:
+    """(M, 3) track, first box and one past the last one of boxes of one track in order of time.
+
+    Only those in the rows first … last - 1 count; `place` (N,) becomes 0 for their tracks. The last
+    one is -1 where the boxes name a track that is none of the N.
+    """
+    count = 1
+    for box in range(1, len(row)):
+        count += (track[box] != track[box - 1]) | (row[box] <= row[box - 1])
+    runs = np.empty((count, 3), np.int64)
+    count, begin = 0, 0
+    for stop in range(1, len(row) + 1):
+        if stop < len(row) and track[stop] == track[stop - 1] and row[stop] > row[stop - 1]:
+            continue
+        if not 0 <= track[begin] < len(place):
+            runs[count] = -1
+            return runs[: count + 1]
+        end = stop
+        while begin < end and row[begin] < first:
+            begin += 1
+        while begin < end and row[end - 1] >= last:
+            end -= 1
+        if begin < end:
+            place[track[begin]] = 0
+            runs[count, 0], runs[count, 1], runs[count, 2] = track[begin], begin, end
+            count += 1
+        begin = stop
+    return runs[:count]
+
+
+@kernel
+def mark(runs: IntArray, row: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
+    """Note in `valid` (R, N), which is false, where there are boxes."""
+    for run in range(len(runs)):
+        to = place[runs[run, 0]]
+        for box in range(runs[run, 1], runs[run, 2]):
+            valid[row[box] - first, to] = True
+
+
+@kernel
+def scatter(
+    row: IntArray,
+    track: IntArray,
+    motion: tuple[BitArray, ...],
+    extent: tuple[FloatArray, FloatArray],
+    is_plain: bool,
+    place: IntArray,
+    first: int,
+    highest: tuple[int, ...],
+    limits: FloatArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+) -> bool:
+    """Spread the boxes of a row group over dense arrays, those of tracks that have a place.
+
+    Returns whether all of the row group are within `limits` (7, 2): the bits of a float without
+    its sign are in the order of its size, and up to `highest` (6,), the last that of infinity.
+    Places and the rest take turns, as the sums of all do not fit into the registers.
+    """
+    x, y, heading, vx, vy = motion
+    length, width = extent
+    x_top, y_top, heading_top, vx_top, vy_top, infinity = highest
+    (least_length, most_length), (least_width, most_width) = limits[5], limits[6]
+    flat_poses, flat_speeds = (
+        poses.reshape(-1).view(np.uint64),
+        velocities.reshape(-1).view(np.uint64),
+    )
+    flat_sizes = sizes.reshape(-1)
+    zero, one, two, three = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+    size = ~(one << np.uint64(63))
+    num_rows, num = np.uint64(poses.shape[0]), np.uint64(poses.shape[1])
+    good = True
+    x_step = y_step = heading_step = x_bits = y_bits = heading_bits = zero
+    for box in range(np.uint64(len(row))):
+        if is_plain:
+            x_bits, y_bits, heading_bits = x[box], y[box], heading[box]
+        else:
+            x_step += difference_of(x[box])
+            y_step += difference_of(y[box])
+            heading_step += difference_of(heading[box])
+            x_bits += x_step
+            y_bits += y_step
+            heading_bits += heading_step
+        good &= (x_bits & size <= x_top) & (y_bits & size <= y_top)
+        good &= heading_bits & size <= heading_top
+        at, to = np.uint64(row[box] - first), place[track[box]]
+        if to >= 0 and at < num_rows:  # a row before the first is a large one, too
+            at = three * (at * num + np.uint64(to))
+            flat_poses[at] = x_bits
+            flat_poses[at + one] = y_bits
+            flat_poses[at + two] = heading_bits
+    vx_step = vy_step = vx_bits = vy_bits = zero
+    for box in range(np.uint64(len(row))):
+        if is_plain:
+            vx_bits, vy_bits = vx[box], vy[box]
+        else:
+            vx_step += difference_of(vx[box])
+            vy_step += difference_of(vy[box])
+            vx_bits += vx_step
+            vy_bits += vy_step
+        # velocities of static objects are NaN: more than infinity
+        good &= (vx_bits & size <= vx_top) | (vx_bits & size > infinity)
+        good &= (vy_bits & size <= vy_top) | (vy_bits & size > infinity)
+        good &= (length[box] >= least_length) & (length[box] <= most_length)
+        good &= (width[box] >= least_width) & (width[box] <= most_width)
+        at, to = np.uint64(row[box] - first), place[track[box]]
+        if to >= 0 and at < num_rows:
+            at = two * (at * num + np.uint64(to))
+            flat_speeds[at] = vx_bits
+            flat_speeds[at + one] = vy_bits
+            flat_sizes[at] = length[box]
+            flat_sizes[at + one] = width[box]
+    return good
