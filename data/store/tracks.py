@@ -140,14 +140,20 @@ class StoredRecording:
         if not 0 <= first < last <= self.num_rows:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
-        frames = _rows(self.frames, first, last)
-        lights = self._lights(frames)
+        blocks = _blocks(self.frames, first, last)
+        frames = self.frames.read(blocks)
+        begin = blocks[0] * schema.FRAME_BLOCK
+        if begin + len(frames) < last:
+            raise DataError(f"{self.frames.path}: row groups are too short", hint=REPAIR)
+        rows = slice(first - begin, last - begin)
+        lights = self._lights(frames).rows(rows)
+        time_us = _view(frames["time_us"])[rows]
         tracks = self._tracks(first, last, choose, plausible)
-        return Recording(self.log_name, self.city, frames["time_us"].to_numpy(), tracks, lights)
+        return Recording(self.log_name, self.city, time_us, tracks, lights)
 
     def _lights(self, frames: pa.Table) -> TrafficLights:
         shape = (len(frames), len(self.connectors))
-        status = frames["light_status"].combine_chunks().flatten()
+        status = _whole(frames["light_status"]).values
         if len(status) != shape[0] * shape[1]:
             raise DataError(f"{self.frames.path}: light_status has gaps", hint=REPAIR)
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
@@ -293,11 +299,6 @@ def _blocks(table: Table, first: int, last: int) -> list[int]:
     return list(blocks)
 
 
-def _rows(table: Table, first: int, last: int) -> pa.Table:
-    blocks = _blocks(table, first, last)
-    return table.read(blocks).slice(first - blocks[0] * schema.FRAME_BLOCK, last - first)
-
-
 def _dense(valid: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), to be filled where valid (R, N), else NaN.
 
@@ -318,9 +319,11 @@ def _views(table: pa.Table) -> list[Any]:
 
 
 def _view(column: pa.ChunkedArray) -> Any:
-    if not len(column):
-        return _nothing(column.type)
-    return (column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()).to_numpy()
+    return _whole(column).to_numpy() if len(column) else _nothing(column.type)
+
+
+def _whole(column: pa.ChunkedArray) -> pa.Array:
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def _nothing(kind: pa.DataType) -> Any:
