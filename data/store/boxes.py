@@ -15,6 +15,7 @@ from shiftsim.data.store.plausible import BOX_LIMITS
 BitArray: TypeAlias = NDArray[np.uint64]
 # bits of the largest numbers that are in `BOX_LIMITS`, which are as wide to both sides; of infinity
 HIGHEST = tuple(np.array([*BOX_LIMITS[:5, 1], np.inf]).view(np.uint64))
+SIZE_LIMITS = tuple(BOX_LIMITS[5:].reshape(-1).tolist())
 
 
 class BoxBlock(NamedTuple):
@@ -38,6 +39,13 @@ def second_differences(values: FloatArray) -> BitArray:
     return ((bend << 1) ^ (bend >> 63)).view(np.uint64)
 
 
+def restored(codes: BitArray) -> FloatArray:
+    """(n,) numbers of which `second_differences` made these codes (n,)."""
+    one = np.uint64(1)
+    differences = (codes >> one) ^ -(codes & one)
+    return np.cumsum(np.cumsum(differences)).view(np.float64)
+
+
 @lean_kernel
 def difference_of(code: np.uint64) -> np.uint64:
     """The second difference, modulo 2^64, that a code stands for."""
@@ -46,55 +54,21 @@ def difference_of(code: np.uint64) -> np.uint64:
 
 
 @kernel
-def restored(codes: BitArray) -> FloatArray:
-    """(n,) numbers of which `second_differences` made these codes (n,)."""
-    bits = np.empty(len(codes), np.uint64)
-    step = value = np.uint64(0)
-    for index in range(len(codes)):
-        step += difference_of(codes[index])
-        value += step
-        bits[index] = value
-    return bits.view(np.float64)
+def note_tracks(row: IntArray, track: IntArray, first: int, last: int, place: IntArray) -> None:
+    """Set `place` (N,) to 0 for tracks, all of the N, that occur in the rows first … last - 1."""
+    for box in range(np.uint64(len(row))):
+        if first <= row[box] < last:
+            place[np.uint64(track[box])] = 0
 
 
 @kernel
-def find_runs(row: IntArray, track: IntArray, first: int, last: int, place: IntArray) -> IntArray:
-    """(M, 3) track, first box and one past the last one of boxes of one track in order of time.
-
-    Only those in the rows first … last - 1 count; `place` (N,) becomes 0 for their tracks. The last
-    one is -1 where the boxes name a track that is none of the N.
-    """
-    count = 1
-    for box in range(1, len(row)):
-        count += (track[box] != track[box - 1]) | (row[box] <= row[box - 1])
-    runs = np.empty((count, 3), np.int64)
-    count, begin = 0, 0
-    for stop in range(1, len(row) + 1):
-        if stop < len(row) and track[stop] == track[stop - 1] and row[stop] > row[stop - 1]:
-            continue
-        if not 0 <= track[begin] < len(place):
-            runs[count] = -1
-            return runs[: count + 1]
-        end = stop
-        while begin < end and row[begin] < first:
-            begin += 1
-        while begin < end and row[end - 1] >= last:
-            end -= 1
-        if begin < end:
-            place[track[begin]] = 0
-            runs[count, 0], runs[count, 1], runs[count, 2] = track[begin], begin, end
-            count += 1
-        begin = stop
-    return runs[:count]
-
-
-@kernel
-def mark(runs: IntArray, row: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
+def mark(row: IntArray, track: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
     """Note in `valid` (R, N), which is false, where there are boxes."""
-    for run in range(len(runs)):
-        to = place[runs[run, 0]]
-        for box in range(runs[run, 1], runs[run, 2]):
-            valid[row[box] - first, to] = True
+    num_rows = np.uint64(len(valid))
+    for box in range(np.uint64(len(row))):
+        at = np.uint64(row[box] - first)  # one before the first is a large one, too
+        if at < num_rows:
+            valid[at, np.uint64(place[np.uint64(track[box])])] = True
 
 
 @kernel
@@ -106,30 +80,30 @@ def scatter(
     is_plain: bool,
     place: IntArray,
     first: int,
+    shape: tuple[int, int],
     highest: tuple[int, ...],
-    limits: FloatArray,
-    poses: FloatArray,
-    velocities: FloatArray,
+    limits: tuple[float, ...],
+    poses: BitArray,
+    velocities: BitArray,
     sizes: FloatArray,
 ) -> bool:
     """Spread the boxes of a row group over dense arrays, those of tracks that have a place.
 
-    Returns whether all of the row group are within `limits` (7, 2): the bits of a float without
-    its sign are in the order of its size, and up to `highest` (6,), the last that of infinity.
-    Places and the rest take turns, as the sums of all do not fit into the registers.
+    The arrays, for R rows and N tracks as `shape` says, are flat: poses (3 R N,) and velocities
+    (2 R N,), both as their bits, and sizes (2 R N,).
+
+    Returns whether all of the row group are within the ranges of a store. The bits of a float
+    without its sign are in the order of its size, and up to `highest` (6,), the last that of
+    infinity; `limits` (4,) are the least and most length and width. Places and the rest take
+    turns, as the sums of all do not fit into the registers.
     """
     x, y, heading, vx, vy = motion
     length, width = extent
     x_top, y_top, heading_top, vx_top, vy_top, infinity = highest
-    (least_length, most_length), (least_width, most_width) = limits[5], limits[6]
-    flat_poses, flat_speeds = (
-        poses.reshape(-1).view(np.uint64),
-        velocities.reshape(-1).view(np.uint64),
-    )
-    flat_sizes = sizes.reshape(-1)
+    least_length, most_length, least_width, most_width = limits
     zero, one, two, three = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
     size = ~(one << np.uint64(63))
-    num_rows, num = np.uint64(poses.shape[0]), np.uint64(poses.shape[1])
+    num_rows, num = np.uint64(shape[0]), np.uint64(shape[1])
     good = True
     x_step = y_step = heading_step = x_bits = y_bits = heading_bits = zero
     for box in range(np.uint64(len(row))):
@@ -144,12 +118,12 @@ def scatter(
             heading_bits += heading_step
         good &= (x_bits & size <= x_top) & (y_bits & size <= y_top)
         good &= heading_bits & size <= heading_top
-        at, to = np.uint64(row[box] - first), place[track[box]]
+        at, to = np.uint64(row[box] - first), place[np.uint64(track[box])]
         if to >= 0 and at < num_rows:  # a row before the first is a large one, too
             at = three * (at * num + np.uint64(to))
-            flat_poses[at] = x_bits
-            flat_poses[at + one] = y_bits
-            flat_poses[at + two] = heading_bits
+            poses[at] = x_bits
+            poses[at + one] = y_bits
+            poses[at + two] = heading_bits
     vx_step = vy_step = vx_bits = vy_bits = zero
     for box in range(np.uint64(len(row))):
         if is_plain:
@@ -164,11 +138,11 @@ def scatter(
         good &= (vy_bits & size <= vy_top) | (vy_bits & size > infinity)
         good &= (length[box] >= least_length) & (length[box] <= most_length)
         good &= (width[box] >= least_width) & (width[box] <= most_width)
-        at, to = np.uint64(row[box] - first), place[track[box]]
+        at, to = np.uint64(row[box] - first), place[np.uint64(track[box])]
         if to >= 0 and at < num_rows:
             at = two * (at * num + np.uint64(to))
-            flat_speeds[at] = vx_bits
-            flat_speeds[at + one] = vy_bits
-            flat_sizes[at] = length[box]
-            flat_sizes[at + one] = width[box]
+            velocities[at] = vx_bits
+            velocities[at + one] = vy_bits
+            sizes[at] = length[box]
+            sizes[at + one] = width[box]
     return good

@@ -14,15 +14,15 @@ from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
 from shiftsim.data.store.boxes import (
     HIGHEST,
+    SIZE_LIMITS,
     BoxBlock,
-    find_runs,
     mark,
+    note_tracks,
     restored,
     scatter,
     second_differences,
 )
 from shiftsim.data.store.plausible import (
-    BOX_LIMITS,
     require_boxes,
     require_recording,
     require_states,
@@ -165,21 +165,22 @@ class StoredRecording:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
         parts = [self._block(block) for block in blocks]
         place = np.full(len(self.tokens), -1)
-        runs = [find_runs(part.row, part.track, first, last, place) for part in parts]
-        if any(len(found) and found[-1, 0] < 0 for found in runs):
-            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        for part in parts:
+            note_tracks(part.row, part.track, first, last, place)
         seen = np.flatnonzero(place >= 0)
         place[seen] = np.arange(len(seen))
         valid = np.zeros((last - first, len(seen)), np.bool_)
-        for part, found in zip(parts, runs, strict=True):
-            mark(found, part.row, place, first, valid)
+        for part in parts:
+            mark(part.row, part.track, place, first, valid)
         order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
         if len(order) < len(seen) or (order != np.arange(len(seen))).any():
             valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
             place[:] = -1
             place[seen] = np.arange(len(seen))
         dense = _dense(valid)
-        inside = all([scatter(*part, place, first, HIGHEST, BOX_LIMITS, *dense) for part in parts])
+        poses, velocities, sizes = (array.reshape(-1) for array in dense)
+        out = valid.shape, HIGHEST, SIZE_LIMITS, poses.view(np.uint64), velocities.view(np.uint64)
+        inside = all([scatter(*part, place, first, *out, sizes) for part in parts])
         names = tuple(self.tokens[i] for i in seen.tolist())
         tracks = Tracks(valid, *dense, self.kinds[seen], names)
         if plausible and not inside:
@@ -191,6 +192,8 @@ class StoredRecording:
         names = schema.MOTION if is_plain else schema.TRACKS.names[: len(schema.MOTION)]
         row, track, *sizes = (_view(found[n]) for n in ("row", "track", "length_m", "width_m"))
         motion = tuple(_view(found[name]).view(np.uint64) for name in names)
+        if len(track) and not 0 <= track.min() <= track.max() < len(self.tokens):
+            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
         return BoxBlock(row, track, motion, (sizes[0], sizes[1]), is_plain)
 
     def boxes(self) -> tuple[IntArray, IntArray, FloatArray]:
