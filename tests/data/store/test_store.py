@@ -540,15 +540,26 @@ def test_columns_carry_their_units(store: Path) -> None:
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
-    ("part", "column"), [("poses", "x_m"), ("velocities", "vx_mps"), ("sizes", "length_m")]
+    ("part", "axis", "column"),
+    [
+        *(("poses", axis, name) for axis, name in enumerate(("x_m", "y_m", "heading_rad"))),
+        *(("velocities", axis, name) for axis, name in enumerate(("vx_mps", "vy_mps"))),
+        *(("sizes", axis, name) for axis, name in enumerate(("length_m", "width_m"))),
+    ],
 )
 @pytest.mark.parametrize("value", [1e300, -np.inf])
 def test_an_implausible_number_names_file_track_and_column(
-    part: str, column: str, value: float, tmp_path: Path, road: VectorMap, rng: np.random.Generator
+    part: str,
+    axis: int,
+    column: str,
+    value: float,
+    tmp_path: Path,
+    road: VectorMap,
+    rng: np.random.Generator,
 ) -> None:
     recording = make_recording(100, 4, rng)
     recording.tracks.valid[50, 1] = True
-    getattr(recording.tracks, part)[50, 1, 0] = value
+    getattr(recording.tracks, part)[50, 1, axis] = value
     write_store(tmp_path / "s", road, recording, make_window("a", 0, 100))
     what = f"tracks.parquet: track '.*', row 50: column '{column}': "
     with pytest.raises(DataError, match=what):
