@@ -5,6 +5,7 @@ scores them, and returns the best one, or an emergency brake. Here is what survi
 step.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,8 +13,8 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.geometry.polylines import Path, make_path
+from shiftsim.geometry.polylines import make_path
+from shiftsim.planners.pdm.corridor import Paths
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,
     Forecast,
@@ -34,7 +35,9 @@ from shiftsim.planners.routes.graph import centerline
 from shiftsim.planners.routes.lights import LightWatch
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import NUM_STATE, Trajectory, VehicleParameters, center_poses
+from shiftsim.world.state import NUM_STATE, Trajectory, VehicleParameters
+
+_TIMES = STEP_US * np.arange(STEPS + 1)  # us
 
 
 class Seen(NamedTuple):
@@ -84,7 +87,7 @@ class PdmClosed:
             map_radius=map_radius,
         )
         self._scene: SceneInfo | None = None
-        self.paths: list[Path] = []
+        self.paths: Paths | None = None
         self._lights: LightWatch | None = None
         self.collided: list[str] = []
         self.route: Route | None = None
@@ -99,14 +102,14 @@ class PdmClosed:
         """
         known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
-        self.paths, self.collided = [], []
-        self.route = self.centerline = self.seen = self._lights = None
+        self.collided = []
+        self.route = self.centerline = self.paths = self.seen = self._lights = None
 
     def plan(self, observation: Observation) -> Trajectory:
         """81 poses, 0.1 s apart, without speeds."""
         states = np.zeros((STEPS + 1, NUM_STATE))
         states[:, :3] = self.step(observation).poses
-        return Trajectory(observation.time_us + STEP_US * np.arange(STEPS + 1), states)
+        return Trajectory(observation.time_us + _TIMES, states)
 
     def step(self, observation: Observation) -> Step:
         """One planning step with everything that led to the plan."""
@@ -120,41 +123,44 @@ class PdmClosed:
         route = self.route
         selected = select_areas(scene.map, center[0], center[1], params.map_radius)
         lane = current_lane(scene.map, route, selected, ego, center, ego_box(vehicle))
-        if not self.paths:
-            self.follow(centerline(scene.map, follow_route(scene.map, route.corrected, lane).path))
-        forecast, tokens = self._forecast(scene.map, route, observation)
-        place = Place(route.areas, selected, scene.map.intersections.polygons, self.paths[0])
+        paths = self.paths
+        if paths is None:
+            lanes = follow_route(scene.map, route.corrected, lane).path
+            paths = self.follow(centerline(scene.map, lanes))
+        forecast, tokens = self._forecast(scene.map, route, observation, center)
+        place = Place(route.areas, selected, scene.map.intersections.polygons, paths.at(0))
         self.seen = Seen(forecast, tokens, place, lane)
-        return self.step_in(self.seen, ego, float(scene.map.speed_limits[lane]), vehicle)
+        return self.step_in(self.seen, paths, ego, float(scene.map.speed_limits[lane]), vehicle)
 
-    def follow(self, line: FloatArray) -> None:
+    def follow(self, line: FloatArray) -> Paths:
         """Lay the centerline (K, 3) and the paths beside it, once per scenario."""
         self.centerline, offsets = line, self.parameters.lateral_offsets
-        self.paths = [make_path(line), *(make_path(offset_poses(line, by)) for by in offsets)]
+        lines = [line, *(offset_poses(line, by) for by in offsets)]
+        made = [make_path(item) for item in lines]
+        self.paths = Paths(*(np.stack(arrays) for arrays in zip(*made, strict=True)))
+        return self.paths
 
     def step_in(
-        self, seen: Seen, ego: FloatArray, limit: float, vehicle: VehicleParameters
+        self, seen: Seen, paths: Paths, ego: FloatArray, limit: float, vehicle: VehicleParameters
     ) -> Step:
         """One planning step in what an ego (11,) sees; what it touches is ignored from now on.
 
         `limit` is the speed limit of the lane, NaN where it has none [m/s].
         """
         size, params = ego_box(vehicle), self.parameters
-        center = center_poses(ego[:3], vehicle)
-        footprint = boxes_to_corners(center, np.array([size.length, size.width]))
-        self.collided += [seen.tokens[i] for i in touched(seen.forecast, footprint)]
+        self.collided += [seen.tokens[i] for i in touched(seen.forecast, ego, size)]
         if self.collided:
             seen.forecast.ignored[:] = [token in self.collided for token in seen.tokens]
-        limit = params.fallback_velocity if np.isnan(limit) else limit
+        limit = params.fallback_velocity if math.isnan(limit) else limit
         targets = limit * np.array(params.speed_fractions)
-        around = Scene(self.paths, seen.forecast, size, params.following)
+        around = Scene(paths, seen.forecast, size, params.following)
         return plan_step(ego, targets, around, seen.place, vehicle, params)
 
     def _forecast(
-        self, road: VectorMap, route: Route, observation: Observation
+        self, road: VectorMap, route: Route, observation: Observation, center: FloatArray
     ) -> tuple[Forecast, list[str]]:
         """What is around, and the tokens of tracks and red lights."""
-        tracks, center = observation.history.tracks, observation.ego.center
+        tracks = observation.history.tracks
         chosen = select_tracks(tracks, center[0], center[1], set(self.collided), self.parameters)
         if self._lights is None:
             self._lights = LightWatch(road, route.lanes.tolist())

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import PlannerError
-from shiftsim.planners.proposals.areas import Areas, covering, index_ranks, make_areas
+from shiftsim.planners.proposals.areas import Areas, Slabs, covering, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.routes.graph import (
@@ -18,8 +18,9 @@ from shiftsim.planners.routes.graph import (
     lanes_of,
     search_cheapest,
 )
-from shiftsim.world.layers import square_around
+from shiftsim.world.layers import Polylines, square_around
 from shiftsim.world.map import VectorMap
+from shiftsim.world.state import HEADING, X, Y
 
 SEARCH_DEPTH = 30  # blocks of the route the centerline covers
 START_HALF_WIDTH = 1.0  # m, of the square around the rear axle that is searched for the start
@@ -73,11 +74,37 @@ def lanes_at(
     road: VectorMap, route: Route, selected: IntArray, ego: FloatArray
 ) -> tuple[list[int], list[float]]:
     """Areas of the route under the rear axle, and their heading errors [rad]."""
-    areas, (x, y, heading) = route.areas, ego[:3].tolist()
-    found = covering(areas.slabs, selected, ego[None, :2])
-    under = found[areas.on_route[found]].tolist()
-    lanes = areas.lane[under].tolist()
-    return under, [deviation(road.baselines, lane, 1, x, y, heading)[1] for lane in lanes]
+    areas = route.areas
+    under, errors = np.empty_like(selected), np.empty(len(selected))
+    count = _lanes_at(
+        *(areas.slabs, areas.on_route, areas.lane, selected, road.baselines),
+        *(ego, ego[None, :2], under, errors),
+    )
+    return under[:count].tolist(), errors[:count].tolist()
+
+
+@lean_kernel
+def _lanes_at(
+    slabs: Slabs,
+    on_route: BoolArray,
+    lane: IntArray,
+    selected: IntArray,
+    baselines: Polylines,
+    ego: FloatArray,
+    point: FloatArray,  # (1, 2) its rear axle
+    under: IntArray,  # receives the areas
+    errors: FloatArray,  # receives their heading errors
+) -> int:
+    """Find areas of the route under the rear axle; how many."""
+    count = 0
+    for entry in range(covering(slabs, selected, point, under)):
+        area = under[entry]
+        if on_route[area]:
+            under[count] = area
+            error = deviation(baselines, lane[area], 1, ego[X], ego[Y], ego[HEADING])[1]
+            errors[count] = error
+            count += 1
+    return count
 
 
 def in_index_order(route: Route, selected: IntArray, chosen: list[int]) -> list[int]:

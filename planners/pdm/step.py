@@ -6,7 +6,7 @@ import numpy as np
 
 from shiftsim.arrays import FloatArray
 from shiftsim.planners.pdm.parameters import PdmParameters
-from shiftsim.planners.pdm.rollout import Proposals, Scene, extend, roll_out, start_proposals
+from shiftsim.planners.pdm.rollout import Proposals, Scene, extend, roll_out
 from shiftsim.planners.pdm.scorer import Place, Scores, score
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS, Driven, drive_proposals
 from shiftsim.world.state import (
@@ -64,13 +64,12 @@ def plan_step(
     params: PdmParameters,
 ) -> Step:
     """Roll out, drive and score proposals, and choose."""
-    proposals = start_proposals(scene, ego, targets)
-    roll_out(proposals, scene)
+    proposals = roll_out(scene, ego, targets)
     poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)
     driven = drive_proposals(poses, ego, vehicle)
     scores = score(driven.states, place, scene.forecast.others, scene.size, params)
     best, braked = choose(scores, ego, params)
-    plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, best)
+    plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, ego, best)
     return Step(plan, best, braked, proposals, driven, scores)
 
 

@@ -11,12 +11,13 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
-from shiftsim.geometry.rings import ray_crossings
+from shiftsim.geometry.rings import SLACK, ray_crossings
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
 
 EDGES_PER_SLAB = 2  # on average, if none spanned several
+_NOTHING = np.empty((2, 0))
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
@@ -28,6 +29,9 @@ class Slabs(NamedTuple):
     slab_ptr: IntArray  # (M + 1,) first slab of each area, the lowest one
     edge_ptr: IntArray  # (S + 1,) first edge of each slab
     ends: FloatArray  # (2 E, 2) start and end of each edge in turn [m]
+    # (S, 4) x within each slab: up to which and from which all is outside (first and last), and
+    # between which all is inside [m]
+    spans: FloatArray
 
 
 class Areas(NamedTuple):
@@ -69,21 +73,22 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     slab_ptr = np.concatenate([[0], np.cumsum(num_slabs)])
     height = polygons.bounds[:, 3] - polygons.bounds[:, 1]
     scale = np.where(height > 0.0, num_slabs / np.where(height > 0.0, height, 1.0), 0.0)
-    counts = np.zeros(slab_ptr[-1], np.int64)
-    _slice(polygons, scale, slab_ptr, counts, np.zeros(0, np.int64))
+    counts, fixed = np.zeros(slab_ptr[-1], np.int64), (polygons.bounds, scale, slab_ptr)
+    _slice(polygons, Slabs(*fixed, counts, np.empty((0, 2)), np.empty((0, 4))), counts, _NOTHING)
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
-    vertices = np.empty(2 * edge_ptr[-1], np.int64)
-    _slice(polygons, scale, slab_ptr, edge_ptr[:-1].copy(), vertices)
-    slabs = Slabs(polygons.bounds, scale, slab_ptr, edge_ptr, polygons.xy[vertices])
+    ends, spans = np.empty((2 * edge_ptr[-1], 2)), np.empty((len(counts), 4))
+    slabs, scratch = Slabs(*fixed, edge_ptr, ends, spans), np.empty((2, counts.max(initial=0)))
+    _slice(polygons, slabs, edge_ptr[:-1].copy(), scratch)
     return Areas(polygons, slabs, on_route, lane)
 
 
 @lean_kernel
-def _slice(
-    polygons: Polygons, scale: FloatArray, slab_ptr: IntArray, fill: IntArray, vertices: IntArray
-) -> None:
-    """Add the edges of every slab to `fill`; write their ends to `vertices` unless it is empty."""
-    xy = polygons.xy
+def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray) -> None:
+    """Add the edges of every slab to `fill`; write their ends and the spans, unless there are none.
+
+    `scratch` (2, E) is for the edges of a slab.
+    """
+    xy, slab_ptr, scale, ends = polygons.xy, slabs.slab_ptr, slabs.scale, slabs.ends
     for area in range(len(scale)):
         low, last_slab = polygons.bounds[area, 1], slab_ptr[area + 1] - slab_ptr[area] - 1
         for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
@@ -95,10 +100,56 @@ def _slice(
                 first = min(int((bottom - low) * scale[area]), last_slab)
                 last = min(int((top - low) * scale[area]), last_slab)
                 for slab in range(slab_ptr[area] + first, slab_ptr[area] + last + 1):
-                    if len(vertices) > 0:
-                        vertices[2 * fill[slab]], vertices[2 * fill[slab] + 1] = before, vertex
+                    edge = 2 * fill[slab]
+                    for column in range(2 if len(ends) > 0 else 0):
+                        ends[edge, column] = xy[before, column]
+                        ends[edge + 1, column] = xy[vertex, column]
                     fill[slab] += 1
                 before = vertex
+    if len(slabs.spans) > 0:
+        _span(slabs, scratch[0], scratch[1])
+
+
+@part_kernel
+def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
+    """Fill in the spans; `lows` and `highs` are scratch for the edges of a slab."""
+    bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
+    for area in range(len(scale)):
+        height = 1.0 / scale[area] if scale[area] > 0.0 else 0.0
+        for slab in range(slab_ptr[area], slab_ptr[area + 1]):
+            bottom = bounds[area, 1] + (slab - slab_ptr[area]) * height
+            first, count = edge_ptr[slab], edge_ptr[slab + 1] - edge_ptr[slab]
+            spans[slab, 0], spans[slab, 3] = np.inf, -np.inf
+            for edge in range(count):
+                # least and greatest x where the edge is in the slab
+                start = 2 * (first + edge)
+                x, y, low, high = ends[start, 0], ends[start, 1], np.inf, -np.inf
+                slope = (ends[start + 1, 0] - x) / (ends[start + 1, 1] - y)
+                for end in range(2):
+                    at, level = ends[start + end, 0], ends[start + end, 1]
+                    if level < bottom - SLACK:
+                        at = x + slope * (bottom - SLACK - y)
+                    elif level > bottom + height + SLACK:
+                        at = x + slope * (bottom + height + SLACK - y)
+                    low, high = min(low, at), max(high, at)
+                lows[edge], highs[edge] = low - SLACK, high + SLACK
+                spans[slab, 0] = min(spans[slab, 0], lows[edge])
+                spans[slab, 3] = max(spans[slab, 3], highs[edge])
+            # the widest gap between edges, of those that are inside
+            spans[slab, 1], spans[slab, 2] = np.inf, -np.inf
+            middle, widest = bottom + 0.5 * height, 0.0
+            for edge in range(count):
+                left, right, is_inside = highs[edge], np.inf, False
+                for other in range(count):
+                    if lows[other] > left:
+                        right = min(right, lows[other])
+                        start = 2 * (first + other)
+                        is_above = ends[start, 1] > middle
+                        is_inside = is_inside != (is_above != (ends[start + 1, 1] > middle))
+                    elif highs[other] > left:
+                        right = left  # there is no gap
+                if is_inside and right - left > widest:
+                    spans[slab, 1], spans[slab, 2], widest = left, right, right - left
 
 
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:
@@ -106,54 +157,37 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
 
     Lanes come by block, in the order of the blocks.
     """
-    square = square_around(x, y, half_width)
-    lanes = _joined(road.block_edges, meeting(road.blocks.polygons, square))
+    lanes: IntArray = _select(road.blocks.polygons, road.block_edges, x, y, half_width)
     if not len(road.car_parks):
         return lanes
-    return np.concatenate([lanes, meeting(road.car_parks.polygons, square) + len(road.edges)])
+    parks = meeting(road.car_parks.polygons, square_around(x, y, half_width))
+    return np.concatenate([lanes, parks + len(road.edges)])
 
 
 @kernel
-def _joined(lists: Lists, chosen: IntArray) -> IntArray:
-    """Some of the lists, one after the other."""
-    count = 0
-    for index in chosen:
-        count += lists.ptr[index + 1] - lists.ptr[index]
+def _select(
+    blocks: Polygons, block_edges: Lists, x: float, y: float, half_width: float
+) -> IntArray:
+    """Lanes of the blocks that touch a square."""
+    near, count = meeting(blocks, square_around(x, y, half_width)), 0
+    for block in near:
+        count += block_edges.ptr[block + 1] - block_edges.ptr[block]
     out, count = np.empty(count, np.int64), 0
-    for index in chosen:
-        for entry in range(lists.ptr[index], lists.ptr[index + 1]):
-            out[count] = lists.items[entry]
+    for block in near:
+        for entry in range(block_edges.ptr[block], block_edges.ptr[block + 1]):
+            out[count] = block_edges.items[entry]
             count += 1
     return out
 
 
-@kernel
-def near_areas(bounds: FloatArray, selected: IntArray, corners: FloatArray) -> IntArray:
-    """Those of the selected areas whose bounds overlap the bounds of boxes (P, T, 4, 2)."""
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for x, y in corners.reshape(-1, 2):
-        low_x, high_x = min(low_x, x), max(high_x, x)
-        low_y, high_y = min(low_y, y), max(high_y, y)
-    out, count = np.empty_like(selected), 0
-    for area in selected:
-        if (
-            bounds[area, 0] <= high_x
-            and bounds[area, 2] >= low_x
-            and bounds[area, 1] <= high_y
-            and bounds[area, 3] >= low_y
-        ):
-            out[count] = area
-            count += 1
-    return out[:count]
-
-
 @part_kernel
-def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
-    """Which points (K, 2) lie in the interior of an area, and which on its boundary: bits."""
-    bounds, scale, slab_ptr, edge_ptr, ends = slabs
+def held_points(
+    slabs: Slabs, area: int, points: FloatArray, first: int, stop: int
+) -> tuple[int, int]:
+    """Which of some points (K, 2) lie in the interior of an area, which on its boundary: bits."""
+    bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
     inside = on_boundary = 0
-    for point in range(len(points)):
+    for point in range(first, stop):
         x, y, bit = points[point, 0], points[point, 1], 1 << point
         if not (
             bounds[area, 0] <= x <= bounds[area, 2] and bounds[area, 1] <= y <= bounds[area, 3]
@@ -161,6 +195,11 @@ def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
             continue  # also where a coordinate is NaN
         slab = slab_ptr[area] + int((y - bounds[area, 1]) * scale[area])
         slab = min(slab, slab_ptr[area + 1] - 1)
+        if spans[slab, 1] < x < spans[slab, 2]:
+            inside |= bit
+            continue
+        if x < spans[slab, 0] or x > spans[slab, 3]:
+            continue
         for edge in range(2 * edge_ptr[slab], 2 * edge_ptr[slab + 1], 2):
             ay, by = ends[edge, 1], ends[edge + 1, 1]
             if ay != y and by != y:  # nearly always
@@ -181,15 +220,18 @@ def held_points(slabs: Slabs, area: int, points: FloatArray) -> tuple[int, int]:
     return inside & ~on_boundary, on_boundary
 
 
-@kernel
-def covering(slabs: Slabs, selected: IntArray, points: FloatArray) -> IntArray:
-    """The selected areas that hold a point (1, 2), boundary included, in their order."""
-    out, count = np.empty_like(selected), 0
+@lean_kernel
+def covering(slabs: Slabs, selected: IntArray, points: FloatArray, out: IntArray) -> int:
+    """Write the selected areas that hold a point (1, 2), or have it on their boundary, into `out`.
+
+    They keep their order; how many they are.
+    """
+    count = 0
     for area in selected:
-        if held_points(slabs, area, points) != (0, 0):
+        if held_points(slabs, area, points, 0, 1) != (0, 0):
             out[count] = area
             count += 1
-    return out[:count]
+    return count
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

@@ -42,13 +42,20 @@ def project_box(corners: FloatArray, state: FloatArray, travel: float, out: Floa
 @kernel
 def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
     """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
-    out = np.zeros(len(boxes), np.bool_)
-    x, y, radius = circle_around(footprint)
+    out = np.empty(len(boxes), np.bool_)
+    circle = circle_around(footprint)
     for index in range(len(boxes)):
-        other_x, other_y, other_radius = circle_around(boxes[index])
-        if np.hypot(x - other_x, y - other_y) <= radius + other_radius:
-            out[index] = convex_intersect(boxes[index], footprint)
+        out[index] = touches_box(footprint, circle, boxes[index])
     return out
+
+
+@lean_kernel
+def touches_box(footprint: FloatArray, circle: tuple[float, float, float], box: FloatArray) -> bool:
+    """Whether a box (4, 2), with the circle around it, touches another one."""
+    x, y, radius = circle_around(box)
+    if np.hypot(circle[0] - x, circle[1] - y) > circle[2] + radius:
+        return False
+    return convex_intersect(box, footprint)
 
 
 @kernel
@@ -96,30 +103,33 @@ def hits(
 
 @lean_kernel
 def is_at_fault(
-    state: FloatArray, box: FloatArray, is_off_lane: bool, others: Others, row: int, index: int
+    state: FloatArray,
+    box: FloatArray,
+    is_off_lane: bool,
+    speed: float,
+    centroid: FloatArray,
+    other: FloatArray,
 ) -> bool:
-    """Whether the ego causes a collision with one of the others at a row of time.
+    """Whether the ego causes a collision with a box (4, 2) of a speed [m/s] and a centroid (2,).
 
     `state` (11,) and `box` (4, 2) are the ego's; `is_off_lane`: on several lanes or off the road.
     """
     if np.hypot(state[VX], state[VY]) <= STOPPED:
         return False
-    if others.speeds[row, index] <= STOPPED:
+    if speed <= STOPPED:
         return True
-    center = others.centroids[row, index]
-    if bearing(state, center[0], center[1]) > BEHIND:
+    if bearing(state, centroid[0], centroid[1]) > BEHIND:
         return False
-    return is_off_lane or front_touches(box, others.boxes[row, index])
+    return is_off_lane or front_touches(box, other)
 
 
 @kernel
 def first_faults(
-    places: Places, others: Others, near: IntArray, rows: IntArray, forgives: bool
+    places: Places, others: Others, near: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of the others that are near.
 
-    `rows` (T,) is the row of time of each time index, -1 where it is not looked at. With `forgives`
-    a first contact without fault makes all later ones count as such.
+    `rows` (T,) is the row of time of each time index, -1 where it is not looked at.
 
     Returns:
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
@@ -139,11 +149,10 @@ def first_faults(
                 if decided[entry] or not hits(others, row, index, box, circle):
                     continue
                 state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
-                if is_at_fault(state, box, off_lane, others, row, index):
+                speed, center = others.speeds[row, index], others.centroids[row, index]
+                if is_at_fault(state, box, off_lane, speed, center, others.boxes[row, index]):
                     worth = 0.0 if others.is_agent[index] else 0.5
                     scores[proposal] = min(scores[proposal], worth)
                     first[proposal] = min(first[proposal], float(step))
-                    decided[entry] = True
-                elif forgives:
                     decided[entry] = True
     return scores, first

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import box_corners
-from shiftsim.planners.proposals.areas import Areas, Slabs, held_points, near_areas
+from shiftsim.planners.proposals.areas import Areas, Slabs, held_points
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
 _ALL_CORNERS, _WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
+_MIDDLE = 0b10000  # the point that decides whether the ego is on the route
 
 
 class EgoBox(NamedTuple):
@@ -45,60 +46,63 @@ def find_places(
     size: EgoBox,
     areas: Areas,  # all areas of the map
     selected: IntArray,  # those of this step
-    limits: FloatArray,  # (M,) speed limits of all areas [m/s]
+    limits: FloatArray,  # (M,) speed limits of all areas, or none of them [m/s]
     *,
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
 ) -> Places:
     """Places of driven states (P, T, 11)."""
+    at, near = empty_places(states), np.empty_like(selected)
+    find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
+    return at
+
+
+def empty_places(states: FloatArray) -> Places:
+    """Driven states (P, T, 11) and arrays for their places."""
     shape = states.shape[:2]
-    corners, centers = np.empty((*shape, 4, 2)), np.empty((*shape, 2))
-    _place_ego(states, size, corners, centers)
-    flags, speed_limits = np.empty((*shape, 3), np.bool_), np.empty(shape)
-    points = centers if by_center else np.ascontiguousarray(states[..., :2])
-    near = near_areas(areas.slabs.bounds, selected, corners)
-    _find(areas.slabs, areas.on_route, near, limits, corners, points, flags, speed_limits)
-    off_lane = flags[..., MULTIPLE] | flags[..., OFF_ROAD]
-    return Places(states, corners, centers, flags, off_lane, speed_limits)
+    return Places(
+        states,
+        np.empty((*shape, 4, 2)),
+        np.empty((*shape, 2)),
+        np.empty((*shape, 3), np.bool_),
+        np.empty(shape, np.bool_),
+        np.empty(shape),
+    )
 
 
-@lean_kernel
-def _place_ego(states: FloatArray, size: EgoBox, corners: FloatArray, centers: FloatArray) -> None:
-    """Write corners and centres of driven states."""
-    for row in range(states.shape[0]):
-        for step in range(states.shape[1]):
-            heading = states[row, step, HEADING]
-            x = states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
-            y = states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
-            centers[row, step, 0], centers[row, step, 1] = x, y
-            box_corners(x, y, heading, size.length, size.width, corners[row, step])
-
-
-@lean_kernel
-def _find(
+@kernel
+def find(
     slabs: Slabs,
     on_route: BoolArray,
-    near: IntArray,
+    selected: IntArray,
     limits: FloatArray,
-    corners: FloatArray,
-    points: FloatArray,
-    flags: BoolArray,
-    speed_limits: FloatArray,
+    by_center: bool,
+    size: EgoBox,
+    near: IntArray,  # (M,) scratch
+    at: Places,  # the states are there
 ) -> None:
-    """Fill in flags and speed limits, from the areas near and the points (P, T, 2) of the ego."""
-    bounds, highest = slabs.bounds, 0.0
-    for area in near:
-        highest = max(highest, limits[area])
+    """Fill in the places."""
+    bounds, flags = slabs.bounds, at.flags
+    num_near, highest = _place_ego(at, size, bounds, selected, near), 0.0
+    has_limits = len(limits) > 0
+    for entry in range(num_near if has_limits else 0):
+        highest = max(highest, limits[near[entry]])
+    points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
     guess = -1  # the area that held the whole ego last is tried first
-    for row in range(corners.shape[0]):
-        for step in range(corners.shape[1]):
-            box = corners[row, step]
-            point = points[row, step : step + 1]
+    for row in range(len(flags)):
+        for step in range(flags.shape[1]):
+            box = at.corners[row, step]
+            for corner in range(4):
+                points[corner, 0], points[corner, 1] = box[corner, 0], box[corner, 1]
+            if by_center:
+                points[4, 0], points[4, 1] = at.centers[row, step, 0], at.centers[row, step, 1]
+            else:
+                points[4, 0], points[4, 1] = at.states[row, step, X], at.states[row, step, Y]
             low_x = min(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
             low_y = min(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
             high_x = max(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
             high_y = max(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
             num_touched, held, is_on_route, limit = 0, 0, False, 0.0
-            for entry in range(-1, len(near)):
+            for entry in range(-1, num_near):
                 area = guess if entry < 0 else near[entry]
                 if area < 0 or (entry >= 0 and area == guess):
                     continue
@@ -112,10 +116,7 @@ def _find(
                     and high_y >= bounds[area, 1]
                 ):
                     continue
-                if not is_known and held_points(slabs, area, point)[0] != 0:
-                    limit = max(limit, limits[area])
-                    is_on_route = is_on_route or on_route[area]
-                if held == _WHOLE or (
+                is_settled = held == _WHOLE or (
                     num_touched > 1
                     and held == _ALL_CORNERS  # only an area that holds the box changes anything
                     and not (
@@ -124,9 +125,15 @@ def _find(
                         and bounds[area, 1] <= low_y
                         and bounds[area, 3] >= high_y
                     )
-                ):
+                )
+                if is_settled and is_known:
                     continue
-                within = held_points(slabs, area, box)[0]
+                first, stop = 4 if is_settled else 0, 4 if is_known else 5
+                within = held_points(slabs, area, points, first, stop)[0]
+                if within & _MIDDLE != 0:
+                    limit = max(limit, limits[area]) if has_limits else limit
+                    is_on_route = is_on_route or on_route[area]
+                within &= _ALL_CORNERS
                 if within == _ALL_CORNERS:
                     held, guess = _WHOLE, area
                 elif within > 0:
@@ -135,4 +142,36 @@ def _find(
             flags[row, step, MULTIPLE] = num_touched > 1 and held != _WHOLE
             flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
             flags[row, step, OFF_ROUTE] = not is_on_route
-            speed_limits[row, step] = limit
+            at.off_lane[row, step] = flags[row, step, MULTIPLE] or flags[row, step, OFF_ROAD]
+            at.speed_limits[row, step] = limit
+
+
+@lean_kernel
+def _place_ego(
+    at: Places, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
+) -> int:
+    """Write corners and centres, and which of the selected areas may be met; how many they are."""
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for row in range(at.states.shape[0]):
+        for step in range(at.states.shape[1]):
+            heading = at.states[row, step, HEADING]
+            x = at.states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
+            y = at.states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
+            at.centers[row, step, 0], at.centers[row, step, 1] = x, y
+            corners = at.corners[row, step]
+            box_corners(x, y, heading, size.length, size.width, corners)
+            for corner in range(4):
+                low_x, high_x = min(low_x, corners[corner, 0]), max(high_x, corners[corner, 0])
+                low_y, high_y = min(low_y, corners[corner, 1]), max(high_y, corners[corner, 1])
+    count = 0
+    for area in selected:
+        if (
+            bounds[area, 0] <= high_x
+            and bounds[area, 2] >= low_x
+            and bounds[area, 1] <= high_y
+            and bounds[area, 3] >= low_y
+        ):
+            near[count] = area
+            count += 1
+    return count

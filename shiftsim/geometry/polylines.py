@@ -196,9 +196,14 @@ def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
     s = min(max(progress, path.progress[0]), path.progress[last])
-    upper = min(max(int(np.searchsorted(path.progress, s)), 1), last)
+    return pose_before(path, min(max(int(np.searchsorted(path.progress, s)), 1), last), s)
+
+
+@lean_kernel
+def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, float]:
+    """As `pose_at`, between a vertex and the one before, which have the progress between them."""
     lower = upper - 1
-    ahead = s - path.progress[lower]
+    ahead = progress - path.progress[lower]
     span = path.progress[upper] - path.progress[lower]
     return (
         interpolate(path.xy[lower, 0], path.xy[upper, 0], span, ahead),
@@ -215,12 +220,16 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     """
     num_runs = len(path.runs)
     guess = min(max(guess, 0), num_runs - 1)
-    bound = _project_on_run(path, guess, x, y)[0] + SLACK
+    least, along = _project_on_run(path, guess, x, y)
+    bound = least + SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        if not is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+        if run == guess:
+            distance, progress = least, along
+        elif is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+            distance, progress = _project_on_run(path, run, x, y)
+        else:
             continue
-        distance, progress = _project_on_run(path, run, x, y)
         if distance < best:
             best, found, run_found = distance, progress, run
     return found, best, run_found

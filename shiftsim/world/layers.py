@@ -310,8 +310,11 @@ def meeting(polygons: Polygons, ring: FloatArray) -> IntArray:
 def square_around(x: float, y: float, half_width: float) -> FloatArray:
     """(4, 2) corners of an axis-parallel square, counter-clockwise [m]."""
     low_x, low_y, high_x, high_y = x - half_width, y - half_width, x + half_width, y + half_width
-    corners = (high_x, high_y, low_x, high_y, low_x, low_y, high_x, low_y)
-    return np.array(corners).reshape(4, 2)
+    out = np.empty((4, 2))
+    for corner in range(4):
+        out[corner, 0] = low_x if corner == 1 or corner == 2 else high_x
+        out[corner, 1] = high_y if corner < 2 else low_y
+    return out
 
 
 @dataclass(frozen=True)

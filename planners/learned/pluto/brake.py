@@ -3,7 +3,13 @@
 import numpy as np
 
 from shiftsim.arrays import FloatArray, kernel
-from shiftsim.planners.proposals.tracker import DT, Profiles, fit_profiles, look_ahead
+from shiftsim.planners.proposals.tracker import (
+    DT,
+    Profiles,
+    factor_speed_fit,
+    fit_profiles,
+    look_ahead,
+)
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.dynamics.lqr import (
     NUPLAN,
@@ -47,7 +53,14 @@ def _roll_out(
 ) -> None:
     """Drive along poses (81, 3) to a standstill; `states` (81, 11) starts with the ego's."""
     count = len(poses) - 1
-    profiles = Profiles(np.empty(count), np.empty(count), np.empty(params.horizon))
+    profiles = Profiles(
+        np.empty(count),
+        np.empty(count),
+        np.empty(params.horizon),
+        np.empty((count + 1, 2)),
+        np.empty((3, count)),
+    )
+    factor_speed_fit(dt, params.jerk_penalty, profiles.factors)
     fit_profiles(poses, dt, params, profiles)
     for step in range(count):
         state = states[step]

@@ -31,7 +31,7 @@ def collisions(
     rows = np.arange(places.states.shape[1])
     rows[0] = -1
     # nuPlan rule 251: a contact without fault is looked at again
-    scores, first = first_faults(places, others, near, rows, False)
+    scores, first = first_faults(places, others, near, rows)
     # a red light after another fault does not count
     is_red = (first_red < NEVER) & (first_red <= first)
     return np.where(is_red, 0.0, scores), DT * np.minimum(first, first_red)
@@ -77,7 +77,12 @@ def times_to_collision(places: Places, others: Others, near: IntArray) -> FloatA
                 off_lane = places.off_lane[proposal, number]
                 for index in near:
                     if hits(others, step, index, box, circle):
-                        if is_at_fault(then, box, off_lane, others, number, index):
+                        speed, center = (
+                            others.speeds[number, index],
+                            others.centroids[number, index],
+                        )
+                        other = others.boxes[number, index]
+                        if is_at_fault(then, box, off_lane, speed, center, other):
                             scores[proposal] = 0.0
             if scores[proposal] == 0.0:
                 break

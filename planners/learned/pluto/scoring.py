@@ -73,8 +73,7 @@ def score(
     ttc = times_to_collision(at, others, near)
     factors = np.stack([clear, on_road(at.flags[..., OFF_ROAD]), direction(driven, at.flags)])
     progress = travel(driven, place.baseline)
-    is_within = comfort(driven, ComfortBounds()).is_within.all(axis=1)
-    comfortable = np.where(is_within, 1.0, 0.0)
+    comfortable = comfort(driven, ComfortBounds()).score
     terms = np.stack([np.empty(len(ttc)), speed_score(driven, at.speed_limits), comfortable, ttc])
     terms[0], rule = aggregate(factors, terms, progress)
     total = rule + LEARNED_WEIGHT * learned

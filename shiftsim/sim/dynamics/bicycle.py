@@ -48,6 +48,20 @@ def step_bicycle(
     out: FloatArray,
 ) -> None:
     """Advance the kinematic bicycle by one Euler step, low-pass filters included."""
+    turn_and_step(state, np.tan(state[STEERING]), accel, steering_rate, wheel_base, dt, out)
+
+
+@lean_kernel
+def turn_and_step(
+    state: FloatArray,
+    tangent: float,  # of the steering angle
+    accel: float,
+    steering_rate: float,
+    wheel_base: float,
+    dt: float,
+    out: FloatArray,
+) -> float:
+    """As `step_bicycle`; the tangent of the new steering angle, for the next step."""
     heading, speed, steering = state[HEADING], state[VX], state[STEERING]
     old_accel, old_yaw_rate = state[AX], state[YAW_RATE]
     new_accel = old_accel + dt / (dt + ACCEL_TIME_CONSTANT) * (accel - old_accel)
@@ -59,10 +73,11 @@ def step_bicycle(
     # nuPlan rule 15: the pose uses the old steering angle, the yaw rate the new one; the stored
     # rate is the one before clipping
     new_steering = min(max(steering + rate * dt, -MAX_STEERING), MAX_STEERING)
-    yaw_rate = new_speed * np.tan(new_steering) / wheel_base
+    new_tangent = np.tan(new_steering)
+    yaw_rate = new_speed * new_tangent / wheel_base
     out[X] = state[X] + speed * np.cos(heading) * dt
     out[Y] = state[Y] + speed * np.sin(heading) * dt
-    out[HEADING] = wrap_angle(heading + speed * np.tan(steering) / wheel_base * dt)
+    out[HEADING] = wrap_angle(heading + speed * tangent / wheel_base * dt)
     out[VX] = new_speed
     out[VY] = 0.0
     out[AX] = new_accel
@@ -71,6 +86,7 @@ def step_bicycle(
     out[STEERING_RATE] = rate
     out[YAW_RATE] = yaw_rate
     out[YAW_ACCEL] = (yaw_rate - old_yaw_rate) / dt
+    return new_tangent
 
 
 @lean_kernel

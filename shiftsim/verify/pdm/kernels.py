@@ -57,7 +57,7 @@ def _tracker(case: Source, where: str) -> None:
 
 
 def _comfort(case: Source, where: str) -> None:
-    signals, bounded = comfort(case.take("states", SCORED + 1, NUM_STATE)[None], DEFAULT.comfort)
+    signals, bounded, _ = comfort(case.take("states", SCORED + 1, NUM_STATE)[None], DEFAULT.comfort)
     ours = {"is_comfortable": bounded[0], **dict(zip(SIGNALS, signals[0], strict=True))}
     case.match(where, ours, SIGNAL_TOLERANCE)
     case.note("states: all but heading, ax and ay are not read by the test")
@@ -73,7 +73,7 @@ def _path(case: Source, where: str) -> None:
     poses, queries = case.take("vertices", -1, 3), case.take("query_s", -1)
     path, at = make_path(poses), np.empty((len(queries), 3))
     for progress, pose in zip(queries.tolist(), at, strict=True):
-        rollout.read_pose(path, progress, pose)
+        rollout.read_pose(path, progress, np.full(3, np.nan), pose)
     points = case.take("query_xy", -1, 2).tolist()
     ours = {
         "progress": path.progress,

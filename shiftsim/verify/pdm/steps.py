@@ -46,9 +46,9 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
     file = read_arrays(path.with_suffix(".npz"), report, "PDM")
     ego, limit, planner = np.array(inputs["ego_state"]), inputs["speed_limit_mps"], PdmClosed()
-    planner.follow(np.array(inputs["centerline"], np.float64))
-    seen = _see(inputs, ego, planner.paths[0])
-    step = planner.step_in(seen, ego, np.nan if limit is None else limit, PACIFICA)
+    paths = planner.follow(np.array(inputs["centerline"], np.float64))
+    seen = _see(inputs, ego, paths.at(0))
+    step = planner.step_in(seen, paths, ego, np.nan if limit is None else limit, PACIFICA)
     facts[where] = made = {
         **{"seen": seen, "collided": planner.collided, "step": step, "arrays": step_arrays(step)},
         "boxes": seen.forecast.others.boxes[[0, 5, 20]],  # two time indices each

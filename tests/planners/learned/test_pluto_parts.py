@@ -18,7 +18,7 @@ from shiftsim.planners.learned.pluto.reference import (
 )
 from shiftsim.planners.learned.pluto.scoring import Place, aggregate, normalise, on_road, score
 from shiftsim.planners.learned.pluto.world import Agents, make_world, static_objects
-from shiftsim.planners.proposals.contacts import Others, is_at_fault
+from shiftsim.planners.proposals.contacts import is_at_fault
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.state import AX, NUM_STATE, PACIFICA, VX, AgentKind, center_poses
 
@@ -230,14 +230,11 @@ def test_a_red_connector_is_a_fault_also_when_the_ego_stands_on_it(road):
 
 @given(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
 def test_a_standing_ego_is_never_at_fault_and_a_standing_object_never_to_blame(x, y):
-    center = np.array([[[x + 2.5, y]]])
-    moves, none = np.array([[3.0]]), np.zeros(1, np.bool_)
-    moving = Others(FOOTPRINT + center - [2.5, 0.0], center, center, moves, np.ones(1), none, none)
-    moving = moving._replace(boxes=moving.boxes[None])
+    center = np.array([x + 2.5, y])
+    box = FOOTPRINT + center - [2.5, 0.0]
     still, driving = ego_state(0.0, speed=0.0), ego_state(0.0, speed=5.0)
-    assert not is_at_fault(still, FOOTPRINT, True, moving, 0, 0)
-    standing = moving._replace(speeds=np.array([[0.0]]))
-    assert is_at_fault(driving, FOOTPRINT, False, standing, 0, 0)
+    assert not is_at_fault(still, FOOTPRINT, True, 3.0, center, box)
+    assert is_at_fault(driving, FOOTPRINT, False, 0.0, center, box)
 
 
 def test_progress_is_compared_only_if_anybody_makes_some():

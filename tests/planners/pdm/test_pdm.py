@@ -17,8 +17,8 @@ from worlds import (
 )
 
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.geometry.polylines import HIT, make_path
-from shiftsim.planners.pdm.corridor import corridor_shape, fill_corridor, make_corridor
+from shiftsim.geometry.polylines import HIT, OPEN, make_path
+from shiftsim.planners.pdm.corridor import corridor_shape, decide, fill_corridor, make_corridors
 from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
 from shiftsim.planners.pdm.planner import PdmClosed
@@ -184,16 +184,20 @@ def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
     poses = np.column_stack([rng.uniform(0, 60, (40, 1)), rng.uniform(-8, 8, 40), heading[:40]])
     poses[:, :2] = path.xy[rng.integers(0, 60, 40)] + rng.uniform(-4, 4, (40, 2))
     tracks = standing_tracks(1, poses, [VEHICLE] * 40)
-    tracks.velocities[:] = rng.normal(0.0, 3.0, (1, 40, 2))
+    tracks.velocities[:, 10:] = rng.normal(0.0, 3.0, (1, 30, 2))  # the others stand still
     forecast = make_forecast(tracks, np.arange(40), red_lights([], []))
-    corridor = make_corridor(10.3, 42.0, 1.1485, 40)
-    fill_corridor(path, corridor, forecast, 0, 21)
-    polygon = corridor_shape(path, corridor)
-    for row in range(21):
+    corridors = make_corridors(1, 1.1485, 40)
+    corridors.spans[0] = 10.3, 42.0
+    for first, last in ((1, 11), (11, 21)):
+        fill_corridor(path, corridors, forecast, 0, first, last)
+    polygon = corridor_shape(path, 10.3, 42.0, 1.1485)
+    for row, it in np.argwhere(corridors.sides[0] == OPEN).tolist():
+        decide(polygon, corridors, forecast, 0, row, it)
+    for row in range(1, 21):
         touches = [
             polygon.intersects(shapely.Polygon(ring_of(forecast, i, row))) for i in range(40)
         ]
-        np.testing.assert_array_equal(corridor.sides[row] == HIT, touches)
+        np.testing.assert_array_equal(corridors.sides[0, row] == HIT, touches)
 
 
 def test_the_nearest_of_each_kind_are_seen_static_objects_first():
@@ -201,3 +205,22 @@ def test_the_nearest_of_each_kind_are_seen_static_objects_first():
     tracks = standing_tracks(1, np.array(poses), [VEHICLE] * 55 + [CONE] * 5)
     chosen = select_tracks(tracks, 0.0, 0.0, {f"{2:016x}"}, replace(DEFAULT, map_radius=58.0))
     assert chosen.tolist() == [55, 56, 57, *(i for i in range(51) if i != 2)]
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_tracks_are_seen_by_group_and_distance_also_where_some_are_equally_far(seed, is_tied):
+    rng = np.random.default_rng(seed)
+    poses = rng.uniform(-60.0, 60.0, (120, 3))
+    if is_tied:
+        poses = np.rint(poses / 10.0)
+    kinds = rng.integers(0, 7, 120)
+    tracks = standing_tracks(1, poses, [AgentKind(kind) for kind in kinds.tolist()])
+    tracks.valid[0] = rng.uniform(size=120) < 0.8
+    distance = np.hypot(poses[:, 0], poses[:, 1])
+    expected = []
+    for members, most in ((kinds > 2, 50), (kinds == 0, 50), (kinds == 1, 25), (kinds == 2, 10)):
+        here = np.flatnonzero(members & tracks.valid[0] & (distance <= DEFAULT.map_radius))
+        here = here[np.argsort(kinds[here], kind="stable")]
+        expected += here[np.argsort(distance[here])[:most]].tolist()
+    assert select_tracks(tracks, 0.0, 0.0, set(), DEFAULT).tolist() == expected
