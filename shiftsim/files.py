@@ -23,9 +23,9 @@ from typing import Any, BinaryIO
 from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
+# a line end is found twice as fast as a line's beginning
 _IMPORT = re.compile(
-    r"^ *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))",
-    re.MULTILINE,
+    r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )
 
 
@@ -283,7 +283,7 @@ def _read_source(name: str) -> tuple[bytes, list[str]]:
     """The text of a module, and the modules that its import statements name."""
     text = (PACKAGE / name).read_bytes()
     imported = []
-    for module, block, line, plain in _IMPORT.findall(text.decode()):
+    for module, block, line, plain in _IMPORT.findall("\n" + text.decode()):
         place = (module or plain).replace(".", "/")
         for at in (place, *(f"{place}/{word}" for word in re.findall(r"\w+", block + line))):
             imported += [f"{at}.py", f"{at}/__init__.py"]

@@ -8,6 +8,7 @@ optimised where they end up. That, less search for garbage and no passes for wha
 """
 
 import gc
+from functools import cached_property
 from typing import Any
 
 from numba.core import event, types
@@ -46,9 +47,13 @@ class _Kernel(CPUDispatcher):
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         super().__init__(function, {}, options, _Short)
         self._parts: dict[Any, Any] = {}  # by types of arguments
-        compiler: Any = type(vars(self)["_compiler"])
-        self._make = compiler(function, self.targetdescr, options, {}, _ShortPart)
         self._cache = Kept(function)
+
+    @cached_property
+    def _make(self) -> Any:
+        """What compiles parts; most kernels of a process are kept, or never called."""
+        compiler: Any = type(vars(self)["_compiler"])
+        return compiler(self.py_func, self.targetdescr, self.targetoptions, {}, _ShortPart)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """For a kernel that calls this one: what it may be called with, the part being there."""

@@ -315,7 +315,7 @@ def _command(name: str) -> Any:
         alone.command()(found)
         command = typer.main.get_command(alone)
     command.name = name
-    return command
+    return completion.with_plain_values(command)
 
 
 app = new_app(
@@ -371,7 +371,7 @@ def _raised_nowhere(found: Any) -> None:
 
 def _run(words: list[str], debug: bool) -> int:
     try:
-        command = typer.main.get_command(app)
+        command = completion.with_plain_values(typer.main.get_command(app))
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED

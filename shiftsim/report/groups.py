@@ -338,9 +338,9 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
 
 def _of_tokens(table: pa.Table, name: str, tokens: Sequence[str]) -> tuple[str, ...]:
     """A column that is the same for all rollouts of a scenario; empty where nothing is known."""
-    found = table.select(["token", name]).group_by("token").aggregate([(name, "max")]).to_pylist()
-    known = {row["token"]: row[f"{name}_max"] for row in found}
-    return tuple(known.get(token) or "" for token in tokens)
+    rows = zip(table["token"].to_pylist(), table[name].to_pylist(), strict=True)
+    known = dict(sorted({(token, value or "") for token, value in rows}))  # the last one counts
+    return tuple(known.get(token, "") for token in tokens)
 
 
 def _published_list(

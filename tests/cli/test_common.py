@@ -1,5 +1,8 @@
 """Options of the command line are the settings of a run."""
 
+import os
+import subprocess
+import sys
 from dataclasses import fields
 
 import pytest
@@ -59,3 +62,20 @@ def test_a_command_gets_the_settings_that_were_given(words, expected):
     assert done.exit_code == 0, done.output
     assert found == [expected]
     make_config({"planners": ["idm"], **found[0]})
+
+
+@pytest.mark.parametrize(("given", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
+def test_a_command_computes_in_one_thread_unless_told_otherwise(given, threads):
+    code = (
+        "import os, sys\n"
+        "from shiftsim.__main__ import main\n"
+        "try:\n    main()\nfinally:\n"
+        "    import numpy\n"
+        "    print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
+    )
+    others = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
+    command = [sys.executable, "-c", code, "--version"]
+    done = subprocess.run(command, env=others | given, capture_output=True, text=True, check=True)
+    told, running = done.stdout.splitlines()[-1].split()
+    assert told == threads
+    assert int(running) <= int(threads)

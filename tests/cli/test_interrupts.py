@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import shiftsim.runs.execute  # noqa: F401  what is imported while a test replaces it would stay
 from shiftsim.cli import main
 
 CASES = [
