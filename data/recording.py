@@ -174,6 +174,8 @@ def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
 def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: IntArray) -> None:
     last = np.full(16, -1)
     for frame in range(valid.shape[0]):
+        if frame > 0 and _is_same(valid, frame):
+            continue  # it tells nothing new
         for kind in range(len(last)):
             last[kind] = -1
         for track in range(valid.shape[1]):
@@ -184,6 +186,15 @@ def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: I
                 before[last[kind], track] = True
             last[kind] = track
             first[track] = min(first[track], frame)
+
+
+@lean_kernel
+def _is_same(valid: BoolArray, frame: int) -> bool:
+    """Whether a frame has the tracks of the one before."""
+    same = True
+    for track in range(valid.shape[1]):
+        same &= valid[frame, track] == valid[frame - 1, track]
+    return same
 
 
 @kernel

@@ -27,11 +27,10 @@ from shiftsim.files import PACKAGE, fresh_python, kernel_folders
 from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import default_workers
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.metric_worlds import read_world
-from shiftsim.verify.worlds import make_scenario, make_tracks
+from shiftsim.verify.worlds import read_world
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA
+from shiftsim.world.scenario import Scenario, scenario_of_rows
+from shiftsim.world.state import PACIFICA, AgentKind, tracks_of_boxes
 
 WORLD = PACKAGE / "verify" / "reference" / "metric_worlds" / "metric_world_21.json"
 
@@ -129,14 +128,14 @@ def _rollout() -> tuple[SimulationLog, VectorMap]:
     values = np.ones((len(log.time_us), 2, 7))
     values[..., :3] = log.ego[:, None, :3] + [[12.0, 0.0, 0.0], [30.0, 0.0, 0.0]]
     values[..., 5:] = 2.0
-    tracks = make_tracks(values.shape[:2], ..., values, ("vehicle", "pedestrian"), ("a", "b"))
+    tracks = tracks_of_boxes(values, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN), ("a", "b"))
     return replace(log, tracks=tracks), road
 
 
 def scene() -> Scenario:
     """A scenario of a dozen iterations: a small map with a route, a car, a pedestrian."""
     log, road = _rollout()
-    out = make_scenario(log.token, road, log.time_us, log.ego, log.tracks)
+    out = scenario_of_rows(log.token, road, log.time_us, log.ego, log.tracks)
     return replace(out, iteration_rows=np.arange(12, dtype=np.int64), route=("R1", "RC1", "R2"))
 
 

@@ -12,7 +12,6 @@ from time import process_time
 import numpy as np
 import pytest
 
-from shiftsim.data.nuplan.scenarios import read_scenario
 from shiftsim.runs.edits.interplan.build import apply_code
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.verify.scenario_edits import WINDOW
@@ -41,15 +40,13 @@ def codes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reference")
     with tarfile.open(GOLDEN / "nuplan.tar.xz") as archive:
         archive.extractall(folder)
-    scenes = Scenes(folder / "nuplan")
+    scenes = Scenes(folder / "nuplan", mapping=WINDOW)
     cases = json.loads((GOLDEN / "scenario_edits" / "build.json").read_text())["cases"]
     found = {}
     for case in (case for case in cases if "error" not in case):
-        entry = scenes.entries[case["scene"]]
-        road = scenes.maps[entry["map"]]
-        scene = read_scenario(scenes.folder / entry["db"], entry["token"], road, WINDOW)
         table = {"name": case["code"], "code": case["code"], "details": case.get("details") or {}}
-        found[f"{case['scene']} {case['code']}"] = (scene, make_edit(table, "benchmark"))
+        edit = make_edit(table, "benchmark")
+        found[f"{case['scene']} {case['code']}"] = scenes[case["scene"]], edit
     return found
 
 

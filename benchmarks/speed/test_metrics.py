@@ -9,7 +9,7 @@ import numpy as np
 from shiftsim.metrics import compute_metrics, judge
 from shiftsim.metrics import measure as measure_rollout
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.metric_worlds import read_world
+from shiftsim.verify.worlds import read_world
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks
 

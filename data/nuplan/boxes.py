@@ -10,7 +10,7 @@ from shiftsim.data.nuplan.log import Log, as_numbers, note_implausible, read_row
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError
 from shiftsim.world.ranges import STORE
-from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, tracks_of_boxes
 
 _COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
 _KINDS = {kind.name.lower(): int(kind) for kind in AgentKind}
@@ -125,17 +125,11 @@ def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tra
     first_frame = frame[np.unique(track, return_index=True)[1]]
     order = sort_tracks(before, kinds, first_frame)
     place = np.argsort(order)
-    shape = (last - first, len(index))
-    valid = np.zeros(shape, np.bool_)
-    poses, velocities, sizes = (np.full((*shape, n), np.nan) for n in (3, 2, 2))
-    where = (frame, place[track])
-    valid[where] = True
-    twice = int(len(frame) - valid.sum())
+    dense = np.full((last - first, len(index), 7), np.nan)
+    dense[frame, place[track]] = boxes.values[:, :7]
+    dense[:, kinds[order] > LAST_AGENT_KIND, 3:5] = np.nan  # nuPlan rule 420
+    tokens = np.array(list(index), object)[order].tolist()
+    tracks = tracks_of_boxes(dense, kinds[order], tokens)
+    twice = int(len(frame) - tracks.valid.sum())
     flaws["track listed twice in a frame: the last one is kept"] += twice
-    poses[where] = boxes.values[:, :3]
-    poses[..., 2] = np.where(valid, poses[..., 2], np.nan)
-    velocities[where] = boxes.values[:, 3:5]
-    velocities[:, kinds[order] > LAST_AGENT_KIND] = np.nan  # nuPlan rule 420
-    sizes[where] = boxes.values[:, 5:7]
-    tokens = tuple(np.array(list(index), object)[order].tolist())
-    return Tracks(valid, poses, velocities, sizes, kinds[order], tokens)
+    return tracks

@@ -4,10 +4,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from shiftsim.arrays import FloatArray, IntArray
-from shiftsim.data.store import schema
 from shiftsim.data.store.tracks import StoredRecording
 from shiftsim.data.tracks.motion import (
     MAX_SHARE,
@@ -45,17 +43,9 @@ class Boxes(NamedTuple):
 
 def read_boxes(recording: StoredRecording) -> Boxes:
     """All boxes of a recording, those that occur twice, too."""
-    table = recording.tracks.read()
-    names = schema.TRACKS.names
-    row, track = (table[name].to_numpy().astype(np.int64) for name in names[:2])
+    row, track, motion = recording.boxes()
     order = np.lexsort((row, track))
-    values = [_column(table, name)[order] for name in names[2:7]]
-    return Boxes(row[order], track[order], np.stack(values[:3], 1), np.stack(values[3:], 1))
-
-
-def _column(table: pa.Table, name: str) -> FloatArray:
-    found: FloatArray = table[name].to_numpy().astype(np.float64, copy=False)
-    return found
+    return Boxes(row[order], track[order], motion[order, :3], motion[order, 3:])
 
 
 def check_boxes(recording: StoredRecording, boxes: Boxes, time_us: IntArray) -> Iterator[Finding]:

@@ -53,6 +53,9 @@ class ScenarioStore:
         self.hash = str(manifest["hash"])
         self.generator: dict[str, Any] = dict(manifest.get("generator", {}))
         self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
+        self._columns = {
+            name: self._table[name].combine_chunks() for name in schema.SCENARIOS.names
+        }
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
         self.is_reviewed = (path / tables.REVIEW).is_file()
         if self.is_reviewed:
@@ -120,12 +123,18 @@ class ScenarioStore:
             )
         path = str(self.path / tables.SCENARIOS)
         try:
-            window = window_of(self._table.slice(self._row_of[token], 1).to_pylist()[0])
+            window = window_of(self._row(token))
         except (ValueError, RecursionError) as error:
             what = f"{path}: scenario {token!r}: metadata is not JSON: {error}"
             raise DataError(what, tables.REPAIR) from error
         require_rows(window, path)
         return window
+
+    def _row(self, token: str) -> dict[str, Any]:
+        at = self._row_of[token]
+        rows = self._columns["iteration_rows"][at].values.to_numpy(zero_copy_only=False)
+        plain = {n: c[at].as_py() for n, c in self._columns.items() if n != "iteration_rows"}
+        return {**plain, "iteration_rows": rows}
 
     def read(self, token: str, *, plausible: bool = True) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.

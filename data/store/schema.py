@@ -6,7 +6,7 @@
     maps/<city>.parquet               one row: the arrays of the map, flat
     recordings/<log>/frames.parquet   one row per row of the recording: time, traffic lights
     recordings/<log>/tracks.parquet   one row per box, in blocks of `BLOCK_ROWS` rows of time
-    recordings/<log>/ego-<name>.parquet  one row per row of the recording: states of one ego
+    recordings/<log>/ego-<name>.parquet  states of one ego, for some rows of the recording
 
 A recording is stored once; a scenario is a window into it. Names of logs and egos are percent
 encoded in file names. Lists that belong to a whole file (tokens and kinds of the tracks, ids of
@@ -20,8 +20,8 @@ from shiftsim.data.arrow import defer_pandas
 defer_pandas()  # before the first array
 
 FORMAT = "shiftsim-store"
-VERSION = 2
-READABLE = (1, 2)
+VERSION = 3
+READABLE = (1, 2, 3)
 # rows of a recording per row group of tracks, about: what opening one costs is that of 80 more rows
 BLOCK_ROWS = 512
 FIRST_BLOCK_ROWS = 128  # in version 1, whose footers do not say it
@@ -63,17 +63,14 @@ FRAMES = _schema(
     # … one LightStatus code per connector of the footer, -1 not listed
 )
 
-TRACKS = _schema(
-    row=_I32,  # row of the recording
-    track=_I32,  # index into the footer's tokens and kinds
-    x_m=_F64,  # box centre
-    y_m=_F64,
-    heading_rad=_F64,
-    vx_mps=_F64,  # velocity in the map frame; NaN for static objects
-    vy_mps=_F64,
-    length_m=_F64,
-    width_m=_F64,
-)
+# Columns that change evenly in time are stored as second differences of their bits, in the order of
+# the rows and from the beginning of each row group (`shiftsim.data.store.boxes`).
+CODED = "_diff2"  # how the names of these columns end
+MOTION = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps")  # of a box's centre, in the map frame
+_INDICES = {"row": _I32, "track": _I32}  # row of the recording; in the footer's tokens and kinds
+_SIZES = {"length_m": _F64, "width_m": _F64}
+TRACKS = _schema(**{f"{name}{CODED}": _I64 for name in MOTION}, **_INDICES, **_SIZES)
+FORMER_TRACKS = _schema(**dict.fromkeys(MOTION, _F64), **_INDICES, **_SIZES)  # up to version 2
 
 EGO_COLUMNS = (
     "x_m",
@@ -88,7 +85,8 @@ EGO_COLUMNS = (
     "yaw_rate_radps",
     "yaw_accel_radps2",
 )
-EGO = _schema(**dict.fromkeys(EGO_COLUMNS, _F64))
+EGO = _schema(states_diff2=_I64)  # in each row group all of the first column, then of the next, …
+FORMER_EGO = _schema(**dict.fromkeys(EGO_COLUMNS, _F64))  # up to version 2
 
 # Columns of few values in any file.
 REPEATING = (

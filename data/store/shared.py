@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from shiftsim.world.map import LAYERS, VectorMap
 
 _LOG = logging.getLogger(__name__)
 _PACKED, _UNPACKED = 100_000, 4 << 20  # bytes from which on a map is kept: in the store, in memory
-_ALIGNMENT = 64  # bytes
+_ALIGNMENT, _PIECE = 64, 1 << 18  # bytes; of an array, and read at once
 _SUM, _LENGTH = 8, 16  # bytes: checksum of all that follows, and length of the description, in hex
 
 
@@ -107,9 +107,9 @@ def _write(path: Path, road: VectorMap) -> None:
             for _, array in _arrays(road):
                 file.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
                 file.write(bytes(-array.nbytes % _ALIGNMENT))
-            file.flush()
-            with mmap.mmap(file.fileno(), 0) as whole:
-                whole[:_SUM] = b"%0*x" % (_SUM, _checksum(whole))
+            total = _checksum(file)
+            file.seek(0)
+            file.write(b"%0*x" % (_SUM, total))
         partial.replace(path)
 
 
@@ -117,9 +117,13 @@ def _names(places: dict[str, Any]) -> set[str]:
     return {name.partition(".")[0] for name in places}
 
 
-def _checksum(whole: mmap.mmap) -> int:
-    with memoryview(whole) as view, view[_SUM:] as content:
-        return zlib.crc32(content)
+def _checksum(file: BinaryIO) -> int:
+    """Of what follows the sum; read, as every page of a mapping that is looked at stays."""
+    file.seek(_SUM)
+    total = 0
+    while piece := file.read(_PIECE):
+        total = zlib.crc32(piece, total)
+    return total
 
 
 def _open(path: Path) -> VectorMap:
@@ -131,8 +135,8 @@ def _open(path: Path) -> VectorMap:
     """
     with path.open("rb") as file:
         whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    if int(whole[:_SUM], 16) != _checksum(whole):
-        raise ValueError("the checksum is wrong")
+        if int(whole[:_SUM], 16) != _checksum(file):
+            raise ValueError("the checksum is wrong")
     start = _SUM + _LENGTH + int(whole[_SUM : _SUM + _LENGTH], 16)
     about = json.loads(whole[_SUM + _LENGTH : start])
     arrays = {

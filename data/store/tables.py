@@ -149,7 +149,7 @@ def write_blocks(
 
 
 def _encodings(described: pa.Schema, repeating: Container[str]) -> dict[str, Any]:
-    """How columns are written: floats as their bytes in planes, integers as their differences.
+    """How columns are written: floats and codes as bytes in planes, integers as differences.
 
     Both compress much better than numbers as they are, and any reader undoes them.
     """
@@ -160,10 +160,10 @@ def _encodings(described: pa.Schema, repeating: Container[str]) -> dict[str, Any
         name = f"{field.name}.list.element" if is_list else field.name
         if field.name in repeating:
             dictionaries.append(name)
+        elif kind == pa.float64() or field.name.endswith(schema.CODED):
+            encodings[name] = "BYTE_STREAM_SPLIT"
         elif kind in (pa.int32(), pa.int64()):
             encodings[name] = "DELTA_BINARY_PACKED"
-        elif kind == pa.float64():
-            encodings[name] = "BYTE_STREAM_SPLIT"
     return {"use_dictionary": dictionaries, "column_encoding": encodings}
 
 
@@ -186,7 +186,7 @@ class Table:
         """`former` is what files have that lack the first column of what is expected."""
         self.path = path
         try:
-            self._file = pq.ParquetFile(path, memory_map=True)
+            self._file = pq.ParquetFile(path, memory_map=True, pre_buffer=False)
         except (OSError, ValueError, pa.ArrowException) as error:
             what = (
                 "is missing"
@@ -205,7 +205,8 @@ class Table:
             if not kind.equals(field.type):
                 raise DataError(f"{column} is {kind}, not {field.type}", hint=REPAIR)
         self.names = expected.names
-        self._full = {field.name for field in expected if not field.nullable}
+        self._texts = [field.name for field in expected if pa.types.is_string(field.type)]
+        self._full = [f.name for f in expected if found.field(f.name).nullable and not f.nullable]
         self.footer = self._read_footer()
 
     def _read_footer(self) -> dict[str, object]:
@@ -235,16 +236,17 @@ class Table:
             DataError: The file is damaged.
         """
         groups = list(range(self.num_blocks)) if blocks is None else blocks
+        wanted = self.names if columns is None else columns
         try:
-            found = self._file.read_row_groups(groups, columns or self.names, use_threads=False)
-            for column in found.columns:
-                if pa.types.is_string(column.type):
-                    column.validate(full=True)  # that it is UTF-8
+            found = self._file.read_row_groups(groups, wanted, use_threads=False)
+            for name in self._texts:
+                if name in wanted:
+                    found[name].validate(full=True)  # that it is UTF-8
         except (OSError, pa.ArrowException) as error:
             raise DataError(f"{self.path}: damaged: {error}", hint=REPAIR) from error
-        for name, column in zip(found.column_names, found.columns, strict=True):
-            if column.null_count and name in self._full:
-                what = f"{column.null_count} of {len(column)} values are missing"
+        for name in self._full:
+            if name in wanted and (missing := found[name].null_count):
+                what = f"{missing} of {len(found)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
         return found
 

@@ -9,12 +9,20 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
+from shiftsim.data.store.boxes import (
+    HIGHEST,
+    SIZE_LIMITS,
+    BoxBlock,
+    mark,
+    note_tracks,
+    restored,
+    scatter,
+    second_differences,
+)
 from shiftsim.data.store.plausible import (
-    BOX_LIMITS,
-    all_inside,
     require_boxes,
     require_recording,
     require_states,
@@ -26,7 +34,6 @@ from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
 
 # which of some tracks are wanted, in order, from when they are there, their kinds and tokens
 _Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
-_MANY = 8  # rows for every value of a column that is written by a dictionary
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
@@ -65,31 +72,31 @@ def write_ego(folder: Path, ego: EgoTrace) -> None:
         DataError: A number is outside of its range.
     """
     require_states(ego.states, ego_file(folder, ego.name))
-    columns = [pa.array(np.ascontiguousarray(ego.states[:, i])) for i in range(NUM_STATE)]
-    table = pa.Table.from_arrays(columns, schema=schema.EGO)
     footer = {"name": ego.name, "first_row": ego.first_row}
-    few = len(table) // _MANY
-    repeating = [n for n, v in zip(table.column_names, columns, strict=True) if _count(v) <= few]
-    blocks = _split(table, schema.FRAME_BLOCK)
-    write_blocks(ego_file(folder, ego.name), blocks, footer, repeating, codec="lz4")
+    starts = range(0, max(len(ego.states), 1), schema.FRAME_BLOCK)
+    parts = [ego.states[start : start + schema.FRAME_BLOCK] for start in starts]
+    codes = [_codes(part.T.reshape(-1)) for part in parts]
+    blocks = [pa.Table.from_arrays([code], schema=schema.EGO) for code in codes]
+    write_blocks(ego_file(folder, ego.name), blocks, footer, codec="lz4")
+
+
+def _codes(values: FloatArray) -> pa.Array:
+    return pa.array(second_differences(values).view(np.int64))  # unsigned ones read more slowly
 
 
 def _split(table: pa.Table, rows: int) -> list[pa.Table]:
     return [table.slice(start, rows) for start in range(0, max(len(table), 1), rows)]
 
 
-def _count(values: pa.Array) -> int:
-    """How many values there are, each counted once."""
-    return len(np.unique(values.to_numpy().view(np.int64)))
-
-
 def _track_block(tracks: Tracks, rows: slice) -> pa.Table:
     """Boxes of some rows, track by track: neighbours in time compress well."""
     part = tracks.rows(rows)
     track, row = np.nonzero(part.valid.T)
-    columns = [pa.array((row + rows.start).astype(np.int32)), pa.array(track.astype(np.int32))]
-    for values in (part.poses, part.velocities, part.sizes):
-        columns += [pa.array(values[row, track, axis]) for axis in range(values.shape[2])]
+    motion = [part.poses[..., axis] for axis in range(3)]
+    motion += [part.velocities[..., axis] for axis in range(2)]
+    columns = [_codes(values[row, track]) for values in motion]
+    columns += [pa.array((row + rows.start).astype(np.int32)), pa.array(track.astype(np.int32))]
+    columns += [pa.array(part.sizes[row, track, axis]) for axis in range(2)]
     return pa.Table.from_arrays(columns, schema=schema.TRACKS)
 
 
@@ -133,14 +140,20 @@ class StoredRecording:
         if not 0 <= first < last <= self.num_rows:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
-        frames = _rows(self.frames, first, last)
-        lights = self._lights(frames)
+        blocks = _blocks(self.frames, first, last)
+        frames = self.frames.read(blocks)
+        begin = blocks[0] * schema.FRAME_BLOCK
+        if begin + len(frames) < last:
+            raise DataError(f"{self.frames.path}: row groups are too short", hint=REPAIR)
+        rows = slice(first - begin, last - begin)
+        lights = self._lights(frames).rows(rows)
+        time_us = _view(frames["time_us"])[rows]
         tracks = self._tracks(first, last, choose, plausible)
-        return Recording(self.log_name, self.city, frames["time_us"].to_numpy(), tracks, lights)
+        return Recording(self.log_name, self.city, time_us, tracks, lights)
 
     def _lights(self, frames: pa.Table) -> TrafficLights:
         shape = (len(frames), len(self.connectors))
-        status = frames["light_status"].combine_chunks().flatten()
+        status = _whole(frames["light_status"]).values
         if len(status) != shape[0] * shape[1]:
             raise DataError(f"{self.frames.path}: light_status has gaps", hint=REPAIR)
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
@@ -150,26 +163,54 @@ class StoredRecording:
         blocks = range(first // self.block_rows, (last - 1) // self.block_rows + 1)
         if blocks[-1] >= self.tracks.num_blocks:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
-        row, track, *boxes = _views(self.tracks.read(list(blocks)))
-        if len(row) and not 0 <= track.min() <= track.max() < len(self.tokens):
-            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
-        values = tuple(boxes)
-        place = _places(row, track, first, last, len(self.tokens))
+        parts = [self._block(block) for block in blocks]
+        place = np.full(len(self.tokens), -1)
+        for part in parts:
+            note_tracks(part.row, part.track, first, last, place)
         seen = np.flatnonzero(place >= 0)
+        place[seen] = np.arange(len(seen))
         valid = np.zeros((last - first, len(seen)), np.bool_)
-        _mark(row, track, place, first, valid)
+        for part in parts:
+            mark(part.row, part.track, place, first, valid)
         order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
         if len(order) < len(seen) or (order != np.arange(len(seen))).any():
             valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
             place[:] = -1
             place[seen] = np.arange(len(seen))
-        poses, velocities, sizes = _dense(valid.shape)
-        _scatter(row, track, place, first, values, valid, poses, velocities, sizes)
+        dense = _dense(valid)
+        poses, velocities, sizes = (array.reshape(-1) for array in dense)
+        out = valid.shape, HIGHEST, SIZE_LIMITS, poses.view(np.uint64), velocities.view(np.uint64)
+        inside = all([scatter(*part, place, first, *out, sizes) for part in parts])
         names = tuple(self.tokens[i] for i in seen.tolist())
-        tracks = Tracks(valid, poses, velocities, sizes, self.kinds[seen], names)
-        if plausible and not all_inside(values, BOX_LIMITS):
+        tracks = Tracks(valid, *dense, self.kinds[seen], names)
+        if plausible and not inside:
             require_boxes(tracks, last - first, self.tracks.path)
         return tracks
+
+    def _block(self, block: int) -> BoxBlock:
+        found, is_plain = self.tracks.read([block]), _is_former(self.tracks)
+        names = schema.MOTION if is_plain else schema.TRACKS.names[: len(schema.MOTION)]
+        row, track, *sizes = (_view(found[n]) for n in ("row", "track", "length_m", "width_m"))
+        motion = tuple(_view(found[name]).view(np.uint64) for name in names)
+        if len(track) and not 0 <= track.min() <= track.max() < len(self.tokens):
+            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        return BoxBlock(row, track, motion, (sizes[0], sizes[1]), is_plain)
+
+    def boxes(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """All boxes as they are stored: rows (A,), tracks (A,) and `schema.MOTION` (A, 5).
+
+        Raises:
+            DataError: The file is damaged.
+        """
+        parts = [self._block(block) for block in range(self.tracks.num_blocks)]
+        motion = [
+            np.column_stack(
+                [c.view(np.float64) if part.is_plain else restored(c) for c in part.motion]
+            )
+            for part in parts
+        ]
+        row, track = (np.concatenate([part[i] for part in parts]).astype(np.int64) for i in (0, 1))
+        return row, track, np.concatenate(motion)
 
 
 def open_recording(folder: Path) -> StoredRecording:
@@ -179,7 +220,7 @@ def open_recording(folder: Path) -> StoredRecording:
         DataError: A file or a column is missing, or is damaged.
     """
     frames = Table(folder / FRAMES, schema.FRAMES)
-    tracks = Table(folder / TRACKS, schema.TRACKS)
+    tracks = Table(folder / TRACKS, schema.TRACKS, schema.FORMER_TRACKS)
     head = _footer(frames, {"log": str, "city": str, "connectors": [str]})
     names = _footer(tracks, {"tokens": [str], "kinds": [int]})
     require(STORE, "kinds", np.array(names["kinds"], np.float64), f"{tracks.path}: footer")
@@ -207,7 +248,11 @@ def _footer(table: Table, kinds: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def open_ego(folder: Path, name: str) -> Table:
     """Open the file of an ego's states."""
-    return Table(ego_file(folder, name), schema.EGO)
+    return Table(ego_file(folder, name), schema.EGO, schema.FORMER_EGO)
+
+
+def _is_former(table: Table) -> bool:
+    return schema.MOTION[0] in table.names
 
 
 def ego_span(table: Table) -> tuple[int, int]:
@@ -217,7 +262,7 @@ def ego_span(table: Table) -> tuple[int, int]:
         DataError: The file is damaged.
     """
     start = int(_footer(table, {"first_row": int})["first_row"])
-    return start, start + table.num_rows
+    return start, start + table.num_rows // (1 if _is_former(table) else NUM_STATE)
 
 
 def ego_states(table: Table, first: int, last: int) -> FloatArray:
@@ -229,40 +274,46 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
     start, stop = ego_span(table)
     if not start <= first < last <= stop:
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
-    rows = _rows(table, first - start, last - start)
-    states = np.empty((last - first, NUM_STATE))
-    for index, values in enumerate(_views(rows)):
-        states[:, index] = values
-    return states
+    blocks = _blocks(table, first - start, last - start)
+    if _is_former(table):
+        columns = np.array(_views(table.read(blocks)))
+    else:
+        codes = [_view(table.read([block]).column(0)).view(np.uint64) for block in blocks]
+        if any(len(code) % NUM_STATE for code in codes):
+            raise DataError(f"{table.path}: a row group holds no whole states", hint=REPAIR)
+        columns = np.concatenate([restored(code).reshape(NUM_STATE, -1) for code in codes], axis=1)
+    low = start + blocks[0] * schema.FRAME_BLOCK
+    if columns.shape[1] < last - low:
+        raise DataError(f"{table.path}: row groups are too short", hint=REPAIR)
+    return np.ascontiguousarray(columns[:, first - low : last - low].T)
 
 
 def whole_ego(table: Table) -> tuple[int, FloatArray]:
     """Row of the recording of the first state, and all states (R, 11) of an ego."""
-    start = int(_footer(table, {"first_row": int})["first_row"])
-    return start, ego_states(table, start, start + table.num_rows)
+    start, stop = ego_span(table)
+    return start, ego_states(table, start, stop)
 
 
-def _rows(table: Table, first: int, last: int) -> pa.Table:
-    low, high = first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK
-    if high >= table.num_blocks:
+def _blocks(table: Table, first: int, last: int) -> list[int]:
+    """The row groups of frames or states that hold the rows first … last - 1."""
+    blocks = range(first // schema.FRAME_BLOCK, (last - 1) // schema.FRAME_BLOCK + 1)
+    if blocks[-1] >= table.num_blocks:
         raise DataError(f"{table.path}: row groups are missing", hint=REPAIR)
-    rows = table.read(list(range(low, high + 1)))
-    return rows.slice(first - low * schema.FRAME_BLOCK, last - first)
+    return list(blocks)
 
 
-def _dense(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), not filled.
+def _dense(valid: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arrays (R, N, 3), (R, N, 2) and (R, N, 2), to be filled where valid (R, N), else NaN.
 
     They share one block: the allocator then keeps it for the next scenario instead of returning it
     to the system, which costs more than reading the file.
     """
-    num = shape[0] * shape[1]
-    block = np.empty(7 * num)
-    return (
-        block[: 3 * num].reshape(*shape, 3),
-        block[3 * num : 5 * num].reshape(*shape, 2),
-        block[5 * num :].reshape(*shape, 2),
-    )
+    block = np.empty(7 * valid.size)
+    if not valid.all():
+        block.fill(np.nan)
+    poses, velocities, sizes = np.split(block, (3 * valid.size, 5 * valid.size))
+    shape = valid.shape
+    return poses.reshape(*shape, 3), velocities.reshape(*shape, 2), sizes.reshape(*shape, 2)
 
 
 def _views(table: pa.Table) -> list[Any]:
@@ -271,66 +322,14 @@ def _views(table: pa.Table) -> list[Any]:
 
 
 def _view(column: pa.ChunkedArray) -> Any:
-    if not len(column):
-        return _nothing(column.type)
-    return (column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()).to_numpy()
+    return _whole(column).to_numpy() if len(column) else _nothing(column.type)
+
+
+def _whole(column: pa.ChunkedArray) -> pa.Array:
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def _nothing(kind: pa.DataType) -> Any:
     array = np.empty(0, kind.to_pandas_dtype())
     array.flags.writeable = False
     return array
-
-
-@kernel
-def _places(row: IntArray, track: IntArray, first: int, last: int, num: int) -> IntArray:
-    """(num,) position of each track among those that occur in the rows, -1 for the others."""
-    place = np.full(num, -1)
-    for box in range(len(row)):
-        if first <= row[box] < last:
-            place[track[box]] = 0
-    count = 0
-    for index in range(num):
-        if place[index] == 0:
-            place[index] = count
-            count += 1
-    return place
-
-
-@kernel
-def _mark(row: IntArray, track: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
-    """Note in `valid` (R, N), which is false, where there are boxes."""
-    for box in range(len(row)):
-        at = row[box] - first
-        if 0 <= at < len(valid):
-            valid[at, place[track[box]]] = True
-
-
-@kernel
-def _scatter(  # type: ignore[no-untyped-def]  # compiled; the arrays are those of `Tracks`
-    row: IntArray,
-    track: IntArray,
-    place: IntArray,
-    first: int,
-    values: tuple[FloatArray, ...],
-    valid: BoolArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-):
-    """Spread boxes of the tracks that have a place over dense arrays; what is not valid is NaN."""
-    for box in range(len(row)):
-        at, to = row[box] - first, place[track[box]]
-        if at < 0 or at >= len(valid) or to < 0:
-            continue
-        for axis in range(3):
-            poses[at, to, axis] = values[axis][box]
-        for axis in range(2):
-            velocities[at, to, axis] = values[3 + axis][box]
-            sizes[at, to, axis] = values[5 + axis][box]
-    for at in range(valid.shape[0]):
-        for to in range(valid.shape[1]):
-            if not valid[at, to]:
-                poses[at, to] = np.nan
-                velocities[at, to] = np.nan
-                sizes[at, to] = np.nan

@@ -13,8 +13,8 @@ import pyproj
 
 from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.recording import Converted, convert_recording
-from shiftsim.data.deepplan.states import sample_runs
-from shiftsim.data.deepplan.windows import EGO, ConversionConfig, find_runs, judge_windows
+from shiftsim.data.deepplan.states import rows_between, sample_runs
+from shiftsim.data.deepplan.windows import EGO, ROW_S, ConversionConfig, find_runs, judge_windows
 from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site, read_recording
 from shiftsim.data.opendrive.lanes import LaneKey
 from shiftsim.data.opendrive.map import Origin, build_road_map
@@ -24,47 +24,42 @@ from shiftsim.metrics.route import driven_route
 from shiftsim.verify.files import Compare, Source, open_tables, read_table, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
-from shiftsim.world.map import VectorMap
 from shiftsim.world.state import center_poses
 
 _POSITION = 2e-2  # m: README of the scripted recordings
-_STEP_S, _ROUNDING = 0.05, 1e-9  # s, steps
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
+Ways = dict[tuple[str, ...], list[list[Any]]]  # lanes that egos pass, by window and track
 FACTS = read_tables(__file__)
 _DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
 
 
-class LocalMap:
-    """A map in its own frame, with the OpenDRIVE lanes behind the lanes of ours."""
+class Lanes:
+    """A map at its place in UTM, with the OpenDRIVE lanes behind the lanes of ours."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, site: Site) -> None:
         """Read and convert a map file."""
-        self._drive = read_opendrive(path)
-        self._map, made = build_road_map(self._drive, name=path.stem)
+        self.offset, drive = site.offset[:2], read_opendrive(path)
+        x, y = self.offset.tolist()
+        self.road, made = build_road_map(drive, name=path.stem, offset=(x, y), epsg=site.epsg)
         self._pieces: dict[int, list[Origin]] = defaultdict(list)  # in the direction of travel
         for origin in made.origins:
-            if (lane := self._map.edges.index.get(origin.id)) is not None:
+            if (lane := self.road.edges.index.get(origin.id)) is not None:
                 self._pieces[lane].append(origin)
-
-    def placed(self, site: Site) -> VectorMap:
-        """The same map in UTM."""
-        offset = float(site.offset[0]), float(site.offset[1])
-        return build_road_map(self._drive, name=self._map.name, offset=offset, epsg=site.epsg)[0]
 
     def keys_at(self, x: float, y: float) -> list[LaneKey]:
         """OpenDRIVE lanes behind the lanes of ours that hold a point."""
-        lanes = self._map.edges.containing(x, y).tolist()
+        lanes = self.road.edges.containing(x, y).tolist()
         return [self._key(lane, x, y) for lane in lanes if lane in self._pieces]
 
     def _key(self, lane: int, x: float, y: float) -> LaneKey:
-        pieces, share = self._pieces[lane], self._map.progress_on(lane, x, y)
+        pieces, share = self._pieces[lane], self.road.progress_on(lane, x, y)
         ends = np.cumsum([abs(piece.end - piece.begin) for piece in pieces])
-        share *= ends[-1] / self._map.baselines.length(lane)
+        share *= ends[-1] / self.road.baselines.length(lane)
         return pieces[int(np.searchsorted(ends[:-1], share, "right"))].key
 
     def sequences(self, centers: FloatArray) -> list[list[LaneKey]]:
         """OpenDRIVE lanes passed by centres (n, 3), without and with short pieces at the ends."""
-        route = driven_route(self._map, centers)
+        route = driven_route(self.road, centers)
         points = zip(map(route.at, range(len(centers))), *centers[:, :2].T, strict=True)
         keys = [self._key(lanes[0], x, y) for lanes, x, y in points if lanes]
         pieces = [(key, len([*same])) for key, same in groupby(keys)]
@@ -81,8 +76,8 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     site = open_site(folder / "data")
     if len(site.recordings) != 1:
         report.skip("recordings beyond the first", len(site.recordings) - 1)
-    recording, local = read_recording(site, site.recordings[0]), LocalMap(find_map(site))
-    keys = [local.keys_at(x, y) for x, y in recording.bottom[:, :2].tolist()]
+    recording, lanes = read_recording(site, site.recordings[0]), Lanes(find_map(site), site)
+    keys = [lanes.keys_at(x, y) for x, y in (recording.bottom[:, :2] + lanes.offset).tolist()]
     files: dict[str, Compare] = {
         "expected_rows.parquet": lambda file, _: _compare_rows(file, site, recording, keys),
         "expected_20hz.parquet": lambda file, _: _compare_samples(file, recording),
@@ -111,12 +106,11 @@ def _compare_samples(file: Source, recording: Annotations) -> None:
     """The bottoms of all boxes at 20 Hz, by track and time."""
     recording = replace(recording, centers=recording.bottom)
     runs = find_runs(recording, ConversionConfig().max_hole_s)
-    first = np.ceil(recording.time[runs.first] / _STEP_S - _ROUNDING)
-    last = np.floor(recording.time[runs.last] / _STEP_S + _ROUNDING)
-    steps = [np.arange(*span) for span in zip(first, last + 1, strict=True)]
-    run, step = np.repeat(np.arange(len(steps)), [*map(len, steps)]), np.concatenate(steps)
-    ids, time = recording.track_ids[runs.track[run]], step * _STEP_S
-    ours = {"ids": ids, "steps": step.astype(np.int64), "time": time}
+    first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
+    run = np.repeat(np.arange(len(first)), last - first + 1)
+    step = np.concatenate([*map(np.arange, first, last + 1)])
+    time = step * ROW_S
+    ours = {"ids": recording.track_ids[runs.track[run]], "steps": step, "time": time}
     samples = sample_runs(recording, runs, run, time)
     FACTS["samples"].match(file, "recording", samples=samples, **ours)
 
@@ -139,7 +133,7 @@ def _compare_summary(
         "to_velocity": np.abs(wrap_angles(yaw - moving)).max(),
         "to_rotation": np.abs(yaw - raw["rotation_z"][order]).max(),
         "alone": [key for key in keys if len(key) == 1],
-        "steps": int(np.floor(recording.duration / _STEP_S + _ROUNDING)) + 1,
+        "steps": int(recording.duration / ROW_S + 1e-9) + 1,
     }
     FACTS["summary"].match(expected, "recording", **facts)
     for number, where, track in _tracks(expected, recording):
@@ -189,25 +183,24 @@ def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | N
     for number, where, track in _tracks(expected, recording):
         kind, size = recording.categories[number], recording.sizes[number]
         FACTS["scripted"].match(track, where, category=kind, size=size)
-    lanes = _compare_windows(expected, recording, config, name)
+    ways = _compare_windows(expected, recording, config, name)
     expected.used.add("note")
     places = [maps / expected["map"]] if maps is not None else []
     places += [folder / "data/map/map.xodr"]
     places += [parent / "maps" / expected["map"] for parent in folder.resolve().parents[:4]]
     if found := next(filter(Path.is_file, places), None):
-        local = LocalMap(found)
-        made = convert_recording(recording, local.placed(site), site.offset[:2], config)
-        _verify_scenarios(folder, made, site.offset[:2], local, lanes, report)
+        lanes = Lanes(found, site)
+        made = convert_recording(recording, lanes.road, lanes.offset, config)
+        _compare_scenarios(folder, made, lanes, ways, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
 
 
 def _compare_windows(
     expected: Source, recording: Annotations, config: ConversionConfig, name: str
-) -> dict[tuple[str, ...], list[list[Any]]]:
+) -> Ways:
     """Compare windows and verdicts; what the file says of lanes, by window and ego."""
-    report, ids = expected.report, recording.track_ids.tolist()
-    lanes: dict[tuple[str, ...], list[list[Any]]] = {}
+    report, ids, ways = expected.report, recording.track_ids.tolist(), Ways()
     windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
     wanted = expected.each("windows")
     report.compare("windows", name, len(windows), len(wanted))
@@ -224,17 +217,12 @@ def _compare_windows(
         for seen in sorted(set(verdicts) & set(given)):
             report.compare("verdict", f"{where} track {seen}", verdicts[seen], given[seen])
         begin = f"{theirs['start_s']:.1f}"
-        lanes |= {(begin, ego): way for ego, way in theirs["lanes_from_t0"].items()}
-    return lanes
+        ways |= {(begin, ego): way for ego, way in theirs["lanes_from_t0"].items()}
+    return ways
 
 
-def _verify_scenarios(
-    folder: Path,
-    made: Converted,
-    offset: FloatArray,
-    local: LocalMap,
-    lanes: dict[tuple[str, ...], list[list[Any]]],
-    report: Report,
+def _compare_scenarios(
+    folder: Path, made: Converted, lanes: Lanes, ways: Ways, report: Report
 ) -> None:
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
     poses = open_tables(folder, report, "expected_ego_20hz")["expected_ego_20hz"]
@@ -246,16 +234,15 @@ def _verify_scenarios(
         where, ego = f"{folder.name} window {key[0]} track {key[1]}", egos[window.ego]
         rows = slice(window.first_row - ego.first_row, window.last_row - ego.first_row)
         centers = center_poses(ego.states[rows, :3])
-        centers[:, :2] -= offset
         if poses.match(key, {"frame": np.arange(len(centers))}, quantity="20 Hz"):
             poses.match(key, {"yaw": centers[:, 2]}, quantity="20 Hz", angles={"yaw"})
             xy = np.column_stack([poses[key]["x_local"], poses[key]["y_local"]])
-            error = np.linalg.norm(centers[:, :2] - xy, axis=1)
+            error = np.linalg.norm(centers[:, :2] - lanes.offset - xy, axis=1)
             report.compare("20 Hz position", where, error, 0.0 * error, atol=_POSITION)
         first = int(window.iteration_rows[0]) - window.first_row
-        given = repr([tuple(lane) for lane in lanes.get(key, ())])
-        ways = [repr([tuple(lane) for lane in way]) for way in local.sequences(centers[first:])]
-        report.compare("lanes", where, given if given in ways else ways[0], given)
-    for start, track in sorted((set(poses) | set(lanes)) - seen):
+        given = repr([tuple(lane) for lane in ways.get(key, ())])
+        passed = [repr([tuple(lane) for lane in way]) for way in lanes.sequences(centers[first:])]
+        report.compare("lanes", where, given if given in passed else passed[0], given)
+    for start, track in sorted((set(poses) | set(ways)) - seen):
         report.fail("lanes", f"{folder.name} window {start} track {track}", "no such scenario")
     poses.finish()

@@ -29,7 +29,6 @@ COMPARED: dict[str, Any] = tomllib.loads(
 )
 EXACT = 0.0
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
-RUN_KEY = ("scene", "challenge", "planner")
 DAMAGED = "the file is damaged, or not what its name says; make it or get it again"
 # Tolerance of all, or by name, "" being that of all others; exact where there is none
 Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
@@ -140,16 +139,6 @@ class Source:
             agree &= self.report.compare(label, where, *sides, atol=bound, angle=angle)
         return agree
 
-    def match_rows(
-        self, ours: Mapping[str, Any], atol: Tolerances = EXACT, *, where: str = "case"
-    ) -> None:
-        """`match`, where every row is a case of its own; a `DataError` if ours are not as many."""
-        counts = {len(value) for value in (*ours.values(), *(self[n] for n in ours if n in self))}
-        if len(counts) != 1:
-            raise DataError(f"{self.name}: {', '.join(ours)}: rows are {sorted(counts)}")
-        for row in range(counts.pop()):
-            self.at(row).match(f"{where} {row}", {n: v[row] for n, v in ours.items()}, atol)
-
     def note(self, what: str, *names: str) -> None:
         """Name values that need not be compared."""
         self.used.update(self.prefix + name for name in names)
@@ -212,24 +201,12 @@ def read_json(path: Path) -> Any:
 class Groups(dict[tuple[str, ...], Source]):
     """The rows of a `.parquet` by key, and which of them were asked for; other keys have no rows.
 
-    A file that does not exist is named as not covered.
+    `atol` holds unless a comparison names another.
     """
 
-    def __init__(
-        self,
-        table: Path | Source,
-        report: Report,
-        key: Sequence[str] = RUN_KEY,
-        atol: Tolerances = EXACT,
-    ) -> None:
-        self._asked: set[tuple[str, ...]] = set()
-        self.atol = atol  # unless a comparison names another
-        if isinstance(table, Path) and not table.is_file():
-            self.table = Source(table.stem, "column", {}, report)
-            report.skip(f"{table.name} is missing")
-            return
-        self.table = read_table(table, report) if isinstance(table, Path) else table
-        super().__init__(self.table.groups(*key))
+    def __init__(self, table: Source, key: Sequence[str], atol: Tolerances = EXACT) -> None:
+        self.table, self.atol, self._asked = table, atol, set[tuple[str, ...]]()
+        super().__init__(table.groups(*key) if table.values else {})
 
     def __getitem__(self, key: tuple[str, ...]) -> Source:
         self._asked.add(key)
@@ -265,9 +242,19 @@ class Groups(dict[tuple[str, ...], Source]):
 
 
 def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
-    """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`."""
-    paths = {name: folder / f"{name}.parquet" for name in names}
-    return {name: Groups(path, report, **COMPARED[path.name]) for name, path in paths.items()}
+    """The `.parquet` files of these names, with keys and tolerances as of `compared.toml`.
+
+    One that does not exist has no rows, and is named as not covered.
+    """
+    tables = {}
+    for path in (folder / f"{name}.parquet" for name in names):
+        if not path.is_file():
+            report.skip(f"{path.name} is missing")
+        table = (
+            read_table(path, report) if path.is_file() else Source(path.stem, "column", {}, report)
+        )
+        tables[path.stem] = Groups(table, **COMPARED[path.name])
+    return tables
 
 
 def verify_file(compare: Compare, path: Path, report: Report) -> None:

@@ -42,8 +42,11 @@ def compare_idm_world(world: Source, name: str) -> None:
         columns = np.column_stack([*numbers, traffic.path_speeds]).T
         theirs.match(where, dict(zip(NUMBERS, columns, strict=True)), TOLERANCE)
         ids = scenario.map.edges.ids
-        routes = [[ids[edge] for edge in route] for route in traffic.routes.values()]
-        theirs.match_rows({"route_edge_ids": routes}, where=f"{where} vehicle")
+        if len(index) != len(rows):
+            raise DataError(f"idm_world: {len(rows)} vehicles, of ours {len(index)}")
+        for row, route in enumerate(traffic.routes.values()):
+            ours = {"route_edge_ids": [ids[edge] for edge in route]}
+            theirs.at(row).match(f"{where} vehicle {row}", ours)
 
 
 def _make_scenario(world: Source) -> Scenario:

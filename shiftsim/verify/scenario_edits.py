@@ -6,13 +6,11 @@ The windows of this folder are 20 s long; interPlan's own are 30 s.
 import random
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shiftsim.data.nuplan.scenarios import read_scenario
 from shiftsim.errors import ConfigError, DataError, ShiftsimError
 from shiftsim.metrics import compute_metrics
 from shiftsim.metrics.interplan import (
@@ -55,17 +53,11 @@ _FAILURES = {  # what interPlan raises, and what our message says
 
 def verify_scenario_edits(folder: Path, report: Report, scenes: Path | None = None) -> None:
     """Compare everything in the folder; `scenes` holds logs and maps."""
-    world = Scenes(scenes or folder.parent / "nuplan")
+    world = Scenes(scenes or folder.parent / "nuplan", mapping=WINDOW)
     if not len(world):
         raise DataError(
             f"{world.folder}: no scenes.json", "say where the scenes are, with --scenes"
         )
-
-    @cache
-    def scene(name: str) -> Scenario:
-        entry = world.entries[name]
-        road = world.maps[entry["map"]]
-        return read_scenario(world.folder / entry["db"], entry["token"], road, WINDOW)
 
     parts = {name: read_fields(folder / f"{name}.json", report) for name in _PARTS}
     details: dict[str, Any] = {}
@@ -80,7 +72,7 @@ def verify_scenario_edits(folder: Path, report: Report, scenes: Path | None = No
                     continue
                 if name == "build":
                     details[case["scene"]] = case["details"] or {} if "details" in case else {}
-                compare(case, label, scene(case["scene"]), details.get(case["scene"], {}))
+                compare(case, label, world[case["scene"]], details.get(case["scene"], {}))
         part.finish()
     for path in sorted(folder.iterdir()):
         if path.stem not in _PARTS and not path.name.startswith("README"):

@@ -21,14 +21,17 @@ class Scenes(Mapping[str, Scenario]):
     Attributes:
         folder: Holds `scenes.json`, `logs` and `maps`; without `scenes.json` there are no scenes.
         entries: What `scenes.json` says, by scene name; `report` takes what is compared with it.
+        mapping: Duration [s], offset [s] and subsample ratio that the scenarios are cut with.
     """
 
-    def __init__(self, folder: Path, report: Report | None = None) -> None:
+    def __init__(
+        self, folder: Path, report: Report | None = None, mapping: LogMapping = MAPPING
+    ) -> None:
         path, used = folder / "scenes.json", report or Report()
         listed = read_json(path) if path.is_file() else []
         entries = [Source("scenes.json", "field", entry, used) for entry in listed]
         self.folder, self.entries = folder, {entry["scene"]: entry for entry in entries}
-        self._read: dict[str, Scenario] = {}
+        self.mapping, self._read = mapping, dict[str, Scenario]()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
@@ -45,7 +48,7 @@ class Scenes(Mapping[str, Scenario]):
             if entry["map"] not in self.maps:
                 raise DataError(f"{self.folder / 'scenes.json'}: unknown map {entry['map']!r}")
             path, road = self.folder / entry["db"], self.maps[entry["map"]]
-            self._read[scene] = read_scenario(path, entry["token"], road, MAPPING)
+            self._read[scene] = read_scenario(path, entry["token"], road, self.mapping)
         return self._read[scene]
 
     @cached_property

@@ -1,7 +1,11 @@
-"""What reference files hold of a rollout: ego states, tracks and small maps in plain JSON."""
+"""What reference files hold of a rollout: columns of official tables, and worlds in plain JSON.
 
-from collections.abc import Iterable, Mapping, Sequence
+The metric worlds were scored by the official metric classes: the metrics without any importer.
+"""
+
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,14 +13,21 @@ import shapely
 
 from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
+from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
+from shiftsim.metrics.collision import at_fault_counts
+from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog, as_recorded
-from shiftsim.verify.files import Source
+from shiftsim.verify.files import COMPARED, Source, verify_files
+from shiftsim.verify.report import Report
+from shiftsim.verify.tables import read_tables
 from shiftsim.world import state
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, Tracks, TrafficLights
+from shiftsim.world.scenario import Scenario, scenario_of_rows
+from shiftsim.world.state import AgentKind, Tracks, tracks_of_boxes
 
+TABLES = read_tables(__file__)
+SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
 EGO_COLUMNS = (
     *("x", "y", "heading", "vx", "vy", "ax", "ay"),
@@ -57,28 +68,26 @@ def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str,
     }
 
 
-def make_tracks(
-    shape: tuple[int, int],
-    where: Any,
-    values: FloatArray,
-    kinds: Sequence[str],
-    tokens: Sequence[str],
-) -> Tracks:
-    """Dense tracks of a shape (rows, tracks), with names of their types and their tokens.
+def tracks_of(rows: Source, count: int) -> Tracks:
+    """Dense tracks over `count` iterations from rows of `objects.parquet`."""
+    names, iteration = rows["track_token"].tolist(), rows["iteration"].astype(np.int64)
+    kinds = dict(zip(names, rows["type"].tolist(), strict=True))
+    column = {token: index for index, token in enumerate(kinds)}
+    track = [column[token] for token in names]
+    if not ((iteration >= 0) & (iteration < count)).all():
+        raise DataError(f"objects at iterations which the ego does not have, of {count}")
+    if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
+        raise DataError("an object occurs twice at one iteration")
+    if [kinds[token] for token in names] != rows["type"].tolist():
+        raise DataError("an object changes its type")
+    boxes = np.full((count, len(kinds), len(BOX_COLUMNS)), np.nan)
+    boxes[iteration, track] = np.column_stack([rows[n].astype(np.float64) for n in BOX_COLUMNS])
+    return tracks_of_boxes(boxes, [AgentKind[kind] for kind in kinds.values()], list(kinds))
 
-    `values` (..., 7) are x, y, heading, vx, vy, length, width at the rows and tracks `where` (`...`
-    where they are dense); NaN where a track is absent.
-    """
-    dense = np.full((*shape, 7), np.nan)
-    dense[where] = values
-    return Tracks(
-        valid=~np.isnan(dense[..., 0]),
-        poses=np.ascontiguousarray(dense[..., :3]),
-        velocities=np.ascontiguousarray(dense[..., 3:5]),
-        sizes=np.ascontiguousarray(dense[..., 5:]),
-        kinds=np.array([AgentKind[name.upper()] for name in kinds], np.int64),
-        tokens=tuple(tokens),
-    )
+
+def kind_of(thing: Source) -> AgentKind:
+    """Type of an object that is listed."""
+    return AgentKind[thing["type"].upper()]
 
 
 def read_map(world: Source, *fields: str) -> VectorMap:
@@ -119,35 +128,13 @@ def _areas(rings: Iterable[tuple[object, Any]]) -> list[AreaSpec]:
     return [AreaSpec(str(name), shapely.Polygon(ring)) for name, ring in rings]
 
 
-def make_scenario(
-    token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
-) -> Scenario:
-    """A scenario whose iterations are all rows, without lights, route and goal."""
-    return Scenario(
-        token=token,
-        scenario_type="unknown",
-        log_name="world",
-        city=road.name,
-        map=road,
-        time_us=time_us,
-        ego=ego,
-        tracks=tracks,
-        traffic_lights=TrafficLights.empty(len(time_us)),
-        iteration_rows=np.arange(len(time_us)),
-        row_step=1,
-        route=(),
-        mission_goal=None,
-        mapping=(10.0, 0.0, 1.0),
-    )
-
-
 def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
     """The scenario of a world from its map and its ego states (T, 11).
 
     The world also holds `time_us` and `objects`, which list x, y, heading, vx, vy per frame.
     """
     time_us = np.array(world["time_us"], np.int64)
-    objects = sorted(world.each("objects"), key=lambda thing: AgentKind[thing["type"].upper()])
+    objects = sorted(world.each("objects"), key=kind_of)
     counts = {len(ego), *(len(thing["frames"]) for thing in objects)}
     if counts != {len(time_us)}:
         raise DataError(f"{sorted(counts)} frames for {len(time_us)} time stamps")
@@ -156,9 +143,9 @@ def read_scenario(world: Source, road: VectorMap, ego: FloatArray) -> Scenario:
         for row, frame in enumerate(thing["frames"]):
             if frame is not None:
                 values[row, column] = [*frame, thing["length"], thing["width"]]
-    kinds, tokens = ([thing[name] for thing in objects] for name in ("type", "token"))
-    tracks = make_tracks(values.shape[:2], ..., values, kinds, tokens)
-    return make_scenario(f"world {world.values.get('world')}", road, time_us, ego, tracks)
+    kinds, tokens = [kind_of(thing) for thing in objects], [thing["token"] for thing in objects]
+    tracks = tracks_of_boxes(values, kinds, tokens)
+    return scenario_of_rows(f"world {world.values.get('world')}", road, time_us, ego, tracks)
 
 
 def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:
@@ -167,3 +154,70 @@ def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:
     if len(ego) != len(log.ego):
         raise DataError(f"{len(ego)} ego states, {len(log.ego) + 1} of the expert")
     return replace(log, ego=ego)
+
+
+def verify_metric_worlds(folder: Path, report: Report) -> None:
+    """Compare every world of the folder, under both threshold profiles."""
+    verify_files(folder, report, {}, {"*.json": _compare_world})
+
+
+def read_world(world: dict[str, Any]) -> tuple[SimulationLog, VectorMap]:
+    """Rollout and map of one world."""
+    return _read_world(Source("metric_world", "field", world, Report()))
+
+
+def _read_world(world: Source) -> tuple[SimulationLog, VectorMap]:
+    road = read_map(world.each("map")[0], "incoming")
+    ego, expert = (
+        ego_states(dict(zip(world["state_columns"], np.transpose(world[name]), strict=True)))
+        for name in ("ego", "expert")
+    )
+    return recorded_log(read_scenario(world, road, expert), ego), road
+
+
+def _compare_world(world: Source, where: str) -> None:
+    report, (log, road) = world.report, _read_world(world)
+    world.note("label", "world", "kind")
+    # a connector lies in a roadblock connector, a lane in a roadblock
+    kinds = road.block_of >= road.num_roadblocks
+    is_connector = np.arange(len(road.edges)) >= road.num_lanes
+    report.compare("kind of edges and their roadblocks", where, kinds, is_connector)
+    expected, measured = world.each("expected")[0], measure(log, road)
+    for name, profile in (("deepplan", DEEPPLAN), ("default", NUPLAN)):
+        scores, result = expected.each(f"scores_{name}")[0], judge(measured, profile)
+        scores.match(f"{where} {name}", known_scores(result), SCORE_TOLERANCES, quantity="score")
+    order = list(BOUNDED_SIGNALS.values())
+    expected.match(where, {"comfort_flag_order": order}, quantity="")
+    series, found = expected.each("series")[0], found_along(measured, road)
+    names = {
+        **{"result": result, "counts": at_fault_counts(measured.collisions)},
+        "inside": ~measured.drivable.outside.any(axis=1),
+        "ttc": np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values),
+        "flags": within_bounds(measured.comfort, NUPLAN),
+        "deepplan": within_bounds(measured.comfort, DEEPPLAN),
+        "statistics": {one.name: one.value for one in result.statistics},
+    }
+    TABLES["series"].match(series, where, **found, **names)
+    TABLES["progress"].match(series.each("progress_statistics")[0], where, **names)
+    contacts = series.each("collisions")
+    report.compare("number of collisions", where, len(found["types"]), len(contacts))
+    ours = zip(measured.collisions, found["types"], contacts, strict=False)
+    for contact, kind, theirs in ours:
+        TABLES["collisions"].match(theirs, f"{where} {contact.token}", contact=contact, kind=kind)
+
+
+def known_scores(result: MetricResult) -> dict[str, float]:
+    """Scores by metric, and the whole `score`; without those that have no value."""
+    scores = {**result.scores, "score": result.score}
+    return {name: score for name, score in scores.items() if score is not None}
+
+
+def found_along(measured: Measurements, road: VectorMap) -> dict[str, Any]:
+    """What tables say of the way of a rollout: roadblocks at every sample, and collisions."""
+    samples, corners = range(len(measured.time_us)), measured.corners
+    return {
+        "measured": measured,
+        "route": [measured.route.ids(road, i) for i in samples],
+        "corners": [[corners.ids(road, i, corner) for corner in range(4)] for i in samples],
+        "types": [f"{one.collision_type.upper()}_COLLISION" for one in measured.collisions],
+    }

@@ -135,6 +135,36 @@ class Scenario:
         return edit_scenario(self, name, **tables)
 
 
+def scenario_of_rows(
+    token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
+) -> Scenario:
+    """A scenario whose iterations are all rows, without lights, route and goal.
+
+    Args:
+        token: Id of the scenario.
+        road: The map.
+        time_us: (R,) time stamps [us].
+        ego: (R, 11) ego states, columns of `state.STATE_COLUMNS`.
+        tracks: Tracks over the rows.
+    """
+    return Scenario(
+        token=token,
+        scenario_type="unknown",
+        log_name="world",
+        city=road.name,
+        map=road,
+        time_us=time_us,
+        ego=ego,
+        tracks=tracks,
+        traffic_lights=TrafficLights.empty(len(time_us)),
+        iteration_rows=np.arange(len(time_us)),
+        row_step=1,
+        route=(),
+        mission_goal=None,
+        mapping=(10.0, 0.0, 1.0),
+    )
+
+
 def require_scenario(what: str, given: object) -> None:
     """Refuse what is no scenario, with how to get one.
 

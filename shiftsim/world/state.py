@@ -4,6 +4,7 @@ Everything is an array with one row per time; the few objects here name the colu
 the rear axle, a track's pose is the centre of its box.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -178,6 +179,27 @@ class Tracks:
             np.zeros(0, np.int64),
             (),
         )
+
+
+def tracks_of_boxes(
+    boxes: FloatArray, kinds: Sequence[int] | IntArray, tokens: Sequence[str]
+) -> Tracks:
+    """Tracks of what is known of them row by row.
+
+    Args:
+        boxes: (T, N, 7) box centre x [m], y [m], heading [rad], velocity x, y in the map frame
+            [m/s], length, width [m]; x is NaN where a track is absent.
+        kinds: (N,) AgentKind codes.
+        tokens: N ids.
+    """
+    return Tracks(
+        valid=~np.isnan(boxes[..., 0]),
+        poses=np.ascontiguousarray(boxes[..., :3]),
+        velocities=np.ascontiguousarray(boxes[..., 3:5]),
+        sizes=np.ascontiguousarray(boxes[..., 5:]),
+        kinds=np.array(kinds, np.int64),
+        tokens=tuple(tokens),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded
-from shiftsim.verify.metric_worlds import read_world
 from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.worlds import read_world
 from shiftsim.world.state import PACIFICA, center_poses
 
 CORNERS = [(0.0, 0.0), (0.9, 0.2), (1.0, -1.0), (-1.0, 1.0)]  # first actions

@@ -12,7 +12,7 @@ from strategies import OFFSETS, rigid_motions, seeds
 from worlds import join_tracks
 
 from shiftsim.metrics import MetricResult, compute_metrics
-from shiftsim.verify.metric_worlds import read_world
+from shiftsim.verify.worlds import read_world
 
 LOADED = {path.stem: load_world(path) for path in WORLDS}
 worlds = st.sampled_from(sorted(LOADED))

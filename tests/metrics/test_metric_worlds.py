@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from rollouts import WORLDS, load_world
 
-from shiftsim.verify.metric_worlds import verify_metric_worlds
 from shiftsim.verify.report import Report
+from shiftsim.verify.worlds import verify_metric_worlds
 
 pytestmark = pytest.mark.golden
 CRASH = next(path for path in WORLDS if path.stem.endswith("18"))

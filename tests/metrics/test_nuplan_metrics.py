@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.nuplan.metrics import verify_nuplan_metrics
+from shiftsim.verify.nuplan.runs import verify_nuplan_metrics
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 

@@ -12,8 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.nuplan.format import verify_nuplan_format
-from shiftsim.verify.nuplan.logs import verify_nuplan_import
+from shiftsim.verify.nuplan.logs import verify_nuplan_format, verify_nuplan_import
 from shiftsim.verify.nuplan.maps import verify_maps
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes

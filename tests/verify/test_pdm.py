@@ -10,8 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.calls import verify_routes
-from shiftsim.verify.pdm.kernels import verify_kernels
+from shiftsim.verify.pdm.cases import verify_kernels, verify_routes
 from shiftsim.verify.pdm.steps import verify_calls
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes

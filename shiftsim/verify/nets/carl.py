@@ -24,7 +24,7 @@ def _verify_forward(file: Source) -> None:
     names = ("bev_semantics", "measurements", "value_measurements")
     inputs = [file[f"in.{name}"][None] for name in names]
     for variant in common.match_case(file, NAME):
-        says = _outputs(common.make_network(NAME, variant), *inputs)
+        says = _outputs(common.make_planner(Carl, variant).networks[0], *inputs)
         where = f"{file.name} {variant}"
         TABLES["encoder"].match(file.below("out."), where, NAME, **says)
         TABLES["heads"].match(file.below(f"out.{variant}."), where, NAME, **says)

@@ -1,8 +1,9 @@
-"""What is compared of every learned planner: the manifest of its network, its closed loops.
+"""The nets folder: the learned planners with deterministic weights against the official code.
 
-Weights are deterministic: anybody can make them again from the names of the tensors. In a closed
-loop a rollout of ours is moved by what is recorded; the planner sees it, and what it says is
-compared.
+Here is what is compared of all: the manifest of a network, closed loops, routes as the planners
+correct them. Weights are deterministic: anybody can make them again from the names of the tensors.
+In a closed loop a rollout of ours is moved by what is recorded; the planner sees it, and what it
+says is compared.
 """
 
 import hashlib
@@ -10,24 +11,40 @@ import json
 import re
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict
-from functools import cache
-from typing import Any
+from functools import cache, partial
+from importlib import import_module
+from importlib.util import find_spec
+from inspect import signature
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.planners.learned.checkpoint import load_network
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.match import network_module
+from shiftsim.planners.routes import correction
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import past_rows
-from shiftsim.verify.files import Source
+from shiftsim.verify.files import Source, read_arrays, read_fields, verify_files
+from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import Table, read_tables
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 
+Tables: TypeAlias = Mapping[str, Table]  # by section
 TABLES = read_tables(__file__)
+PARTS = {  # sub-folder → module with `FILES`: what compares a file, by glob pattern
+    "carl": "carl",
+    "diffusion_planner": "diffusion",
+    "plantf": "plantf",
+    "pluto": "pluto",
+    "route_correction": "common",
+}
+SQUARE = 1.0  # m, half width
 STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
 
 # As in state.STATE_COLUMNS, in the words of the files.
@@ -37,10 +54,55 @@ PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
 
 
+def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> None:
+    """Compare every file of a folder with sub-folders named as the parts, or of one of these.
+
+    `scenes` holds the logs and maps, by default `nuplan` beside `nets`.
+    """
+    home, part = folder.resolve().parent, _part_of(folder)
+    known = Scenes(scenes or (home.parent if part in PARTS else home) / "nuplan")
+    if part in PARTS:
+        verify_part(part, folder, report, known)
+    else:
+        parts = {name: partial(verify_part, name, report=report, scenes=known) for name in PARTS}
+        verify_files(folder, report, parts)
+
+
+def _part_of(folder: Path) -> str:
+    """Which part a folder is by itself; empty where it holds the parts."""
+    if any(folder.glob("route_correction_*.json")):
+        return "route_correction"
+    manifest = folder / "state_dict.json"
+    return str(read_fields(manifest, Report())["planner"]) if manifest.is_file() else ""
+
+
+def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
+    """Compare every file of a sub-folder, whose name as in `PARTS` is `part`."""
+    is_network = part != "route_correction"
+    if is_network and find_spec("torch") is None:
+        report.skip(f"{part}: torch is not installed")
+        return
+    files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
+    parts = {pattern: partial(_verify, files[pattern], report, scenes) for pattern in files}
+    with import_module("torch").no_grad() if is_network else nullcontext():
+        verify_files(folder, report, parts)
+
+
+def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:
+    """Compare one file, with its scenes if it asks for them and has one that is at hand."""
+    file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
+    scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
+    if scene is not None and scene not in scenes:
+        report.skip(f"{path.name}: scene {scene}, which is not at hand")
+        return
+    compare(file, *([scenes] if "scenes" in signature(compare).parameters else []))
+    file.finish()
+
+
 @cache
-def make_network(planner: str, variant: str) -> Any:
-    """The network of a planner with a variant of the deterministic weights, ready to be called."""
-    return load_network(f"deterministic:{variant}", planner)
+def make_planner(make: Callable[[str], Any], variant: str) -> Any:
+    """A planner with a variant of the deterministic weights; its network serves all files."""
+    return make(f"deterministic:{variant}")
 
 
 def match_meta(file: Source, planner: str, **ours: object) -> None:
@@ -55,9 +117,7 @@ def match_case(file: Source, planner: str) -> list[str]:
     return variants
 
 
-def verify_manifest(
-    planner: str, tables: Mapping[str, Table], file: Source, /, **names: Any
-) -> None:
+def verify_manifest(planner: str, tables: Tables, file: Source, /, **names: Any) -> None:
     """Compare `state_dict.json`: names, shapes, types, rules and weights, and the other fields.
 
     Section `manifest` of the tables has these, among `names`; `weights` has by field which weights
@@ -71,18 +131,11 @@ def verify_manifest(
     listed = [str(entry["key" if "key" in entry else "name"]) for entry in entries]
     report.compare(f"{planner} state names", file.name, sorted(built), sorted(listed))
     for name, entry in zip(listed, entries, strict=True):
-        if name not in built:
-            continue
-        ours = {
-            "shape": list(built[name].shape),
-            "dtype": str(built[name].dtype),
-            "kind": "parameter" if name in trained else "buffer",
-            "ckpt_key": module.PREFIXES[0] + name,
-            "rule": rules.get(name) or rule_of(name, built[name].ndim),
-            "value": built[name].tolist(),
-        }
-        ours = {field: value for field, value in ours.items() if field in entry}
-        entry.match(name, ours, quantity=f"{planner} state")
+        if name in built:
+            tensor, kind = built[name], "parameter" if name in trained else "buffer"
+            known = {"tensor": tensor, "kind": kind, "name": name, "network": module}
+            known["rule"] = rules.get(name) or rule_of(name, tensor.ndim)
+            TABLES["tensor"].match(entry, name, f"{planner} state", **known)
     (check,) = file.each("selfcheck")
     if "first3_raw_z" in check:
         where, shape = check["name"], built[check["name"]].shape
@@ -111,13 +164,13 @@ class Loop:
     """One closed-loop file, and its iteration that is compared just now."""
 
     def __init__(
-        self, file: Source, planner: Any, tables: Mapping[str, Table], scenario: Scenario
+        self, file: Source, make: Callable[[str], Any], tables: Tables, scenario: Scenario
     ) -> None:
         self.file, self.tables, self.where = file, {**TABLES, **tables}, file.name
         self.scenario, self.road, self.tracks = scenario, scenario.map, scenario.tracks
-        self.planner, self.name = planner, planner.name  # the planner after this iteration
         self.variant = str(file["meta/variant"])  # of its weights
-        self.rollout = Rollout(scenario, planner)
+        self.planner = make_planner(make, self.variant)  # after this iteration
+        self.name, self.rollout = self.planner.name, Rollout(scenario, self.planner)
 
     def step(self, number: int) -> None:
         """Look at an iteration, which must be that of the rollout, and make its plan again."""
@@ -152,7 +205,7 @@ class Loop:
 
 def verify_loop(
     make: Callable[[str], Any],
-    tables: Mapping[str, Table],
+    tables: Tables,
     compare: Callable[[Loop], None],
     file: Source,
     scenes: Scenes,
@@ -162,8 +215,7 @@ def verify_loop(
     `make` makes the planner from the name of its weights; the arrays of section `iteration` have a
     row for every plan.
     """
-    planner = _planner(make, f"deterministic:{file['meta/variant']}")
-    loop = Loop(file, planner, tables, scenes[str(file["meta/scene"])])
+    loop = Loop(file, make, tables, scenes[str(file["meta/scene"])])
     egos, plans = file["ego/current"], file.below("out/")
     counts = [len(plans[name.partition("[")[0]]) for name in tables["iteration"].rows]
     loop.compare("plans", counts, counts[:1] * len(counts))
@@ -198,4 +250,29 @@ def _compare_scene(loop: Loop, scenes: Scenes, count: int) -> None:
     loop.match("ego", loop.file.below("ego/"), **names)
 
 
-_planner = cache(lambda make, weights: make(weights))  # its network serves all files
+def verify_corrections(file: Source, scenes: Scenes) -> None:
+    """Correct every route of a file as the learned planners do."""
+    scenario = scenes[str(file["scene"])]
+    TABLES["corrected_scene"].match(file, file.name, scenario=scenario)
+    for number, case in enumerate(file.each("cases")):
+        at = f"{file.name} {number} ({case['case']})"
+        with file.report.attempt("corrected route", at):
+            _compare_correction(case, at, scenario)
+
+
+def _compare_correction(case: Source, where: str, scenario: Scenario) -> None:
+    road, rear_axle = scenario.map, np.array(case["rear_axle"], np.float64).reshape(3)
+    if case["case"] == "as_logged":
+        TABLES["logged"].match(case, where, scenario=scenario)
+    blocks = correction.known_blocks(road, case["route"], "of the file", "route correction")
+    size = np.array([state.PACIFICA.length, state.PACIFICA.width])
+    footprint = boxes_to_corners(state.center_poses(rear_axle), size)
+    start = correction.find_start(road, blocks, rear_axle, footprint)
+    ours = {
+        "square": correction.RouteCorrector(road, blocks, SQUARE).at(rear_axle),
+        "footprint": correction.correct_route(road, blocks, start),
+    }
+    TABLES["corrections"].match(case, where, road=road, **ours)
+
+
+FILES = {"route_correction_*.json": verify_corrections}

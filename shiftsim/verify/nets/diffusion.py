@@ -18,9 +18,9 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common
-from shiftsim.verify.nets.common import Loop, make_network, match_meta
-from shiftsim.verify.nuplan.metrics import tracks_of
+from shiftsim.verify.nets.common import Loop, make_planner, match_meta
 from shiftsim.verify.tables import read_tables
+from shiftsim.verify.worlds import tracks_of
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -76,7 +76,7 @@ def _verify_forward(file: Source) -> None:
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
     inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
-    network = make_network(NAME, "base")
+    network = make_planner(KeyedPlanner, "base").network
     scene = network.normalise(inputs)
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
@@ -102,7 +102,7 @@ def _sampled(
     from shiftsim.planners.learned.diffusion.network import sampler
     from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
 
-    network = make_network(NAME, variant)
+    network = make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
     prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
     seen, made = [], []

@@ -1,6 +1,6 @@
 """PlanTF, and what its comparisons share with PLUTO's: features, inputs and outputs of networks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -12,8 +12,8 @@ from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.common import Loop, make_network, verify_loop, verify_manifest
-from shiftsim.verify.tables import Table, read_tables
+from shiftsim.verify.nets.common import Loop, Tables, make_planner, verify_loop, verify_manifest
+from shiftsim.verify.tables import read_tables
 
 Outputs: TypeAlias = Callable[[Any, Any], dict[str, Any]]  # of a network, from its inputs
 
@@ -49,7 +49,7 @@ def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) ->
 
 
 def verify_forward(
-    planner: str, tables: Mapping[str, Table], outputs: Outputs, radius: float, file: Source
+    planner: Any, tables: Tables, outputs: Outputs, radius: float, file: Source
 ) -> None:
     """Compare the network alone, on synthetic inputs as the official code batched them.
 
@@ -62,13 +62,13 @@ def verify_forward(
         array = np.dstack([stored[n] for n in where]) if isinstance(where, list) else stored[where]
         tensor = torch.from_numpy(np.ascontiguousarray(array))
         tensors[field] = tensor.long() if field in CODES else tensor
-    inputs = network_module(planner).Inputs(**tensors)
-    ours = outputs(make_network(planner, variant), inputs)
+    inputs = network_module(planner.name).Inputs(**tensors)
+    ours = outputs(make_planner(planner, variant).network, inputs)
     for table in (tables["outputs"], tables["large"]):
-        called = f"{planner} ({variant})"
+        called = f"{planner.name} ({variant})"
         table.match(file.below("out/"), file.name, called, variant=variant, **ours)
     codes = {tables["inputs"].rows[field] for field in CODES if field in tensors}
-    _compare_inputs(stored, planner, radius, {*codes, "map.polygon_road_block_id"})
+    _compare_inputs(stored, planner.name, radius, {*codes, "map.polygon_road_block_id"})
     file.note("the network does not read them", "in/origin", "in/angle")
     file.note("the network does not read the yaw rate, the last value of in/current_state")
 
@@ -152,6 +152,6 @@ def _compare(loop: Loop) -> None:
 MANIFEST = partial(verify_manifest, builder=builder, history=2.0, future=builder.PLAN_POSES * STEP)
 FILES = {
     "state_dict.json": partial(MANIFEST, NAME, TABLES, planner=plantf),
-    "forward_*.npz": partial(verify_forward, NAME, TABLES, _outputs, plantf.RADIUS),
+    "forward_*.npz": partial(verify_forward, plantf.PlanTF, TABLES, _outputs, plantf.RADIUS),
     "closed_loop_*.npz": partial(verify_loop, plantf.PlanTF, TABLES, _compare),
 }

@@ -113,7 +113,9 @@ def _compare_from_stored(loop: Loop, stored: Source) -> None:
 
 FILES = {
     "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=planner),
-    "forward_*.npz": partial(plantf.verify_forward, NAME, TABLES, _outputs, planner.RADIUS),
+    "forward_*.npz": partial(
+        plantf.verify_forward, planner.Pluto, TABLES, _outputs, planner.RADIUS
+    ),
     "closed_loop_*.npz": partial(common.verify_loop, planner.Pluto, TABLES, _compare),
     "emergency_brake.npz": _verify_brake,
 }

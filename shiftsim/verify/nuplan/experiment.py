@@ -20,13 +20,14 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
-from shiftsim.verify.metric_worlds import SCORE_TOLERANCES
 from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, POSE, light_columns
-from shiftsim.verify.nuplan.metrics import CATEGORIES, RECORDED, UNITS, tracks_of
 from shiftsim.verify.nuplan.runs import (
+    CATEGORIES,
     CHALLENGES,
     EGO_TOLERANCES,
     OBJECT_TOLERANCES,
+    RECORDED,
+    UNITS,
     Seen,
     observed_columns,
     plan_again,
@@ -39,7 +40,14 @@ from shiftsim.verify.nuplan.simulation_log import (
 )
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, recorded_log
+from shiftsim.verify.worlds import (
+    EGO_COLUMNS,
+    SCORE_TOLERANCES,
+    ego_columns,
+    ego_states,
+    recorded_log,
+    tracks_of,
+)
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
 
@@ -191,7 +199,7 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
                 raise DataError(f"{file}: column {name!r} is missing", OTHER_VERSION)
         if has_means:
             table = _compare_means(table)
-        found[file.stem] = Groups(table, report, (token, "planner_name"))
+        found[file.stem] = Groups(table, (token, "planner_name"))
     return found
 
 

@@ -1,30 +1,39 @@
-"""Runs of nuPlan: simulated again from the log, and planned again from the recorded states.
+"""Runs of nuPlan: scored as recorded, simulated again from the log, planned again at every state.
 
-A simulated run is compared with the recorded one state by state; a reactive one object by object
-too, a scored one score by score.
+A recorded rollout is scored by us and by the official stack. A simulated run is compared with the
+recorded one state by state; a reactive one object by object too, a scored one score by score.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import judge, measure
+from shiftsim.metrics import MetricResult, judge, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
-from shiftsim.verify.files import COMPARED, TOLERANCE, Source, open_tables
-from shiftsim.verify.metric_worlds import known_scores
-from shiftsim.verify.nuplan.metrics import PROFILES, tracks_of
+from shiftsim.verify import worlds
+from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Source, open_tables
+from shiftsim.verify.nuplan.logs import verify_nuplan_import
 from shiftsim.verify.report import Report
-from shiftsim.verify.worlds import EGO_COLUMNS, ego_columns, ego_states, object_columns
-from shiftsim.world.scenario import Scenario
+from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.tables import read_tables
+from shiftsim.verify.worlds import EGO_COLUMNS, SCORE_TOLERANCES, ego_columns, ego_states
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario, scenario_of_rows
 from shiftsim.world.state import AgentKind, Tracks, Trajectory
 
+TABLES = read_tables(__file__)
+PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
+# how the devkit files each metric, and the units of scores that have one
+RECORDED, CATEGORIES, UNITS = (COMPARED[what] for what in ("recorded", "category", "unit"))
+RUN_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
 EGO_TOLERANCES, OBJECT_TOLERANCES = (
     COMPARED[f"{name}.parquet"]["atol"] for name in ("ego", "objects")
 )
@@ -35,6 +44,96 @@ CHALLENGES = {  # controller and traffic
     "R": ("lqr", "reactive"),
 }
 _SCRIPTED = "scripted_"
+
+
+def verify_nuplan(folder: Path, report: Report, mode: str | None = None) -> None:
+    """Compare every table of the folder; of one mode only its runs, but the importer always."""
+    scenes = Scenes(folder)
+    with report.attempt("importer", folder.name):
+        verify_nuplan_import(folder, report)
+    for verify in (verify_planners, verify_simulation, verify_nuplan_metrics):
+        with report.attempt(verify.__name__, folder.name):
+            verify(folder / "expected", report, scenes, mode)
+
+
+def verify_nuplan_metrics(
+    expected: Path,
+    report: Report,
+    scenes: Scenes,
+    mode: str | None = None,
+    *,
+    logged: Path | None = None,
+) -> None:
+    """Score the recorded rollout of every run of `ego.parquet` (of one mode).
+
+    `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
+    """
+    tables = open_tables(expected, report, *RUN_TABLES)
+    replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
+    experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
+    tables["objects"].table.note("no metric reads it", "height")
+    for run in tables["ego"].of_mode(mode):
+        scene, challenge, _ = run
+        with report.attempt("recorded rollout", " ".join(run)):
+            entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
+            seen = tables["objects"][run] if challenge == "R" else replayed[scene, "NR", "*"]
+            log = _rollout(tables["ego"][run], experts[scene, "iteration"], seen, road)
+            times = log.expert_time_us[: len(log.ego)]
+            columns = {"iteration": np.arange(len(times)), "time_us": times}
+            columns |= {name: ego_columns(log.ego)[name] for name in RECORDED}
+            tables["ego"].match(run, columns, RECORDED, quantity="recorded")
+            measured = measure(log, road)
+            contacts, names = measured.collisions, worlds.found_along(measured, road)
+            names["samples"] = np.arange(len(measured.time_us))
+            names["kinds"] = [AgentKind(one.kind).name for one in contacts]
+            names["is_time"] = [one.time_us in measured.at_fault_times for one in contacts]
+            for name, rows in TABLES.items():
+                rows.match(tables[name][run], " ".join(run), **names)
+            for thresholds, profile in PROFILES.items():
+                result = judge(measured, profile)
+                _compare_profile((*run, thresholds), result, entry, tables)
+                if profile == "nuplan":
+                    _compare_series(run, result, tables["time_series"])
+    for table in tables.values():
+        table.finish(mode)
+
+
+def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> SimulationLog:
+    ego, logged = (ego_states({n: part[n] for n in EGO_COLUMNS}) for part in (rows, expert))
+    times, tracks = expert["time_us"].astype(np.int64), worlds.tracks_of(objects, len(ego))
+    scenario = scenario_of_rows("recorded", road, times, logged, tracks)
+    return replace(worlds.recorded_log(scenario, ego), time_us=rows["time_us"].astype(np.int64))
+
+
+def _compare_profile(
+    key: tuple[str, ...], result: MetricResult, entry: Source, tables: dict[str, Groups]
+) -> None:
+    """Compare scores and statistics under one threshold set."""
+    scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
+    row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
+    row |= {"score": result.score}
+    tables["scores"].match(key, {name: [value] for name, value in row.items()})
+    tables["metrics"].match_keys(key, [(name,) for name in scores])
+    for name, score in scores.items():
+        filed = {"category": [CATEGORIES.get(name, "Planning")], "unit": [UNITS.get(name)]}
+        atol = {"score": SCORE_TOLERANCES.get(name, EXACT)}
+        tables["metrics"].match((*key, name), {**filed, "score": [score]}, atol)
+    found = result.statistics
+    tables["statistics"].match_keys(key, [(s.metric, s.name) for s in found])
+    for s in found:
+        ours = {"unit": [s.unit or None], "type": [s.kind or None], "value": [s.value]}
+        is_exact = s.unit in ("boolean", "count")
+        tables["statistics"].match((*key, s.metric, s.name), ours, EXACT if is_exact else None)
+
+
+def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -> None:
+    times = result.measurements.time_us
+    table.match_keys(run, [(metric,) for metric in result.series])
+    for metric, series in result.series.items():
+        columns = {"unit": [series.unit or None] * len(times), "index": np.arange(len(times))}
+        columns |= {"time_us": times, "value": series.values}
+        atol = EXACT if series.unit == "boolean" else None
+        table.match((*run, metric), columns, atol, quantity="series")
 
 
 def verify_simulation(
@@ -67,7 +166,7 @@ def verify_simulation(
                 objects.match(key, shown, quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                rated = known_scores(judge(measured, profile))
+                rated = worlds.known_scores(judge(measured, profile))
                 columns = {name: [score] for name, score in rated.items()}
                 scores.match((*key, thresholds), columns, quantity="simulated score")
     if mode in (None, "R"):
@@ -85,7 +184,7 @@ def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
     listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
     orders = [listed(tracks.kinds, row) for row in tracks.valid]
     iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
-    return object_columns(tracks, iteration, np.concatenate(orders))
+    return worlds.object_columns(tracks, iteration, np.concatenate(orders))
 
 
 def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
@@ -136,7 +235,7 @@ class Seen:
     def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
         self.scenario = scenario
         self.ego = ego_states({name: ego[name] for name in EGO_COLUMNS})
-        self._tracks = tracks_of(objects, len(self.ego)) if challenge == "R" else None
+        self._tracks = worlds.tracks_of(objects, len(self.ego)) if challenge == "R" else None
 
     def at(self, iteration: int) -> Observation:
         """The present alone; the rule-based planners look at nothing else."""

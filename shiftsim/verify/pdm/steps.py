@@ -20,15 +20,14 @@ from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
 from shiftsim.sim.planner import scene_info
-from shiftsim.verify.files import Groups, Source, read_arrays, read_fields, read_json
+from shiftsim.verify.files import Source, open_tables, read_arrays, read_fields, read_json
 from shiftsim.verify.nuplan import runs
-from shiftsim.verify.nuplan.metrics import RUN_TABLES
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
-from shiftsim.verify.worlds import BOX_COLUMNS, make_tracks
+from shiftsim.verify.worlds import BOX_COLUMNS, kind_of
 from shiftsim.world.layers import make_layer, make_polygons
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import HEADING, PACIFICA, center_poses
+from shiftsim.world.state import HEADING, PACIFICA, center_poses, tracks_of_boxes
 
 TABLES = read_tables(__file__)
 UNSTABLE_BEARING = 1e-7  # rad from dead ahead or dead behind
@@ -85,8 +84,8 @@ def _see(inputs: Source, ego: FloatArray, centerline: polylines.Path) -> Seen:
     """What is seen in a recorded step."""
     center, things, parts = center_poses(ego[:3]), inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
-    kinds, names = ([thing[name] for thing in things] for name in ("type", "token"))
-    tracks = make_tracks((1, len(things)), ..., values.reshape(1, -1, 7), kinds, names)
+    kinds, names = [kind_of(thing) for thing in things], [thing["token"] for thing in things]
+    tracks = tracks_of_boxes(values.reshape(1, -1, 7), kinds, names)
     chosen = around.select_tracks(tracks, center[0], center[1], set(), DEFAULT)
     shapes = [shapely.Polygon(part["exterior"]) for part in parts]
     drivable, red = make_layer([part["id"] for part in parts], shapes), inputs["red_light_lane_ids"]
@@ -157,11 +156,8 @@ def verify_calls(
     folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
 ) -> None:
     """Make every planning call of closed loops (of one mode) again from the recorded ego state."""
-    egos, objects = (Groups(folder / f"{name}.parquet", report) for name in ("ego", "objects"))
-    steps, proposals = (
-        Groups(folder / f"{name}.parquet", report, ("scene", "challenge"))
-        for name in ("steps", "proposals")
-    )
+    tables = open_tables(folder, report, "ego", "objects", "steps", "proposals")
+    egos, objects, steps, proposals = tables.values()
     static = read_fields(folder / "static.json", report, "static.json")
     for key in egos:
         call, where = key[:2], " ".join(key[:2])
@@ -177,7 +173,7 @@ def verify_calls(
         table.finish(mode)
     if mode is None:
         static.finish()
-    known = {f"{name}.parquet" for name in (*RUN_TABLES, "steps", "proposals")}
+    known = {f"{name}.parquet" for name in (*runs.RUN_TABLES, "steps", "proposals")}
     known |= {"static.json", *(f"{'_'.join(key[:2])}.npz" for key in egos)}
     for name in sorted({path.name for path in folder.iterdir()} - known):
         report.skip(f"file loop/{name}")

@@ -2,11 +2,14 @@
 
 import dataclasses
 import logging
+import re
+from pathlib import Path
 
 import numpy as np
 import places
 import pytest
 
+from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.store import shared
 from shiftsim.data.store.map import read_map_file, write_map
@@ -15,6 +18,8 @@ from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer
 
 GOLDEN = places.GOLDEN / "nuplan_format" / "maps" / "fixture-town" / "1.0.0" / "map.gpkg"
+
+SMAPS = Path("/proc/self/smaps")
 
 
 @pytest.fixture(autouse=True)
@@ -75,6 +80,19 @@ def test_a_kept_map_is_the_same_to_the_last_bit(stored, cache):
     assert_same(shared_map(stored), expected)
     after = kept_file(cache).stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+@pytest.mark.skipif(not SMAPS.exists(), reason="needs the tables of Linux")
+def test_a_process_has_only_the_parts_of_a_kept_map_that_it_looks_at(tmp_path, cache):
+    path = tmp_path / "city.parquet"
+    write_map(path, bench_scene(1, 0).map)
+    for _ in range(2):  # made, then found
+        road = shared_map(path)
+    tables = SMAPS.read_text("utf-8").partition(str(kept_file(cache)))[2]
+    size, resident = (int(re.search(rf"^{n}:\s*(\d+)", tables, re.M)[1]) for n in ("Size", "Rss"))
+    assert size > 20_000  # kB
+    assert resident < 0.2 * size
+    assert road.num_lanes > 1000  # and it is still open
 
 
 DAMAGES = {

@@ -18,9 +18,12 @@ from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store import schema
+from shiftsim.data.store.boxes import restored, second_differences
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.map import read_map_file, write_map
+from shiftsim.data.store.plausible import BOX_LIMITS
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.tracks import ego_span, ego_states, open_ego, write_ego
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
@@ -29,7 +32,7 @@ from shiftsim.world.state import Tracks, TrafficLights
 GOLDEN = places.GOLDEN / "nuplan_format"
 LOG = GOLDEN / "logs" / "fixture_log_0001.db"
 TOKEN = "000000012a05f23c"
-VERSION_1 = places.GOLDEN / "store_version_1"
+VERSION_1, VERSION_2 = (places.GOLDEN / f"store_version_{number}" for number in (1, 2))
 
 
 @pytest.fixture(scope="module")
@@ -231,8 +234,8 @@ def test_a_window_reads_only_its_part_of_a_long_recording(
     store.read("a")
     rows = store.recording("drive").block_rows
     assert 0.7 * schema.BLOCK_ROWS < rows < 1.5 * schema.BLOCK_ROWS
-    assert asked == [list(range(1000 // rows, 1199 // rows + 1))]
-    assert len(asked[0]) < tracks.num_blocks
+    assert asked == [[block] for block in range(1000 // rows, 1199 // rows + 1)]
+    assert len(asked) < tracks.num_blocks
 
 
 def test_windows_of_several_blocks_come_back_to_the_last_bit(
@@ -252,10 +255,72 @@ def test_windows_of_several_blocks_come_back_to_the_last_bit(
             np.testing.assert_array_equal(getattr(part, name), expected)
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 1000])
+def test_any_bits_come_back_from_their_second_differences(
+    count: int, rng: np.random.Generator
+) -> None:
+    smooth = 4_475_000.0 + np.cumsum(rng.normal(0.5, 1e-4, count))
+    odd = np.array([0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf, 5e-324, 1.7e308])
+    anything = np.concatenate([rng.integers(-(2**63), 2**63, count).view(np.float64), odd])
+    for values in (smooth, -smooth, anything):
+        codes = second_differences(values)
+        assert restored(codes).tobytes() == values.tobytes()
+    assert (second_differences(smooth)[2:] < 2**40).all()
+
+
+def test_limits_of_motion_are_as_wide_to_both_sides() -> None:
+    # `scatter` looks at sizes only
+    assert (BOX_LIMITS[: len(schema.MOTION), 0] == -BOX_LIMITS[: len(schema.MOTION), 1]).all()
+
+
+def test_an_ego_of_several_row_groups_comes_back_to_the_last_bit(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    states = rng.normal(size=(2 * schema.FRAME_BLOCK + 7, 11))
+    write_ego(tmp_path, EgoTrace("drive", "ego", 40, states))
+    table = open_ego(tmp_path, "ego")
+    assert ego_span(table) == (40, 40 + len(states))
+    for first, last in ((0, len(states)), (2040, 2060), (2048, 2049), (4096, 4103)):
+        part = ego_states(table, 40 + first, 40 + last)
+        assert part.tobytes() == states[first:last].tobytes()
+    with pytest.raises(DataError, match="no rows"):
+        ego_states(table, 39, 60)
+
+
+@pytest.mark.parametrize("count", [10, 22])
+def test_a_row_group_without_whole_states_is_named(count: int, tmp_path: Path) -> None:
+    write_ego(tmp_path, EgoTrace("drive", "ego", 0, np.zeros((3, 11))))
+    path = tmp_path / "ego-ego.parquet"
+    file = pq.ParquetFile(path)
+    table = file.read().replace_schema_metadata(file.metadata.metadata)
+    with pq.ParquetWriter(path, table.schema) as writer:
+        for part in (table.slice(0, count), table.slice(count)):
+            writer.write_table(part)
+    with pytest.raises(DataError, match=r"ego-ego\.parquet: .*(whole states|too short)"):
+        ego_states(open_ego(tmp_path, "ego"), 0, 3)
+
+
+def test_boxes_of_a_track_that_is_none_are_refused(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    write_store(tmp_path / "s", road, make_recording(100, 4, rng), make_window("a", 0, 100))
+    path = next((tmp_path / "s").rglob("tracks.parquet"))
+    file = pq.ParquetFile(path)
+    table = file.read().replace_schema_metadata(file.metadata.metadata)
+    for wrong in (-1, 4):
+        track = np.array(table["track"]).copy()
+        track[20] = wrong
+        at = table.column_names.index("track")
+        pq.write_table(table.set_column(at, "track", pa.array(track)), path)
+        with pytest.raises(DataError, match=r"tracks\.parquet: column 'track' names an unknown"):
+            open_store(tmp_path / "s").read("a")
+
+
 @pytest.mark.golden
-def test_stores_of_version_1_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
+def test_stores_of_earlier_versions_are_read(folder: Path) -> None:
     expected = json.loads((VERSION_1 / "expected.json").read_text("utf-8"))
-    store = open_store(VERSION_1 / "store")
+    store = open_store(folder / "store")
     found: dict[str, object] = {}
     for scene in store:
         parts = {name: getattr(scene, name) for name in ("time_us", "ego")}
@@ -273,10 +338,11 @@ def test_stores_of_version_1_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.golden
-def test_a_store_of_version_1_is_added_to(
-    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
+def test_a_store_of_an_earlier_version_is_added_to(
+    folder: Path, tmp_path: Path, road: VectorMap, rng: np.random.Generator
 ) -> None:
-    path = Path(shutil.copytree(VERSION_1 / "store", tmp_path / "s"))
+    path = Path(shutil.copytree(folder / "store", tmp_path / "s"))
     before = open_store(path).read("a")
     recording = dataclasses.replace(make_recording(150, 3, rng), log_name="late")
     with StoreWriter(path) as writer:
@@ -426,16 +492,17 @@ def _drop_column(path: Path) -> None:
     file = pq.ParquetFile(path)
     table = file.read()
     notes = file.metadata.metadata
-    table = table.drop_columns([table.column_names[1]]).replace_schema_metadata(notes)
+    table = table.drop_columns([table.column_names[:2][-1]]).replace_schema_metadata(notes)
     pq.write_table(table, path)
 
 
 def _put_null(path: Path) -> None:
     file = pq.ParquetFile(path)
     table = file.read()
-    column = table.column(1)
+    name = table.column_names[:2][-1]
+    column = table[name]
     values = pa.array([*column.to_pylist()[:-1], None], column.type)
-    table = table.set_column(1, table.column_names[1], values)
+    table = table.set_column(table.column_names.index(name), name, values)
     pq.write_table(table.replace_schema_metadata(file.metadata.metadata), path)
 
 
@@ -467,21 +534,32 @@ def test_a_window_without_its_recording_is_refused(tmp_path: Path) -> None:
 
 def test_columns_carry_their_units(store: Path) -> None:
     tracks = pq.read_schema(next(store.rglob("tracks.parquet")))
-    assert {"x_m", "heading_rad", "vx_mps"} <= set(tracks.names)
-    assert pa.types.is_float64(tracks.field("x_m").type)
+    assert {"x_m_diff2", "heading_rad_diff2", "vx_mps_diff2", "length_m"} <= set(tracks.names)
+    assert pa.types.is_float64(tracks.field("length_m").type)
 
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
-    ("part", "column"), [("poses", "x_m"), ("velocities", "vx_mps"), ("sizes", "length_m")]
+    ("part", "axis", "column"),
+    [
+        *(("poses", axis, name) for axis, name in enumerate(("x_m", "y_m", "heading_rad"))),
+        *(("velocities", axis, name) for axis, name in enumerate(("vx_mps", "vy_mps"))),
+        *(("sizes", axis, name) for axis, name in enumerate(("length_m", "width_m"))),
+    ],
 )
 @pytest.mark.parametrize("value", [1e300, -np.inf])
 def test_an_implausible_number_names_file_track_and_column(
-    part: str, column: str, value: float, tmp_path: Path, road: VectorMap, rng: np.random.Generator
+    part: str,
+    axis: int,
+    column: str,
+    value: float,
+    tmp_path: Path,
+    road: VectorMap,
+    rng: np.random.Generator,
 ) -> None:
     recording = make_recording(100, 4, rng)
     recording.tracks.valid[50, 1] = True
-    getattr(recording.tracks, part)[50, 1, 0] = value
+    getattr(recording.tracks, part)[50, 1, axis] = value
     write_store(tmp_path / "s", road, recording, make_window("a", 0, 100))
     what = f"tracks.parquet: track '.*', row 50: column '{column}': "
     with pytest.raises(DataError, match=what):

@@ -11,8 +11,8 @@ import pytest
 
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import read_scenario
-from shiftsim.verify.calls import verify_idm_calls
 from shiftsim.verify.nuplan.runs import verify_planners
+from shiftsim.verify.pdm.cases import verify_idm_calls
 from shiftsim.verify.report import Report
 
 GOLDEN = places.GOLDEN / "planners"

@@ -7,7 +7,7 @@ import numpy as np
 import places
 import pytest
 
-from shiftsim.verify.nets import verify_nets, verify_part
+from shiftsim.verify.nets.common import verify_nets, verify_part
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 

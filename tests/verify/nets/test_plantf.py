@@ -9,7 +9,7 @@ import places
 import pytest
 
 from shiftsim.verify import verify
-from shiftsim.verify.nets import verify_part
+from shiftsim.verify.nets.common import verify_part
 from shiftsim.verify.report import Report
 from shiftsim.verify.scenes import Scenes
 

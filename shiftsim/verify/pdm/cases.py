@@ -1,4 +1,7 @@
-"""Parts of PDM-Closed that need no map: one function per file of the `kernels` folder."""
+"""The pdm folder: PDM-Closed and nuPlan's IDM planner, from kernels to closed loops.
+
+Kernels need no map; recorded routes and calls are made again from the log and map of a scene.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,21 +12,57 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
+from shiftsim.errors import DataError
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import make_path, project, window
+from shiftsim.planners.idm import STEP_US, STEPS, Idm
 from shiftsim.planners.pdm import rollout, step
+from shiftsim.planners.pdm import route as routes
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.route import offset_poses
+from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
+from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
-from shiftsim.planners.routes.graph import Search, search_cheapest, search_levels
+from shiftsim.planners.routes.graph import Search, centerline, search_cheapest, search_levels
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.verify.files import TOLERANCE, Source, verify_files
-from shiftsim.verify.pdm.steps import verify_step, verify_summary
+from shiftsim.verify.nuplan.runs import verify_nuplan_metrics, verify_simulation
+from shiftsim.verify.pdm.steps import verify_calls, verify_step, verify_summary
 from shiftsim.verify.report import Report
-from shiftsim.verify.tables import verify_cases
-from shiftsim.world.state import NUM_STATE, PACIFICA, center_poses
+from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.tables import read_tables, verify_cases
+from shiftsim.verify.worlds import object_columns
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import NUM_STATE, PACIFICA, LightStatus, center_poses
 
+TABLES = read_tables(__file__)
 COORDINATES = 2e-9  # m, coordinates near 4e6 are spaced 5e-10
 SIGNAL_TOLERANCE = 1e-6  # comfort signals: rounded to 8 decimals, then differentiated
+
+
+def verify_pdm(
+    folder: Path, report: Report, *, mode: str | None = None, scenes: Path | None = None
+) -> None:
+    """Compare every file of the folder; arguments as for `shiftsim.verify.verify`."""
+    known = Scenes(scenes or folder.resolve().parent / "nuplan")
+    parts: dict[str, Callable[[Path], object]] = {
+        "routes.json": partial(verify_routes, report=report, scenes=known),
+        "idm_calls.json": partial(verify_idm_calls, report=report, scenes=known),
+        "loop": partial(_verify_loops, report=report, scenes=known, mode=mode),
+    }
+    if not known:
+        lack = "the logs and maps of the scenes are not at hand"
+        parts = dict.fromkeys(parts, lambda path: report.skip(f"{path.name}: {lack}"))
+    kernels = partial(verify_kernels, report=report)
+    verify_files(folder, report, {"kernels": kernels, **parts})
+
+
+def _verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None) -> None:
+    """Compare every run (of one mode) of the `loop` folder: its calls, then driven freely."""
+    verify_calls(folder, report, scenes, mode)
+    logged = scenes.folder / "expected"
+    verify_nuplan_metrics(folder, report, scenes, mode, logged=logged)
+    verify_simulation(folder, report, scenes, mode, logged=logged)
 
 
 def verify_kernels(folder: Path, report: Report) -> None:
@@ -79,8 +118,8 @@ def _path(case: Source, where: str) -> None:
         "progress": path.progress,
         "projection": [project(path, x, y, 0)[0] for x, y in points],
         "poses": at,
-        "offset_m": offset_poses(poses, -1.0),
-        "offset_p": offset_poses(poses, 1.0),
+        "offset_m": routes.offset_poses(poses, -1.0),
+        "offset_p": routes.offset_poses(poses, 1.0),
     }
     for row, (low, high) in enumerate(case.take("substring_iv", -1, 2).tolist()):
         line = path.xy[slice(*window(path, low, high))]
@@ -119,8 +158,59 @@ def _search_lanes(case: Source, after: list[list[int]]) -> Search:
     )
 
 
+def _compare_route(case: Source, where: str, scenario: Scenario) -> None:
+    """Corrected route, current lane and centerline of PDM-Closed."""
+    road, ego = scenario.map, np.zeros(NUM_STATE)
+    case.note("label", "route_name", "pose_name")
+    ego[:3] = case["rear_axle"]
+    route = routes.start_route(road, tuple(case["route"]), ego, scenario.token)
+    center = center_poses(ego[:3])
+    selected = select_areas(road, center[0], center[1], DEFAULT.map_radius)
+    areas, errors = routes.lanes_at(road, route, selected, ego)
+    ordered = routes.in_index_order(route, selected, areas)
+    lane = routes.current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
+    line = centerline(road, routes.follow_route(road, route.corrected, lane).path)
+    ours = {
+        "under": route.areas.lane[ordered],
+        "errors": [errors[areas.index(area)] for area in ordered],
+    }
+    ours |= {"lane": lane, "line": line, "path": make_path(line)}
+    TABLES["routes"].match(case, where, road=road, route=route, **ours)
+
+
+def _compare_idm(call: Source, where: str, scenario: Scenario) -> None:
+    """Inputs and plan of nuPlan's IDM planner, which was called once before."""
+    first, iteration = call["first_call_iteration"], call["iteration"]
+    if not all(0 <= index < scenario.num_iterations for index in (first, iteration)):
+        raise DataError("no such iteration")
+    planner, road = Idm(), scenario.map
+    planner.reset(scene_info(scenario))
+    planner.plan(observe_log(scenario, first, samples=1))
+    seen = observe_log(scenario, iteration, samples=1)
+    centers, speeds = planner.roll_out(seen)
+    reds = [name for name, status in seen.lights.listed(0) if status == LightStatus.RED]
+    TABLES["inputs"].match(call, where, scenario=scenario, seen=seen, reds=sorted(reds))
+    tracks = seen.tracks
+    index = sorted(np.flatnonzero(tracks.valid[0]).tolist(), key=tracks.tokens.__getitem__)
+    columns = object_columns(tracks, np.zeros(len(index), np.int64), np.array(index, np.int64))
+    kinds = [kind.lower() for kind in columns["type"]]
+    things = sorted(call.each("objects"), key=lambda thing: str(thing["token"]))
+    listed = {name: [thing[name] for thing in things] for name in TABLES["objects"].rows}
+    theirs = Source(call.name, "field", listed, call.report)
+    TABLES["objects"].match(theirs, where, columns=columns, kinds=kinds)
+    path, times = planner.path, seen.time_us + STEP_US * np.arange(STEPS + 1)
+    assert path is not None
+    ours = {
+        "end": [path.end, *path.driven.xy[-1], wrap_angle(float(path.driven.heading[-1]))],
+        "states": np.column_stack([times, centers, speeds]),
+    }
+    TABLES["plan"].match(call, where, road=road, planner=planner, **ours)
+
+
 CHECKS = {
     **{"idm.npz": _idm, "tracker_sim.npz": _tracker, "comfort.npz": _comfort},
     **{"emergency_brake.npz": _emergency_brake, "path.npz": _path},
     "graph_search.json": _graph_search,
 }
+verify_routes = partial(verify_cases, _compare_route)
+verify_idm_calls = partial(verify_cases, _compare_idm)
