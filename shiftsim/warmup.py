@@ -37,13 +37,13 @@ WORLD = PACKAGE / "verify" / "reference" / "metric_worlds" / "metric_world_21.js
 
 @contextmanager
 def warm_up(*groups: Sequence[str]) -> Iterator[None]:
-    """Compile groups of shares (each by itself, if none is named) beside the block; then wait.
+    """Compile groups of shares, a process for each, beside the block, and wait for the rest.
 
     A share that fails is left to whoever runs into its cause.
     """
     command = "import sys; from shiftsim.warmup import SHARES\nfor s in sys.argv[1:]: SHARES[s]()"
     start = partial(subprocess.Popen, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
-    starts = [fresh_python(command, *shares) for shares in groups or [[name] for name in SHARES]]
+    starts = [fresh_python(command, *shares) for shares in groups]
     processes = [start(words, env=environment) for words, environment in starts]
     try:
         yield
@@ -63,9 +63,8 @@ def beside_run(traffic: str) -> AbstractContextManager[None]:
     folder = kept.fingerprint(PACKAGE / "metrics" / "time_to_collision.py")
     if any((place / folder).is_dir() for place in kernel_folders()):
         return nullcontext()
-    # the first task comes to the routes first; agents are placed by then
-    reactive = ["agents"] if traffic == "reactive" else []
-    return warm_up(["contacts", *reactive, "routes"])
+    # the first task does the routes itself, except after the agents, which take longest
+    return warm_up(["contacts", "agents", "routes"] if traffic == "reactive" else ["contacts"])
 
 
 def _routes() -> None:
