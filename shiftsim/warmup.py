@@ -1,16 +1,16 @@
 """Compile kernels before they are needed.
 
 On a fresh install every kernel is compiled once. `warm_up` does so beside other work, a process
-per share of them, on a small scene that is part of the package; `fill` makes runs of all planners,
-in two processes, and leaves nothing to compile for a run. Who needs kernels later finds them on
-disk.
+per group of shares, on a small scene that is part of the package; `beside_run` does it for a run
+that has a core to spare; `fill` makes runs of all planners, in two processes, and leaves nothing to
+compile for a run. Who needs kernels later finds them on disk.
 """
 
 import json
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -23,7 +23,7 @@ import numpy as np
 
 from shiftsim.arrays import kept
 from shiftsim.errors import ShiftsimError
-from shiftsim.files import PACKAGE, fresh_python
+from shiftsim.files import PACKAGE, fresh_python, kernel_folders
 from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import default_workers
 from shiftsim.sim.log import SimulationLog
@@ -36,14 +36,14 @@ WORLD = PACKAGE / "verify" / "reference" / "metric_worlds" / "metric_world_21.js
 
 
 @contextmanager
-def warm_up(*shares: str) -> Iterator[None]:
-    """Compile shares (all, if none is named) beside the block, and wait for the rest after it.
+def warm_up(*groups: Sequence[str]) -> Iterator[None]:
+    """Compile groups of shares, a process for each, beside the block, and wait for the rest.
 
     A share that fails is left to whoever runs into its cause.
     """
-    command = "import sys; from shiftsim.warmup import SHARES; SHARES[sys.argv[1]]()"
+    command = "import sys; from shiftsim.warmup import SHARES\nfor s in sys.argv[1:]: SHARES[s]()"
     start = partial(subprocess.Popen, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
-    starts = [fresh_python(command, share) for share in shares or SHARES]
+    starts = [fresh_python(command, *shares) for shares in groups]
     processes = [start(words, env=environment) for words, environment in starts]
     try:
         yield
@@ -53,6 +53,18 @@ def warm_up(*shares: str) -> Iterator[None]:
         for process in processes:
             process.kill()
             process.wait()
+
+
+def beside_run(traffic: str) -> AbstractContextManager[None]:
+    """Compile what a run needs last while its first task compiles what it needs first.
+
+    Nothing happens where that is kept already.
+    """
+    folder = kept.fingerprint(PACKAGE / "metrics" / "time_to_collision.py")
+    if any((place / folder).is_dir() for place in kernel_folders()):
+        return nullcontext()
+    # the first task does the routes itself, except after the agents, which take longest
+    return warm_up(["contacts", "agents", "routes"] if traffic == "reactive" else ["contacts"])
 
 
 def _routes() -> None:
@@ -96,7 +108,17 @@ def _planners() -> None:
         simulate(scene(), load_planner(planner))
 
 
-SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners}
+def _agents() -> None:
+    """Reactive traffic."""
+    from shiftsim.sim.traffic.idm.model import IdmTraffic
+
+    scenario, traffic = scene(), IdmTraffic()
+    tracks = scenario.tracks.rows(scenario.iteration_rows)
+    traffic.start(scenario, tracks, 0)
+    traffic.step(0, scenario.ego[0], tracks, 1)
+
+
+SHARES = {"routes": _routes, "contacts": _contacts, "planners": _planners, "agents": _agents}
 
 
 def _rollout() -> tuple[SimulationLog, VectorMap]:

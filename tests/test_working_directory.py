@@ -85,7 +85,7 @@ def test_workers_of_a_script_elsewhere_execute_nothing_that_lies_about(folder, t
 
 def test_compiling_kernels_executes_nothing_that_lies_about(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    with warm_up(next(iter(SHARES))):
+    with warm_up([next(iter(SHARES))]):
         pass
 
 

@@ -10,6 +10,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from time import perf_counter
 
 import pytest
 
@@ -77,6 +78,27 @@ def test_first_run_after_an_install(planner, traffic, note, size, tmp_path):
         print(f"  {seconds:6.3f} s  {name}")
     note(total=total, compiling=compiled)
     assert len(own) > 50
+
+
+@pytest.mark.parametrize(
+    ("planner", "traffic", "target"),
+    [("constant-velocity", "nonreactive", 12.0), ("pdm-closed", "reactive", 32.0)],
+)
+def test_first_run_with_two_workers(planner, traffic, target, note, size, tmp_path):
+    """The same by the clock, and what takes longest compiled side by side."""
+    if planner == "pdm-closed" and size(1, 0) == 0:
+        pytest.skip("half a minute more, and shows nothing new")
+    store = demo_store(tmp_path / "demo")
+    words = ["run", "-p", planner, "--traffic", traffic, "--store", str(store), "--quiet"]
+    words += ["--limit", "16", "--workers", "2", "--out", str(tmp_path / "run")]
+    empty = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    began = perf_counter()
+    cpu = cpu_seconds([sys.executable, "-m", "shiftsim", *words], empty)
+    seconds = perf_counter() - began
+    met = "met" if seconds <= target else "NOT MET"
+    print(f"\n{planner}, {traffic}: {seconds:.1f} s, target {target:.0f} {met}; {cpu:.1f} CPU-s")
+    note(seconds=seconds, cpu=cpu)
+    assert any((tmp_path / "kernels").iterdir())
 
 
 def cpu_seconds(command: list[str], environment: dict[str, str]) -> float:

@@ -47,7 +47,7 @@ def demo(
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
         say(f"generating and converting recordings, compiling kernels → {folder}")
-        with warm_up():
+        with warm_up(["routes"], ["contacts"], ["planners"]):
             demo_store(folder)
     values: dict[str, Any] = {
         "planners": list(_PLANNERS),

@@ -124,7 +124,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     began = perf_counter()
     reports = []
     # the metrics take longest to compile; their processes have the time of everything before them
-    with warm_up("routes", "contacts"):
+    with warm_up(["routes"], ["contacts"]):
         advance(0, 3, "torch")
         torch = _torch()
         advance(1, 3, "dynamics")

@@ -4,7 +4,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -77,7 +77,14 @@ def run_config(
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
     again = [*words, "--resume"]
     kept = interruptible(prepared.folder, again, quiet=quiet or as_json)
-    with output_kept(), kept as show, watched([prepared], prepared.folder, live, show) as tell:
+    with ExitStack() as around:
+        around.enter_context(output_kept())
+        show = around.enter_context(kept)
+        tell = around.enter_context(watched([prepared], prepared.folder, live, show))
+        if prepared.workers > 1:  # a core is idle during the first task
+            from shiftsim.warmup import beside_run
+
+            around.enter_context(beside_run(prepared.config.traffic))
         finished = execute(prepared, on_progress=tell, argv=sys.argv)
     leave_with(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
 
