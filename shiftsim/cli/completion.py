@@ -96,7 +96,7 @@ def _plain_value(option: Any, convert: Callable[[Any, Any], Any], context: Any, 
     Newer versions of typer have pydantic look at every value, even where none was given, and to
     import pydantic is a tenth of a short command.
     """
-    about = getattr(option, "type_descriptor", None)
+    about = getattr(option, "type_descriptor", None)  # of older versions of typer none
     if about is None or about.is_ranged:
         return convert(context, value)
     if value is None and not option.required:

@@ -339,7 +339,7 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
 def _of_tokens(table: pa.Table, name: str, tokens: Sequence[str]) -> tuple[str, ...]:
     """A column that is the same for all rollouts of a scenario; empty where nothing is known."""
     rows = zip(table["token"].to_pylist(), table[name].to_pylist(), strict=True)
-    known = dict(sorted({(token, value or "") for token, value in rows}))  # the last one counts
+    known = {token: value for token, value in rows if value}
     return tuple(known.get(token, "") for token in tokens)
 
 
