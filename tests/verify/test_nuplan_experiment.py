@@ -246,6 +246,16 @@ def test_a_row_that_is_gone_is_named(folder, nuplan_reference):
     ]
 
 
+def test_text_in_a_column_of_numbers_is_named(folder, nuplan_reference):
+    keep(folder, LOGGED)
+    path = next(folder.rglob("aggregator_metric/*"))
+    table = pq.read_table(path)
+    index, texts = table.column_names.index("score"), pa.array(["many"] * len(table))
+    pq.write_table(table.set_column(index, "score", texts), path)
+    with pytest.raises(DataError, match=r"\.parquet: column 'score': .*'many'"):
+        compare(folder, nuplan_reference)
+
+
 def test_runs_that_cannot_be_compared_are_named(folder, nuplan_reference):
     keep(folder, WITHOUT, LOGGED)
     for path in folder.rglob("*.parquet"):

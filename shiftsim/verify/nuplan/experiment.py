@@ -198,9 +198,18 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
             if name not in table:
                 raise DataError(f"{file}: column {name!r} is missing", OTHER_VERSION)
         if has_means:
+            _require_numbers(table, file)
             table = _compare_means(table)
         found[file.stem] = Groups(table, (token, "planner_name"))
     return found
+
+
+def _require_numbers(table: Source, file: Path) -> None:
+    for column in ("num_scenarios", *(name for name in table if name not in _NO_METRICS)):
+        try:
+            table[column].astype(np.float64)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"{file}: column {column!r}: {error}", OTHER_VERSION) from None
 
 
 def _compare_means(table: Source) -> Source:
