@@ -52,16 +52,21 @@ print(json.dumps([process_time(), own]))
 """
 
 
+def first_run(planner, traffic, workers, size, folder):
+    """Words and environment of a command whose kernels are all to be compiled."""
+    if planner == "pdm-closed" and size(1, 0) == 0:
+        pytest.skip("a smoke run has shown it with the other planner, in half a minute less")
+    words = ["run", "-p", planner, "--traffic", traffic, "--quiet", "--limit", "16"]
+    words += ["--store", str(demo_store(folder / "demo")), "--out", str(folder / "run")]
+    words += ["--workers", str(workers)]
+    return words, os.environ | {"NUMBA_CACHE_DIR": str(folder / "kernels")}
+
+
 @pytest.mark.parametrize(
     ("planner", "traffic"), [("constant-velocity", "nonreactive"), ("pdm-closed", "reactive")]
 )
 def test_first_run_after_an_install(planner, traffic, note, size, tmp_path):
-    if planner == "pdm-closed" and size(1, 0) == 0:
-        pytest.skip("half a minute more, and shows nothing new")
-    store = demo_store(tmp_path / "demo")
-    words = ["run", "-p", planner, "--traffic", traffic, "--store", str(store), "--quiet"]
-    words += ["--limit", "16", "--workers", "1", "--out", str(tmp_path / "run")]
-    empty = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    words, empty = first_run(planner, traffic, 1, size, tmp_path)
     done = subprocess.run(
         [sys.executable, "-c", CHILD, *words], env=empty, capture_output=True, text=True
     )
@@ -86,12 +91,7 @@ def test_first_run_after_an_install(planner, traffic, note, size, tmp_path):
 )
 def test_first_run_with_two_workers(planner, traffic, target, note, size, tmp_path):
     """The same by the clock, and what takes longest compiled side by side."""
-    if planner == "pdm-closed" and size(1, 0) == 0:
-        pytest.skip("half a minute more, and shows nothing new")
-    store = demo_store(tmp_path / "demo")
-    words = ["run", "-p", planner, "--traffic", traffic, "--store", str(store), "--quiet"]
-    words += ["--limit", "16", "--workers", "2", "--out", str(tmp_path / "run")]
-    empty = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    words, empty = first_run(planner, traffic, 2, size, tmp_path)
     began = perf_counter()
     cpu = cpu_seconds([sys.executable, "-m", "shiftsim", *words], empty)
     seconds = perf_counter() - began
