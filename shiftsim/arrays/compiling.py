@@ -26,13 +26,14 @@ _OPTIONS: dict[str, Any] = {
     **{"nopython": True, "boundscheck": None},
     **{"error_model": "numpy", "no_cfunc_wrapper": True},
 }
-# passes of numba for what no kernel holds: each looks at the whole function, most of them at every
-# variable of every statement
+# passes of numba for what no kernel holds, or, joined arithmetic on whole arrays, none where time
+# matters: each looks at the whole function, most of them at every variable of every statement
 _UNUSED = {
     *("with_lifting", "inline_closure_likes", "make_function_op_code_to_jit_function"),
     *("inline_inlinables", "rewrite_dynamic_raises", "rewrite_semantic_constants"),
     *("find_literally", "literal_unroll", "literal_propagation", "dead_branch_prune"),
     *("nopython_supported_feature_validation", "annotate_types", "dump_parfor_diagnostics"),
+    *("nopython_rewrites",),
 }
 
 
@@ -132,7 +133,7 @@ class _NoCollection(event.Listener):
     """
 
     def __init__(self) -> None:
-        self._depth, self._was_on, self._limit = 0, False, _LOOKED_AT
+        self._depth, self._was_on, self._unseen = 0, False, 0
 
     def on_start(self, event: Any) -> None:
         """A kernel begins to be compiled, maybe within another one."""
@@ -145,12 +146,12 @@ class _NoCollection(event.Listener):
         """It is done."""
         self._depth -= 1
         if self._depth == 0 and self._was_on:
-            gc.freeze()  # what there is will not be looked at
-            if gc.get_freeze_count() > self._limit:
+            self._unseen += gc.get_count()[0]  # objects made, less those that are gone
+            if self._unseen > _LOOKED_AT:
                 gc.unfreeze()
                 gc.collect()
-                gc.freeze()
-                self._limit = gc.get_freeze_count() + _LOOKED_AT
+                self._unseen = 0
+            gc.freeze()  # what there is will not be looked at
             gc.enable()
 
 

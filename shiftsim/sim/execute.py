@@ -47,7 +47,9 @@ def execute(
     code, _, _ = check_values(plan_us, states, now_us - offset_us, next_us - offset_us)
     if code != GOOD:
         return code, TRACKED
-    time_us = plan_us + np.int64(offset_us)
+    time_us = np.empty(len(plan_us), np.int64)
+    for sample in range(len(plan_us)):
+        time_us[sample] = plan_us[sample] + offset_us
     sample_poses(time_us, states, now_us, KEPT_US, kept[iteration])
     if not moves:
         return GOOD, TRACKED
