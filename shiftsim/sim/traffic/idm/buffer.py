@@ -8,7 +8,7 @@ belongs to the buffer where the curve winds around it.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.rings import orientation, point_segment_distance
 
 QUADRANT_SEGMENTS = 16  # per right angle of a round join; what shapely's method defaults to
@@ -61,7 +61,9 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
         middle = _walk(keep, size, index, 1)
         last = _walk(keep, size, middle, 1)
         while last < size:
-            if _is_shallow(line, index, middle, last, tolerance, concave):
+            if _side(line, index, middle, last) == concave and _is_shallow(
+                line, index, middle, last, tolerance
+            ):
                 keep[middle] = False
                 changed = True
                 index = last
@@ -71,15 +73,19 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
             last = _walk(keep, size, middle, 1)
 
 
+@part_kernel
+def _side(line: FloatArray, before: int, at: int, after: int) -> int:
+    """Side to which a line turns at a vertex between two others: 1 left, -1 right, 0 none."""
+    ax, ay = line[before, 0], line[before, 1]
+    bx, by = line[at, 0], line[at, 1]
+    return orientation(ax, ay, bx, by, line[after, 0], line[after, 1])
+
+
 @lean_kernel
-def _is_shallow(
-    line: FloatArray, i0: int, i1: int, i2: int, tolerance: float, concave: int
-) -> bool:
+def _is_shallow(line: FloatArray, i0: int, i1: int, i2: int, tolerance: float) -> bool:
     ax, ay = line[i0, 0], line[i0, 1]
     bx, by = line[i1, 0], line[i1, 1]
     cx, cy = line[i2, 0], line[i2, 1]
-    if orientation(ax, ay, bx, by, cx, cy) != concave:
-        return False
     if point_segment_distance(bx, by, ax, ay, cx, cy) >= tolerance:
         return False
     step = max((i2 - i0) // _SAMPLED, 1)

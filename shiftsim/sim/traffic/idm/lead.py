@@ -114,15 +114,15 @@ def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: 
     low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
     found = 0
     for other in range(len(bounds)):
-        if (
+        # one branch: which of the five fails cannot be foreseen
+        is_near = (
             footprints.present[other]
-            and other != agent
-            and bounds[other, 0] <= high_x
-            and bounds[other, 1] <= high_y
-            and bounds[other, 2] >= low_x
-            and bounds[other, 3] >= low_y
-            and last_near_run(runs, begin, margin, bounds[other]) >= 0
-        ):
+            & (bounds[other, 0] <= high_x)
+            & (bounds[other, 1] <= high_y)
+            & (bounds[other, 2] >= low_x)
+            & (bounds[other, 3] >= low_y)
+        )
+        if is_near and other != agent and last_near_run(runs, begin, margin, bounds[other]) >= 0:
             apart_x = max(bounds[agent, 0] - bounds[other, 2], bounds[other, 0] - bounds[agent, 2])
             apart_y = max(bounds[agent, 1] - bounds[other, 3], bounds[other, 1] - bounds[agent, 3])
             scratch.near[found] = other
