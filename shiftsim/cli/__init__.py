@@ -26,7 +26,7 @@ from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import typer
 
-from shiftsim.cli import completion
+from shiftsim.cli import values
 from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.runs.config import RunConfig, parse_argument
 
@@ -228,7 +228,7 @@ def _option(name: str, text: str | None) -> inspect.Parameter:
     elif option.parse:
         kind = str
     flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
-    offered = completion.BY_SETTING.get(name) or completion.among(*option.choices)
+    offered = values.BY_SETTING.get(name) or values.among(*option.choices)
     words = typer.Option(*flags, help=text or option.help, autocompletion=offered)
     return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[kind | None, words])
 
@@ -315,7 +315,7 @@ def _command(name: str) -> Any:
         alone.command()(found)
         command = typer.main.get_command(alone)
     command.name = name
-    return completion.with_plain_values(command)
+    return values.with_plain_values(command)
 
 
 app = new_app(
@@ -371,7 +371,7 @@ def _raised_nowhere(found: Any) -> None:
 
 def _run(words: list[str], debug: bool) -> int:
     try:
-        command = completion.with_plain_values(typer.main.get_command(app))
+        command = values.with_plain_values(typer.main.get_command(app))
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED

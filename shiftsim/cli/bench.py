@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, completion, output_kept, plural, say, say_json
+from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, say, say_json, values
 from shiftsim.cli.running import DryRun, Live, announce_data, interruptible, say_dry_run, watched
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def bench(
         str,
         typer.Argument(
             help="semantic-shift, state-drift or edits.",
-            autocompletion=completion.among(*_MAIN_TABLE),
+            autocompletion=values.among(*_MAIN_TABLE),
         ),
     ],
     settings: cli.Settings,

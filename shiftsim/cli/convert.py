@@ -12,12 +12,12 @@ from shiftsim.cli import (
     Debug,
     Json,
     Quiet,
-    completion,
     new_app,
     plural,
     progress_bar,
     say,
     say_json,
+    values,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _DATA, PARTIAL = 2, 3
 Store = Annotated[
     str,
     typer.Option(
-        "--store", "-s", help="Name or folder of the store.", autocompletion=completion.stores
+        "--store", "-s", help="Name or folder of the store.", autocompletion=values.stores
     ),
 ]
 _Window = Annotated[

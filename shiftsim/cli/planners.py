@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, completion, new_app, output_kept, plural, say, say_json, show
+from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show, values
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -61,7 +61,7 @@ def check_one_planner(
         str,
         typer.Argument(
             help="Name, ./file.py:Class or package.module:Class.",
-            autocompletion=completion.planners,
+            autocompletion=values.planners,
         ),
     ],
     planner_arg: Annotated[
@@ -69,7 +69,7 @@ def check_one_planner(
     ] = None,
     store: Annotated[
         str,
-        typer.Option(help="Store with scenarios to try it on.", autocompletion=completion.stores),
+        typer.Option(help="Store with scenarios to try it on.", autocompletion=values.stores),
     ] = "demo",
     token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
     as_json: Json = False,

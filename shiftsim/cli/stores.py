@@ -10,12 +10,12 @@ from shiftsim.cli import (
     Debug,
     Json,
     Quiet,
-    completion,
     new_app,
     plural,
     progress_bar,
     say,
     say_json,
+    values,
 )
 
 if TYPE_CHECKING:
@@ -31,9 +31,7 @@ export = new_app("Write scenarios in the formats of others.", no_args_is_help=Tr
 
 Store = Annotated[
     str,
-    typer.Argument(
-        metavar="STORE", help="Store, by name or folder.", autocompletion=completion.stores
-    ),
+    typer.Argument(metavar="STORE", help="Store, by name or folder.", autocompletion=values.stores),
 ]
 
 

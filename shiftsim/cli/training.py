@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Debug, Json, Quiet, completion, new_app, say, show
+from shiftsim.cli import Debug, Json, Quiet, new_app, say, show, values
 
 app = new_app("Train networks.")
 
@@ -16,13 +16,13 @@ app = new_app("Train networks.")
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
     store: Annotated[
-        str, typer.Option(help="Store by name, path or URL.", autocompletion=completion.stores)
+        str, typer.Option(help="Store by name, path or URL.", autocompletion=values.stores)
     ] = "demo",
     split: Annotated[
         str,
         typer.Option(
             help="Split of the store; all its scenarios if empty.",
-            autocompletion=completion.splits,
+            autocompletion=values.splits,
         ),
     ] = "",
     checkpoint: Annotated[

@@ -10,7 +10,7 @@ import pytest
 import typer
 from stores import write_toy_store
 
-from shiftsim.cli.completion import NOISES, with_plain_values
+from shiftsim.cli.values import NOISES, with_plain_values
 from shiftsim.sim.noise import NOISE_NAMES
 
 WATCHED = """
