@@ -140,17 +140,21 @@ def visible_columns(
     valid: BoolArray, kinds: IntArray, tokens: Sequence[str], without: str
 ) -> IntArray:
     """(N',) columns of the tracks of `valid` (R, N) that `visible_tracks` gives, in its order."""
-    seen: BoolArray = np.any(valid, axis=0)
+    first = valid.argmax(axis=0)
+    seen = valid[first, np.arange(len(first))]
     if without in tokens:
         seen[tokens.index(without)] = False
+    if seen.all():
+        return order_of_columns(valid, kinds, first)
     index = np.flatnonzero(seen)
-    shown = valid if seen.all() else valid[:, index]
-    order: IntArray = index[order_of_columns(np.ascontiguousarray(shown), kinds[index])]
+    order: IntArray = index[order_of_columns(valid[:, index], kinds[index], first[index])]
     return order
 
 
 def listed_lights(lights: TrafficLights) -> TrafficLights:
     """The connectors listed in the rows given, ordered by first appearance."""
+    if not lights.status.size:
+        return TrafficLights.empty(len(lights.status))
     listed = lights.status >= 0
     seen = np.flatnonzero(listed.any(axis=0))
     kept = seen[np.argsort(listed.argmax(axis=0)[seen], kind="stable")]
@@ -158,20 +162,24 @@ def listed_lights(lights: TrafficLights) -> TrafficLights:
     return TrafficLights(names, np.ascontiguousarray(lights.status[:, kept]))
 
 
-def order_of_columns(valid: BoolArray, kinds: IntArray) -> IntArray:
+def order_of_columns(valid: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
     """Order of dense tracks (R, N), such that every frame lists its tracks as nuPlan does.
 
     nuPlan rule 410: by type, and within a type as the log lists them. The order depends only on the
     rows given, so that a window of a longer recording is ordered as if it had been read alone.
+    `first` (N,) is the first row of each, all of which occur.
     """
+    order = np.lexsort((first, kinds))
+    if (order == kinds.argsort(kind="stable")).all():
+        return order  # the oldest of a kind come first: as they are listed, whoever is there
     before = np.zeros((len(kinds), len(kinds)), np.bool_)
-    first = np.full(len(kinds), len(valid), np.int64)
-    _link_columns(valid, kinds, before, first)
-    return sort_tracks(before, kinds, first)
+    _link_columns(np.ascontiguousarray(valid), kinds, before)
+    found: IntArray = sort_tracks(before, kinds, first)
+    return found
 
 
 @kernel
-def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: IntArray) -> None:
+def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray) -> None:
     last = np.full(16, -1)
     for frame in range(valid.shape[0]):
         if frame > 0 and _is_same(valid, frame):
@@ -185,7 +193,6 @@ def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray, first: I
             if last[kind] >= 0:
                 before[last[kind], track] = True
             last[kind] = track
-            first[track] = min(first[track], frame)
 
 
 @lean_kernel

@@ -22,6 +22,7 @@ from track_files import export_town, write_tracks
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.tracks.convert import convert_tracks, look_at
@@ -169,6 +170,12 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "realism": lambda: measure_realism(scenario),
         "metrics": lambda: compute_metrics(
             simulate(scenario, load("constant-velocity")), scenario.map
+        ),
+        "order of tracks": lambda: visible_columns(
+            np.eye(3, dtype=bool)[::-1] | [False, True, True],
+            np.zeros(3, int),
+            ["a", "b", "c"],
+            without="",
         ),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.data.store.plausible import BOX_LIMITS
 
 BitArray: TypeAlias = NDArray[np.uint64]
@@ -39,13 +39,6 @@ def second_differences(values: FloatArray) -> BitArray:
     return ((bend << 1) ^ (bend >> 63)).view(np.uint64)
 
 
-def restored(codes: BitArray) -> FloatArray:
-    """(n,) numbers of which `second_differences` made these codes (n,)."""
-    one = np.uint64(1)
-    differences = (codes >> one) ^ -(codes & one)
-    return np.cumsum(np.cumsum(differences)).view(np.float64)
-
-
 @lean_kernel
 def difference_of(code: np.uint64) -> np.uint64:
     """The second difference, modulo 2^64, that a code stands for."""
@@ -53,33 +46,86 @@ def difference_of(code: np.uint64) -> np.uint64:
     return (code >> one) ^ (np.uint64(0) - (code & one))
 
 
-@kernel
-def note_tracks(row: IntArray, track: IntArray, first: int, last: int, place: IntArray) -> None:
-    """Set `place` (N,) to 0 for tracks, all of the N, that occur in the rows first … last - 1."""
+def restored(codes: BitArray) -> FloatArray:
+    """(n,) numbers of which `second_differences` made these codes (n,)."""
+    out = np.empty(len(codes))
+    restore(codes, out.view(np.uint64))
+    return out
+
+
+@lean_kernel
+def restore(codes: BitArray, out: BitArray) -> None:
+    """Write the bits (n,) of which these are the codes (n,)."""
+    step = bits = np.uint64(0)
+    for at in range(np.uint64(len(codes))):
+        step += difference_of(codes[at])
+        bits += step
+        out[at] = bits
+
+
+@lean_kernel
+def cut_spans(
+    row: IntArray, track: IntArray, first: int, last: int, place: IntArray, spans: IntArray
+) -> int:
+    """Number S of spans: boxes of one track in rows one after the other; -1 if a track is none.
+
+    `spans` (A + 1, 3), of which S + 1 are written, are the box that each begins at, its row counted
+    from `first`, and its track. `place` (N,) becomes 1 for tracks, all of the N, that occur in the
+    rows first … last - 1.
+    """
+    count, of, gap = 0, -1, 0
     for box in range(np.uint64(len(row))):
-        if first <= row[box] < last:
-            place[np.uint64(track[box])] = 0
+        if track[box] != of or row[box] - np.int64(box) != gap:
+            of, gap = track[box], row[box] - np.int64(box)
+            if not 0 <= of < len(place):
+                return -1
+            at = np.uint64(count)
+            spans[at, 0], spans[at, 1], spans[at, 2] = box, row[box] - first, of
+            count += 1
+    spans[np.uint64(count), 0] = len(row)
+    for span in range(np.uint64(count)):
+        start, end = spans[span, 1], span_end(spans, span)
+        if start < last - first and end > 0:
+            place[np.uint64(spans[span, 2])] = 1
+    return count
 
 
-@kernel
-def mark(row: IntArray, track: IntArray, place: IntArray, first: int, valid: BoolArray) -> None:
-    """Note in `valid` (R, N), which is false, where there are boxes."""
-    num_rows = np.uint64(len(valid))
-    for box in range(np.uint64(len(row))):
-        at = np.uint64(row[box] - first)  # one before the first is a large one, too
-        if at < num_rows:
-            valid[at, np.uint64(place[np.uint64(track[box])])] = True
+@lean_kernel
+def span_end(spans: IntArray, span: np.uint64) -> int:
+    """One past the last row of a span."""
+    return spans[span, 1] + spans[span + np.uint64(1), 0] - spans[span, 0]
 
 
-@kernel
+@lean_kernel
+def mark(spans: IntArray, place: IntArray, there: BoolArray) -> None:
+    """Note in `there` (N, R) where there are boxes of tracks, by their place, from 1 on."""
+    for span in range(np.uint64(len(spans) - 1)):
+        to = place[np.uint64(spans[span, 2])] - 1
+        if to >= 0:
+            end = min(span_end(spans, span), there.shape[1])
+            for row in range(max(spans[span, 1], 0), end):
+                there[np.uint64(to), np.uint64(row)] = True
+
+
+@lean_kernel
+def first_place(
+    spans: IntArray, span: np.uint64, place: IntArray, num: np.uint64, end: np.uint64
+) -> np.uint64:
+    """Which box of the dense arrays a span begins at; `end` or more if that is none of them.
+
+    Boxes before the first row are there as well: less than 0 is a large one, until it is not.
+    """
+    to = place[np.uint64(spans[span, 2])]
+    return np.uint64(spans[span, 1]) * num + np.uint64(to - 1) if to > 0 else end
+
+
+@lean_kernel
 def scatter(
-    row: IntArray,
-    track: IntArray,
     motion: tuple[BitArray, ...],
     extent: tuple[FloatArray, FloatArray],
     is_plain: bool,
+    spans: IntArray,
     place: IntArray,
-    first: int,
     shape: tuple[int, int],
     highest: tuple[int, ...],
     limits: tuple[float, ...],
@@ -87,10 +133,10 @@ def scatter(
     velocities: BitArray,
     sizes: FloatArray,
 ) -> bool:
-    """Spread the boxes of a row group over dense arrays, those of tracks that have a place.
+    """Spread the boxes of a row group over dense arrays, those of tracks that have a place, from 1.
 
     The arrays, for R rows and N tracks as `shape` says, are flat: poses (3 R N,) and velocities
-    (2 R N,), both as their bits, and sizes (2 R N,).
+    (2 R N,), both as their bits, and sizes (2 R N,). `spans` (S + 1, 3) are those of `cut_spans`.
 
     Returns whether all of the row group are within the ranges of a store. The bits of a float
     without its sign are in the order of its size, and up to `highest` (6,), the last that of
@@ -103,46 +149,53 @@ def scatter(
     least_length, most_length, least_width, most_width = limits
     zero, one, two, three = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
     size = ~(one << np.uint64(63))
-    num_rows, num = np.uint64(shape[0]), np.uint64(shape[1])
-    good = True
+    num = np.uint64(shape[1])
+    end = np.uint64(shape[0]) * num
+    good, over = True, zero  # the top bit of `over`: a number was beyond its limit
     x_step = y_step = heading_step = x_bits = y_bits = heading_bits = zero
-    for box in range(np.uint64(len(row))):
-        if is_plain:
-            x_bits, y_bits, heading_bits = x[box], y[box], heading[box]
-        else:
-            x_step += difference_of(x[box])
-            y_step += difference_of(y[box])
-            heading_step += difference_of(heading[box])
-            x_bits += x_step
-            y_bits += y_step
-            heading_bits += heading_step
-        good &= (x_bits & size <= x_top) & (y_bits & size <= y_top)
-        good &= heading_bits & size <= heading_top
-        at, to = np.uint64(row[box] - first), place[np.uint64(track[box])]
-        if to >= 0 and at < num_rows:  # a row before the first is a large one, too
-            at = three * (at * num + np.uint64(to))
-            poses[at] = x_bits
-            poses[at + one] = y_bits
-            poses[at + two] = heading_bits
+    for span in range(np.uint64(len(spans) - 1)):
+        at = first_place(spans, span, place, num, end)
+        for box in range(np.uint64(spans[span, 0]), np.uint64(spans[span + one, 0])):
+            if is_plain:
+                x_bits, y_bits, heading_bits = x[box], y[box], heading[box]
+            else:
+                x_step += difference_of(x[box])
+                y_step += difference_of(y[box])
+                heading_step += difference_of(heading[box])
+                x_bits += x_step
+                y_bits += y_step
+                heading_bits += heading_step
+            over |= (x_top - (x_bits & size)) | (y_top - (y_bits & size))
+            over |= heading_top - (heading_bits & size)
+            if at < end:
+                poses[three * at] = x_bits
+                poses[three * at + one] = y_bits
+                poses[three * at + two] = heading_bits
+            at += num
+    # velocities of static objects are NaN: more than infinity
+    vx_least = vy_least = ~zero
     vx_step = vy_step = vx_bits = vy_bits = zero
-    for box in range(np.uint64(len(row))):
-        if is_plain:
-            vx_bits, vy_bits = vx[box], vy[box]
-        else:
-            vx_step += difference_of(vx[box])
-            vy_step += difference_of(vy[box])
-            vx_bits += vx_step
-            vy_bits += vy_step
-        # velocities of static objects are NaN: more than infinity
-        good &= (vx_bits & size <= vx_top) | (vx_bits & size > infinity)
-        good &= (vy_bits & size <= vy_top) | (vy_bits & size > infinity)
-        good &= (length[box] >= least_length) & (length[box] <= most_length)
-        good &= (width[box] >= least_width) & (width[box] <= most_width)
-        at, to = np.uint64(row[box] - first), place[np.uint64(track[box])]
-        if to >= 0 and at < num_rows:
-            at = two * (at * num + np.uint64(to))
-            velocities[at] = vx_bits
-            velocities[at + one] = vy_bits
-            sizes[at] = length[box]
-            sizes[at + one] = width[box]
-    return good
+    for span in range(np.uint64(len(spans) - 1)):
+        at = first_place(spans, span, place, num, end)
+        for box in range(np.uint64(spans[span, 0]), np.uint64(spans[span + one, 0])):
+            if is_plain:
+                vx_bits, vy_bits = vx[box], vy[box]
+            else:
+                vx_step += difference_of(vx[box])
+                vy_step += difference_of(vy[box])
+                vx_bits += vx_step
+                vy_bits += vy_step
+            # those up to the highest become more than any other
+            vx_least = min(vx_least, (vx_bits & size) - vx_top - one)
+            vy_least = min(vy_least, (vy_bits & size) - vy_top - one)
+            long, wide = length[box], width[box]
+            good &= (long >= least_length) & (long <= most_length)
+            good &= (wide >= least_width) & (wide <= most_width)
+            if at < end:
+                velocities[two * at] = vx_bits
+                velocities[two * at + one] = vy_bits
+                sizes[two * at] = long
+                sizes[two * at + one] = wide
+            at += num
+    fits = vx_least >= infinity - vx_top and vy_least >= infinity - vy_top
+    return bool(good and fits and over <= size)

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, read_only
+from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, read_only
 from shiftsim.data.recording import Window
 from shiftsim.data.store.schema import EGO_COLUMNS, MOTION, SCENARIOS
 from shiftsim.data.store.tables import FRAMES, REPAIR, ego_file
@@ -31,7 +31,7 @@ def require_rows(window: Window, where: str) -> None:
     """Refuse a window whose iterations are not increasing rows of it."""
     rows = window.iteration_rows
     inside = len(rows) and window.first_row <= rows[0] and rows[-1] < window.last_row
-    if not inside or (np.diff(rows) <= 0).any():
+    if not inside or (rows[1:] <= rows[:-1]).any():
         what = f"{where}: scenario {window.token!r}: iteration_rows do not increase within its rows"
         raise DataError(what, REPAIR)
 
@@ -67,15 +67,38 @@ def require_plausible(scene: Scenario, ego: str, folder: Path, *, boxes: bool = 
 
 def _is_plausible(scene: Scenario) -> bool:
     """Whether times, lights and ego states are sound; quick, and does not say what is not."""
-    times, steps, lights = scene.time_us, scene.iteration_times, scene.traffic_lights.status
-    (first, last), (lowest, highest), (low, high) = _TIMES, _LIGHTS, _EGO_LIMITS.T
-    return bool(
-        (first <= times[0] and times[-1] <= last)
-        and (times[1:] >= times[:-1]).all()
-        and (steps[1:] > steps[:-1]).all()
-        and (not lights.size or (lowest <= lights.min() and lights.max() <= highest))
-        and ((scene.ego >= low) & (scene.ego <= high)).all()
-    )
+    lights, (low, high) = scene.traffic_lights.status, _LIGHTS
+    if lights.size and not low <= lights.min() <= lights.max() <= high:
+        return False
+    if scene.ego.shape[1:] != _EGO_LIMITS.shape[:1]:
+        return False
+    arrays = scene.time_us, scene.iteration_times, scene.ego
+    plain = [read_only(np.ascontiguousarray(array)) for array in arrays]
+    return bool(_increase_within(*plain, _TIMES, _EGO_LIMITS))
+
+
+@lean_kernel
+def _increase_within(
+    time_us: IntArray,
+    steps: IntArray,
+    ego: FloatArray,
+    times: tuple[float, float],
+    limits: FloatArray,
+) -> bool:
+    """Whether times do not decrease, steps increase, and times and ego are within the limits."""
+    if len(time_us) == 0:
+        return False
+    good = time_us[0] >= times[0] and time_us[-1] <= times[1]
+    one = np.uint64(1)
+    for row in range(one, np.uint64(len(time_us))):
+        good &= time_us[row] >= time_us[row - one]
+    for at in range(one, np.uint64(len(steps))):
+        good &= steps[at] > steps[at - one]
+    for row in range(np.uint64(ego.shape[0])):
+        for column in range(np.uint64(ego.shape[1])):
+            value = ego[row, column]
+            good &= (value >= limits[column, 0]) & (value <= limits[column, 1])
+    return good
 
 
 def require_states(states: FloatArray, file: Path) -> None:

@@ -53,15 +53,19 @@ class ScenarioStore:
         self.hash = str(manifest["hash"])
         self.generator: dict[str, Any] = dict(manifest.get("generator", {}))
         self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
-        self._columns = {
-            name: self._table[name].combine_chunks() for name in schema.SCENARIOS.names
+        self._file = str(path / tables.SCENARIOS)
+        columns = {name: self._table[name].combine_chunks() for name in schema.WINDOW}
+        self._rows = columns.pop("iteration_rows")
+        self._numbers = {
+            name: columns.pop(name).to_numpy(zero_copy_only=False) for name in schema.NUMBERS
         }
+        self._texts = columns  # and lists
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
         self.is_reviewed = (path / tables.REVIEW).is_file()
         if self.is_reviewed:
             len(self.reviews)  # a damaged file is noticed now
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
-        where = f"{path / tables.SCENARIOS}: column"
+        where = f"{self._file}: column"
         if len(self._row_of) != len(self.tokens):
             raise DataError(f"{where} 'token' holds one twice", tables.REPAIR)
         require_scenarios(self._table, where)
@@ -121,20 +125,20 @@ class ScenarioStore:
                 f"store {self.path.name!r} has no scenario {token!r}",
                 hint="its `tokens` are the scenarios it has",
             )
-        path = str(self.path / tables.SCENARIOS)
         try:
             window = window_of(self._row(token))
         except (ValueError, RecursionError) as error:
-            what = f"{path}: scenario {token!r}: metadata is not JSON: {error}"
+            what = f"{self._file}: scenario {token!r}: metadata is not JSON: {error}"
             raise DataError(what, tables.REPAIR) from error
-        require_rows(window, path)
+        require_rows(window, self._file)
         return window
 
     def _row(self, token: str) -> dict[str, Any]:
         at = self._row_of[token]
-        rows = self._columns["iteration_rows"][at].values.to_numpy(zero_copy_only=False)
-        plain = {n: c[at].as_py() for n, c in self._columns.items() if n != "iteration_rows"}
-        return {**plain, "iteration_rows": rows}
+        row: dict[str, Any] = {name: column[at].as_py() for name, column in self._texts.items()}
+        row |= {name: column[at].item() for name, column in self._numbers.items()}
+        row["iteration_rows"] = self._rows[at].values.to_numpy(zero_copy_only=False)
+        return row
 
     def read(self, token: str, *, plausible: bool = True) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.
@@ -166,7 +170,7 @@ class ScenarioStore:
         road = self.map(recording.city)
         scene = make_scenario(recording, ego, window, road, offset=first, is_chosen=True)
         if plausible:
-            require_plausible(scene, window.ego, stored.frames.path.parent, boxes=False)
+            require_plausible(scene, window.ego, stored.folder, boxes=False)
         return scene
 
     def map(self, city: str) -> VectorMap:

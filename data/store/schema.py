@@ -54,7 +54,13 @@ SCENARIOS = _schema(
     metadata=pa.string(),  # JSON
 )
 
-# Columns of a scenario that a `Window` has as they are.
+# Columns of a scenario that its `Window` is made of, and those of them that hold one number each.
+WINDOW = tuple(name for name in SCENARIOS.names if name not in ("city", "log"))
+NUMBERS = (
+    *("first_row", "last_row", "row_step", "duration_s", "offset_s", "subsample_ratio"),
+    "is_short",
+)
+# … that it has as they are
 SAME = ("token", "ego", "first_row", "last_row", "row_step", "is_short")
 
 FRAMES = _schema(

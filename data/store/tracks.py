@@ -1,7 +1,7 @@
 """A recording as Parquet files, and the part of it that a window needs."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,8 +16,8 @@ from shiftsim.data.store.boxes import (
     HIGHEST,
     SIZE_LIMITS,
     BoxBlock,
+    cut_spans,
     mark,
-    note_tracks,
     restored,
     scatter,
     second_differences,
@@ -104,6 +104,7 @@ def _track_block(tracks: Tracks, rows: slice) -> pa.Table:
 class StoredRecording:
     """Open files of one recording."""
 
+    folder: Path  # where they are
     log_name: str  # its name
     city: str  # map it was recorded on
     frames: Table  # times and lights
@@ -112,6 +113,7 @@ class StoredRecording:
     tokens: tuple[str, ...]  # tokens of the tracks
     kinds: IntArray  # (N,) AgentKind codes of the tracks
     block_rows: int  # rows of the recording per row group of boxes
+    kept: dict[str, Any] = field(default_factory=dict)  # blocks, times and lights read last
 
     @property
     def num_rows(self) -> int:
@@ -141,60 +143,70 @@ class StoredRecording:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
         blocks = _blocks(self.frames, first, last)
-        frames = self.frames.read(blocks)
+        of, times, lights = self.kept.get("frames", ([], None, None))
+        if of != blocks:
+            times, lights = self._frames(blocks)
+            self.kept["frames"] = blocks, times, lights
         begin = blocks[0] * schema.FRAME_BLOCK
-        if begin + len(frames) < last:
+        if begin + len(times) < last:
             raise DataError(f"{self.frames.path}: row groups are too short", hint=REPAIR)
         rows = slice(first - begin, last - begin)
-        lights = self._lights(frames).rows(rows)
-        time_us = _view(frames["time_us"])[rows]
         tracks = self._tracks(first, last, choose, plausible)
-        return Recording(self.log_name, self.city, time_us, tracks, lights)
+        return Recording(self.log_name, self.city, times[rows], tracks, lights.rows(rows))
 
-    def _lights(self, frames: pa.Table) -> TrafficLights:
+    def _frames(self, blocks: list[int]) -> tuple[IntArray, TrafficLights]:
+        """Times and lights of the rows of some row groups."""
+        frames = self.frames.read(blocks)
         shape = (len(frames), len(self.connectors))
         status = _whole(frames["light_status"]).values
         if len(status) != shape[0] * shape[1]:
             raise DataError(f"{self.frames.path}: light_status has gaps", hint=REPAIR)
         values = status.to_numpy(zero_copy_only=False).reshape(shape)
-        return TrafficLights(self.connectors, values)
+        return _view(frames["time_us"]), TrafficLights(self.connectors, values)
 
     def _tracks(self, first: int, last: int, choose: _Choice, plausible: bool) -> Tracks:
         blocks = range(first // self.block_rows, (last - 1) // self.block_rows + 1)
         if blocks[-1] >= self.tracks.num_blocks:
             raise DataError(f"{self.tracks.path}: row groups are missing", hint=REPAIR)
         parts = [self._block(block) for block in blocks]
-        place = np.full(len(self.tokens), -1)
-        for part in parts:
-            note_tracks(part.row, part.track, first, last, place)
-        seen = np.flatnonzero(place >= 0)
-        place[seen] = np.arange(len(seen))
-        valid = np.zeros((last - first, len(seen)), np.bool_)
-        for part in parts:
-            mark(part.row, part.track, place, first, valid)
-        order = choose(valid, self.kinds[seen], [self.tokens[i] for i in seen.tolist()])
+        place = np.zeros(len(self.tokens), np.int64)  # of tracks in the window, from 1
+        spans = [self._spans(part, first, last, place) for part in parts]
+        seen, names = place.nonzero()[0], self.tokens
+        if len(seen) < len(names):
+            names = tuple([names[i] for i in seen.tolist()])
+        place[seen] = np.arange(1, len(seen) + 1)
+        there = np.zeros((len(seen), last - first), np.bool_)
+        for span in spans:
+            mark(span, place, there)
+        order = choose(there.T, self.kinds[seen], names)
         if len(order) < len(seen) or (order != np.arange(len(seen))).any():
-            valid, seen = np.ascontiguousarray(valid[:, order]), seen[order]
-            place[:] = -1
-            place[seen] = np.arange(len(seen))
+            there, seen = there[order], seen[order]
+            names = tuple([names[i] for i in order.tolist()])
+            place[:] = 0
+            place[seen] = np.arange(1, len(seen) + 1)
+        valid = np.ascontiguousarray(there.T)
         dense = _dense(valid)
         poses, velocities, sizes = (array.reshape(-1) for array in dense)
         out = valid.shape, HIGHEST, SIZE_LIMITS, poses.view(np.uint64), velocities.view(np.uint64)
-        inside = all([scatter(*part, place, first, *out, sizes) for part in parts])
-        names = tuple(self.tokens[i] for i in seen.tolist())
+        pairs = zip(parts, spans, strict=True)
+        inside = all([scatter(*part[2:], span, place, *out, sizes) for part, span in pairs])
         tracks = Tracks(valid, *dense, self.kinds[seen], names)
         if plausible and not inside:
             require_boxes(tracks, last - first, self.tracks.path)
         return tracks
 
+    def _spans(self, part: BoxBlock, first: int, last: int, place: IntArray) -> IntArray:
+        spans = np.empty((len(part.row) + 1, 3), np.int64)
+        count = cut_spans(part.row, part.track, first, last, place, spans)
+        if count < 0:
+            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
+        return spans[: count + 1]
+
     def _block(self, block: int) -> BoxBlock:
         found, is_plain = self.tracks.read([block]), _is_former(self.tracks)
-        names = schema.MOTION if is_plain else schema.TRACKS.names[: len(schema.MOTION)]
-        row, track, *sizes = (_view(found[n]) for n in ("row", "track", "length_m", "width_m"))
-        motion = tuple(_view(found[name]).view(np.uint64) for name in names)
-        if len(track) and not 0 <= track.min() <= track.max() < len(self.tokens):
-            raise DataError(f"{self.tracks.path}: column 'track' names an unknown one", hint=REPAIR)
-        return BoxBlock(row, track, motion, (sizes[0], sizes[1]), is_plain)
+        *motion, row, track, length, width = _views(found)
+        bits = tuple([column.view(np.uint64) for column in motion])
+        return BoxBlock(row, track, bits, (length, width), is_plain)
 
     def boxes(self) -> tuple[IntArray, IntArray, FloatArray]:
         """All boxes as they are stored: rows (A,), tracks (A,) and `schema.MOTION` (A, 5).
@@ -203,6 +215,8 @@ class StoredRecording:
             DataError: The file is damaged.
         """
         parts = [self._block(block) for block in range(self.tracks.num_blocks)]
+        for part in parts:
+            self._spans(part, 0, 0, np.zeros(len(self.tokens), np.int64))  # all tracks are known
         motion = [
             np.column_stack(
                 [c.view(np.float64) if part.is_plain else restored(c) for c in part.motion]
@@ -231,7 +245,7 @@ def open_recording(folder: Path) -> StoredRecording:
     rows = names.get("block_rows", schema.FIRST_BLOCK_ROWS)
     if not isinstance(rows, int) or rows < 1:
         raise DataError(f"{tracks.path}: the footer has no good 'block_rows'", hint=REPAIR)
-    open_files = head["log"], head["city"], frames, tracks
+    open_files = folder, head["log"], head["city"], frames, tracks
     return StoredRecording(*open_files, connectors, tokens, kinds, rows)
 
 
@@ -281,7 +295,8 @@ def ego_states(table: Table, first: int, last: int) -> FloatArray:
         codes = [_view(table.read([block]).column(0)).view(np.uint64) for block in blocks]
         if any(len(code) % NUM_STATE for code in codes):
             raise DataError(f"{table.path}: a row group holds no whole states", hint=REPAIR)
-        columns = np.concatenate([restored(code).reshape(NUM_STATE, -1) for code in codes], axis=1)
+        parts = [restored(code).reshape(NUM_STATE, -1) for code in codes]
+        columns = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
     low = start + blocks[0] * schema.FRAME_BLOCK
     if columns.shape[1] < last - low:
         raise DataError(f"{table.path}: row groups are too short", hint=REPAIR)
@@ -308,10 +323,11 @@ def _dense(valid: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     They share one block: the allocator then keeps it for the next scenario instead of returning it
     to the system, which costs more than reading the file.
     """
-    block = np.empty(7 * valid.size)
+    size = valid.size
+    block = np.empty(7 * size)
     if not valid.all():
         block.fill(np.nan)
-    poses, velocities, sizes = np.split(block, (3 * valid.size, 5 * valid.size))
+    poses, velocities, sizes = block[: 3 * size], block[3 * size : 5 * size], block[5 * size :]
     shape = valid.shape
     return poses.reshape(*shape, 3), velocities.reshape(*shape, 2), sizes.reshape(*shape, 2)
 
