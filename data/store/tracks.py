@@ -1,7 +1,7 @@
 """A recording as Parquet files, and the part of it that a window needs."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -113,7 +113,6 @@ class StoredRecording:
     tokens: tuple[str, ...]  # tokens of the tracks
     kinds: IntArray  # (N,) AgentKind codes of the tracks
     block_rows: int  # rows of the recording per row group of boxes
-    kept: dict[str, Any] = field(default_factory=dict)  # blocks, times and lights read last
 
     @property
     def num_rows(self) -> int:
@@ -143,10 +142,7 @@ class StoredRecording:
             what = f"no rows {first} … {last - 1}, there are {self.num_rows}"
             raise DataError(f"{self.frames.path}: {what}", hint=REPAIR)
         blocks = _blocks(self.frames, first, last)
-        of, times, lights = self.kept.get("frames", ([], None, None))
-        if of != blocks:
-            times, lights = self._frames(blocks)
-            self.kept["frames"] = blocks, times, lights
+        times, lights = self._frames(blocks)
         begin = blocks[0] * schema.FRAME_BLOCK
         if begin + len(times) < last:
             raise DataError(f"{self.frames.path}: row groups are too short", hint=REPAIR)

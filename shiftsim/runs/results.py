@@ -199,10 +199,15 @@ class Run:
 
 
 def stored_place(
-    run: Path, rollout: str | None, rollout_row: int, rollout_rows: int
+    run: Path, rollout: str | None, rollout_row: int | None, rollout_rows: int | None
 ) -> Place | None:
     """Where a rollout is, by the columns of `tasks.parquet`."""
-    return Place(part_file(run / FOLDER, rollout), rollout_row, rollout_rows) if rollout else None
+    if not rollout:
+        return None
+    if rollout_row is None or rollout_rows is None:
+        what = f"'rollout_row' or 'rollout_rows' is empty where 'rollout' is {rollout!r}"
+        raise _damaged(run / "tasks.parquet", what)
+    return Place(part_file(run / FOLDER, rollout), rollout_row, rollout_rows)
 
 
 def stored_results(path: Path) -> Iterator[tuple[TaskResult, Place | None]]:
