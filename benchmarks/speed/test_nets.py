@@ -30,7 +30,7 @@ from shiftsim.planners.learned.owner import Ask, Owner, new_address
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")

@@ -23,7 +23,7 @@ from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
 from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s

@@ -13,7 +13,7 @@ from shiftsim.data.opendrive.curves import ReferenceLine, arc_length_deviation
 from shiftsim.data.opendrive.lanes import LaneKey, lane_links, section_borders
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.opendrive.records import Lane, OpenDrive, Road
-from shiftsim.verify.files import Compare, Source, read_json, read_table, verify_files
+from shiftsim.verify.files import Compare, Source, read_file, read_json, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 
@@ -194,7 +194,7 @@ def _compare_rows(file: Source, folder: Path) -> None:
         tables = [folder / f"{name}.{kind}.parquet" for kind in ("refline", "lanes")]
         compare("status", name, "compared" if tables[0].is_file() else "no golden", entry["status"])
         for table, count in zip(tables, entry.get("rows", ()), strict=False):
-            rows = read_table(table, file.report).num_rows if table.is_file() else None
+            rows = read_file(table, file.report).num_rows if table.is_file() else None
             compare("rows of the reference", name, rows, count)
         summary = folder / f"{name}.summary.json"
         if "roads_junctions" in entry and summary.is_file():

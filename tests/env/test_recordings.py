@@ -11,7 +11,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.worlds import read_world
 from shiftsim.world.state import PACIFICA, center_poses
 

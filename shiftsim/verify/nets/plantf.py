@@ -1,6 +1,6 @@
 """PlanTF, and what its comparisons share with PLUTO's: features, inputs and outputs of networks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -9,15 +9,15 @@ import numpy as np
 from shiftsim.planners.learned import features as builder
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
-from shiftsim.planners.learned.plantf import planner as plantf
+from shiftsim.planners.learned.plantf.planner import RADIUS, PlanTF, make_batch
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.common import Loop, Tables, make_planner, verify_loop, verify_manifest
-from shiftsim.verify.tables import read_tables
+from shiftsim.verify.nets.common import Loop, make_planner
+from shiftsim.verify.tables import Table, read_tables
 
 Outputs: TypeAlias = Callable[[Any, Any], dict[str, Any]]  # of a network, from its inputs
 
-NAME, TABLES = plantf.PlanTF.name, read_tables(__file__)
+PLANNER, TABLES = PlanTF, read_tables(__file__)
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
 LAYERS = np.array(["LANE", "LANE_CONNECTOR", "CROSSWALK"])
 CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
@@ -49,7 +49,7 @@ def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) ->
 
 
 def verify_forward(
-    planner: Any, tables: Tables, outputs: Outputs, radius: float, file: Source
+    planner: Any, tables: Mapping[str, Table], outputs: Outputs, radius: float, file: Source
 ) -> None:
     """Compare the network alone, on synthetic inputs as the official code batched them.
 
@@ -134,7 +134,7 @@ def _outputs(network: Any, inputs: Any) -> dict[str, Any]:
     return {**made, "poses": likeliest(made["trajectory"], made["probability"])}
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: Loop) -> None:
     """Compare features, raw outputs and plan of one iteration."""
     recorded = loop.row["trajectory"][1:, :3]
     again = plan_of_poses(recorded, loop.seen.history)
@@ -145,13 +145,8 @@ def _compare(loop: Loop) -> None:
         # the official code gives every agent the category of the ego at inference
         others = {"state": state, "category": np.zeros(len(agents.valid), np.int64)}
         compare_features(loop, agents, road, route, **others)
-        batch = plantf.make_batch([loop.features], "cpu")
+        batch = make_batch([loop.features], "cpu")
         compare_network(loop, _outputs, batch, "outputs", "large")
 
 
-MANIFEST = partial(verify_manifest, builder=builder, history=2.0, future=builder.PLAN_POSES * STEP)
-FILES = {
-    "state_dict.json": partial(MANIFEST, NAME, TABLES, planner=plantf),
-    "forward_*.npz": partial(verify_forward, plantf.PlanTF, TABLES, _outputs, plantf.RADIUS),
-    "closed_loop_*.npz": partial(verify_loop, plantf.PlanTF, TABLES, _compare),
-}
+FILES = {"forward_*.npz": partial(verify_forward, PlanTF, TABLES, _outputs, RADIUS)}

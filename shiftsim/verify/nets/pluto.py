@@ -14,7 +14,7 @@ from shiftsim.verify.nets.common import Loop
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
-NAME, TABLES = planner.Pluto.name, read_tables(plantf.__file__, __file__)
+PLANNER, TABLES = planner.Pluto, read_tables(plantf.__file__, __file__)
 NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
 
@@ -49,7 +49,7 @@ def _outputs(network: Any, batch: Any) -> dict[str, Any]:
     }
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: Loop) -> None:
     """Compare everything stored of one iteration."""
     from shiftsim.planners.learned.pluto.network import Inputs
 
@@ -111,11 +111,5 @@ def _compare_from_stored(loop: Loop, stored: Source) -> None:
     loop.match("from_stored", stored, "stored proposals'", scores=again.scores)
 
 
-FILES = {
-    "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=planner),
-    "forward_*.npz": partial(
-        plantf.verify_forward, planner.Pluto, TABLES, _outputs, planner.RADIUS
-    ),
-    "closed_loop_*.npz": partial(common.verify_loop, planner.Pluto, TABLES, _compare),
-    "emergency_brake.npz": _verify_brake,
-}
+_FORWARD = partial(plantf.verify_forward, planner.Pluto, TABLES, _outputs, planner.RADIUS)
+FILES = {"forward_*.npz": _FORWARD, "emergency_brake.npz": _verify_brake}

@@ -1,8 +1,10 @@
 """The importer against what the official stack reads from the same logs and maps.
 
-Of the tiny world in nuPlan's own formats this is a file, `devkit_readback.json`.
+Of the tiny world in nuPlan's own formats this is a file, `devkit_readback.json`. Maps are compared
+behind the map interface of `compat`; sections in capitals are what the objects of a layer say.
 """
 
+import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,18 +12,18 @@ import numpy as np
 import shapely
 
 from shiftsim.arrays import IntArray
+from shiftsim.compat import nuplan as compat
 from shiftsim.data.deepplan.route import follow_blocks
 from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.log import Log, open_log, read_ego
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import find_maps, list_scenarios, load_map, read_scenario
 from shiftsim.errors import DataError
-from shiftsim.verify.files import COMPARED, Source, open_tables, read_fields, read_json
-from shiftsim.verify.nuplan.maps import nuplan_map, verify_maps
+from shiftsim.verify.files import COMPARED, Groups, Scenes, Source, open_tables, read_file
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import ego_columns, object_columns
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, EgoState
 
@@ -44,6 +46,14 @@ _NEAR = 80.0  # m, half width of the square of `proximal`
 _DRIVABLE = np.array([[30.0, 0.0], [100.0, -6.0], [30.0, -8.0], [210.0, -6.0]])
 _ORIGINS = {32632: np.array([600000.0, 5300000.0, 0.0])}  # of the poses, by coordinate system
 _PARTS = ("ego_t0", "lane", "connector", "roadblock", "proximal")
+# columns of `map_lines` and `map_queries`
+_AXES = ("x", "y", "heading")
+_LINES = ("baseline", "left_boundary", "right_boundary")
+_EDGES = ("LANE", "LANE_CONNECTOR")
+_NEAR_POINT = 20.0  # m, half width of the square of the `near20` columns
+_HOLDING = (*_EDGES, "ROADBLOCK", "ROADBLOCK_CONNECTOR", "INTERSECTION", "CROSSWALK")  # points
+_NEARBY = (*_EDGES, "STOP_LINE")  # lie there
+_ASKED = ("DRIVABLE_AREA", "INTERSECTION")  # whether a point lies in one
 
 
 def verify_nuplan_import(folder: Path, report: Report) -> None:
@@ -53,12 +63,11 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
     tables = open_tables(expected, report, "log_ego", "objects", "traffic_lights")
     ego, objects, lights = tables.values()
     scripts = open_tables(folder, report, "scripted")["scripted"]
-    path = expected / "scenario_meta.json"
-    meta = Source("scenario_meta.json", "scene", read_json(path), report)
+    meta = read_file(expected / "scenario_meta.json", report, "scenario_meta.json")
+    meta.what = "scene"
     for name, entry in scenes.entries.items():
         with report.attempt("importer", name), open_log(folder / entry["db"]) as log:
-            scene = scenes[name]
-            names = _facts(scene, log)
+            scene, names = scenes[name], _facts(scenes[name], log)
             TABLES["listed"].match(entry, name, **names)
             TABLES["meta"].match(meta.each(name)[0], name, **names)
             offered = bool(log.is_offered[log.row_of[entry["token"]]])
@@ -76,12 +85,12 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
             lights.match((name,), light_columns(scene))
     ego.finish()
     lights.finish()
-    for source in (meta, *scenes.entries.values()):
-        source.finish()
-    logs = (folder / entry["db"] for entry in scenes.entries.values())
-    read_here = {*expected.iterdir(), *logs}
-    read_here |= {folder / name for name in ("scenes.json", "scripted.parquet", "RESULTS.md")}
-    name_rest(folder, read_here, report)
+    read_here = {folder / name for name in ("scenes.json", "scripted.parquet", "RESULTS.md")}
+    meta.finish()
+    for entry in scenes.entries.values():
+        entry.finish()
+        read_here.add(folder / entry["db"])
+    name_rest(folder, {*expected.iterdir(), *read_here}, report)
     report.note("RESULTS.md (for reading; repeats scores.parquet)")
     report.note("maps/*.json: raster layers of the index (not used for planning)")
     report.note("scenes.json: purpose of each script (a label)")
@@ -149,7 +158,7 @@ def light_columns(scene: Scenario) -> dict[str, Any]:
 def verify_nuplan_format(folder: Path, report: Report) -> None:
     """Compare every field of `devkit_readback.json` with what is in `logs` and `maps`."""
     path, logs = folder / "devkit_readback.json", sorted((folder / "logs").glob("*.db"))
-    expected = read_fields(path, report, "readback")
+    expected = read_file(path, report, "readback")
     if not logs:
         raise DataError(f"{folder / 'logs'}: there is no log (.db)")
     for extra in logs[1:]:
@@ -167,8 +176,7 @@ def _read_back(folder: Path, path: Path) -> dict[str, Any]:
     """What `format.toml` speaks of."""
     with open_log(path) as log:
         tagged = [[t, i] for t, i in zip(log.types, log.tokens, strict=True) if t != "unknown"]
-        start, map_name = int(log.time_us[0]), log.map_name
-    road = load_map(find_maps(folder / "maps"), map_name)
+        start, road = int(log.time_us[0]), load_map(find_maps(folder / "maps"), log.map_name)
     scene, origin = read_scenario(path, tagged[0][1], road, _MAPPING), _ORIGINS[road.epsg]
     row, now = int(scene.iteration_rows[0]), int(scene.iteration_times[0])
     ego, kinds = EgoState(now, scene.ego[row]), scene.tracks.kinds[scene.tracks.valid[row]]
@@ -190,4 +198,85 @@ def _read_back(folder: Path, path: Path) -> dict[str, Any]:
         "lanes": world.get_all_map_objects(place, layers.LANE),
         "near": {kind.name: len(found) for kind, found in near.items()},
         "in_drivable": [world.is_in_layer(at, layers.DRIVABLE_AREA) for at in places],
+    }
+
+
+def verify_maps(expected: Path, maps: dict[str, VectorMap], report: Report) -> None:
+    """Compare map_objects, map_lines and map_queries with maps by name."""
+    tables = open_tables(expected, report, "map_objects", "map_lines", "map_queries")
+    parts = _compare_objects, _compare_lines, _compare_queries
+    for (name, table), compare in zip(tables.items(), parts, strict=True):
+        for city, road in maps.items() if len(table) else ():
+            with report.attempt(name, city):
+                compare(*nuplan_map(road), city, table)
+        table.finish()
+
+
+def nuplan_map(road: VectorMap) -> tuple[Any, Any]:
+    """A map behind nuPlan's interface, and its layers by name."""
+    compat.install()
+    from nuplan.common.maps.maps_datatypes import SemanticMapLayer
+
+    from shiftsim.compat.nuplan.bridge.map import BridgeMap
+
+    return BridgeMap(road), SemanticMapLayer
+
+
+def _compare_objects(road: Any, layers: Any, city: str, objects: Groups) -> None:
+    for name in filter(str.isupper, TABLES):
+        found = sorted(road.objects(layers[name]), key=lambda thing: thing.id)
+        # rows may come in another order than in the map; nothing reads the order of this table
+        rows, where = objects[city, name], f"{city} {name}"
+        rows = rows.at(np.argsort(rows["id"].astype(str), kind="stable"))
+        if not rows.match(where, {"id": [thing.id for thing in found]}):
+            continue
+        for row, thing in enumerate(found):
+            shape = shapely.from_wkb(rows["polygon_wkb"][row])
+            theirs = json.loads(rows["attributes"][row]) | _outline(shape)
+            given = Source("map_objects", "attribute", theirs, objects.table.report)
+            TABLES[name].match(given, f"{where} {thing.id}", object=thing)
+            TABLES["outline"].match(given, f"{where} {thing.id}", **_outline(thing.polygon))
+            given.finish()
+
+
+def _outline(shape: shapely.Polygon) -> dict[str, Any]:
+    rings = [np.asarray(ring.coords) for ring in (shape.exterior, *shape.interiors)]
+    return {"rings": [len(ring) for ring in rings], "outline": np.concatenate(rings)}
+
+
+def _compare_lines(road: Any, layers: Any, city: str, lines: Groups) -> None:
+    for name in _EDGES:
+        for edge in road.objects(layers[name]):
+            sides = edge.baseline_path, edge.left_boundary, edge.right_boundary
+            for line, side in zip(_LINES, sides, strict=True):
+                poses = side.discrete_path
+                ours = {"layer": [name] * len(poses), "index": np.arange(len(poses))}
+                ours |= {axis: [getattr(pose, axis) for pose in poses] for axis in _AXES}
+                lines.match((city, edge.id, line), ours)
+
+
+def _compare_queries(road: Any, layers: Any, city: str, queries: Groups) -> None:
+    points = shapely.points(queries[city,]["x"], queries[city,]["y"])
+    answers = [_answer(road, layers, point) for point in points]
+    queries.match((city,), {name: [answer[name] for answer in answers] for name in answers[0]})
+
+
+def _answer(road: Any, layers: Any, point: shapely.Point) -> dict[str, Any]:
+    found = {name: road.get_all_map_objects(point, layers[name]) for name in _HOLDING}
+    near = road.get_proximal_map_objects(point, _NEAR_POINT, [layers[name] for name in _NEARBY])
+    found |= {f"near20_{kind.name}": things for kind, things in near.items()}
+    _, away = road.get_distance_to_nearest_map_object(point, layers.DRIVABLE_AREA)
+    lane, distance = road.get_distance_to_nearest_map_object(point, layers.LANE)
+    line = road.get_map_object(lane, layers.LANE).baseline_path
+    pose = line.get_nearest_pose_from_position(point)
+    arc = line.get_nearest_arc_length_from_position(point)
+    return {
+        **{name: ",".join(sorted(thing.id for thing in found[name])) for name in found},
+        **{f"in_{name}": road.is_in_layer(point, layers[name]) for name in _ASKED},
+        "drivable_area_distance": away,
+        "nearest_lane": lane,
+        "nearest_lane_distance": distance,
+        "lane_arc_length": road.source.progress_on(road.source.edge(lane), point.x, point.y),
+        **{f"lane_pose_{axis}": getattr(pose, axis) for axis in _AXES},
+        "lane_curvature": line.get_curvature_at_arc_length(arc),
     }

@@ -96,9 +96,10 @@ def test_an_additional_column_is_named(falsified, nuplan_reference, scenes):
     path = folder / "trajectories.parquet"
     content = pq.read_table(path)
     pq.write_table(content.append_column("z", pa.array(np.zeros(len(content)))), path)
-    report = Report()
-    verify_planners(folder, report, scenes, "PT")
-    verify_planners(folder, report, scenes, "NR")
+    report = Report("PT")
+    verify_planners(folder, report, scenes)
+    report.mode = "NR"
+    verify_planners(folder, report, scenes)
     assert list(report.not_covered) == ["trajectories: column 'z'"]
 
 

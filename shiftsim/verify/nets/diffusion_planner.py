@@ -5,7 +5,6 @@ Everything is made from the scene's own log and map; stored features are only co
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ def _sampled(
     return {**calls, "plain": plain, "guided": guided, "times": sampler.SCHEDULE.call_times}
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
     loop.match("iteration", loop.row)
     if list(loop.stored):
@@ -190,12 +189,11 @@ def _lines(file: Source, name: str) -> Polylines:
     return make_polylines(np.split(xy, np.cumsum(lengths)[:-1]))
 
 
+PLANNER = KeyedPlanner
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
     "forward_*.npz": _verify_forward,
-    "closed_loop_*.npz": partial(common.verify_loop, KeyedPlanner, TABLES, _compare),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,
 }
