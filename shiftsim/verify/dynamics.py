@@ -1,7 +1,6 @@
 """Compares vehicle dynamics, tracker, noise, interpolation, comfort and IDM steps with nuPlan's.
 
-`CHECKS` has a function for each file, which computes what `dynamics.toml` speaks of from the arrays
-of one case.
+`CHECKS` has what computes, for each file, the names of `dynamics.toml` from the arrays of one case.
 """
 
 from pathlib import Path
@@ -19,7 +18,7 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
-from shiftsim.verify.files import Source, verify_files
+from shiftsim.verify.files import Compare, Source, verify_files
 from shiftsim.verify.idm_worlds import compare_idm_world
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables, rows_of
@@ -38,9 +37,9 @@ _POSE = ("x", "y", "heading")
 
 def verify_dynamics(folder: Path, report: Report) -> None:
     """Compare every file of a folder of dynamics references."""
-    files = dict.fromkeys((f"{name}.npz" for name in CHECKS), _compare_cases)
-    worlds = {"idm_world_*": compare_idm_world}
-    verify_files(folder, report, {"meta.json": None}, {**files, **worlds})
+    files: dict[str, Compare] = {f"{name}.npz": _compare_cases for name in CHECKS}
+    files["idm_world_*"] = compare_idm_world
+    verify_files(folder, report, {"meta.json": None}, files)
 
 
 def _compare_cases(file: Source, name: str) -> None:
@@ -89,11 +88,9 @@ def _lqr_commands(case: Source) -> Names:
     lqr.raise_for_status(ref.status, now, time_us)
     speeds, curvatures = lqr.fit_profiles(*plan[2:], lqr.NUPLAN)
     times = (time_us[0] + np.arange(len(speeds)) * lqr.NUPLAN.step_us) / 1e6
-    return {
-        **{"now": now, "speed": speed, "ref": ref, "command": lqr.track(*plan, lqr.NUPLAN)[1:]},
-        **{"times": times, "speeds": speeds, "curvatures": curvatures},
-        "is_stopping": lqr.is_stopping(speed, ref.speed, lqr.NUPLAN),
-    }
+    names = {"now": now, "speed": speed, "ref": ref, "command": lqr.track(*plan, lqr.NUPLAN)[1:]}
+    names["is_stopping"] = lqr.is_stopping(speed, ref.speed, lqr.NUPLAN)
+    return {**names, "times": times, "speeds": speeds, "curvatures": curvatures}
 
 
 def _closed_loop(case: Source) -> Names:
@@ -121,10 +118,8 @@ def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Names:
     for step, added in enumerate(noise.tolist()):
         knots = slice(None) if is_whole else slice(step, step + WINDOW_KNOTS)
         now, after = iter_time[step : step + 2].tolist()
-        status = lqr.track_and_step(
-            *(now, after, driven[step], ref_time[knots], poses[knots]),
-            *(*added, driven[step + 1], commands[step]),
-        )
+        given = now, after, driven[step], ref_time[knots], poses[knots], *added
+        status = lqr.track_and_step(*given, driven[step + 1], commands[step])
         lqr.raise_for_status(status, now, ref_time[knots])
     plan_times = ref_time[0] + lqr.NUPLAN.step_us * np.arange(len(ref_time))
     ours = {"driven": driven, "commands": commands, "centers": _centers(states)}

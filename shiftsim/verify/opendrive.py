@@ -81,13 +81,10 @@ def _compare_lanes(od: OpenDrive, file: Source, path: Path) -> None:
         compare("lane rows lie in their section", where, inside, True)
         line, borders = ReferenceLine(road.geometries), section_borders(road, key.section, s)
         inner, outer, poses = borders.inner[key.lane], borders.outer[key.lane], line.evaluate(s)
-        ours = {
-            "types": [lanes[key].type] * len(s),
-            **{"inner": inner, "inside": poses.offset(inner)},
-            **{"outer": outer, "outside": poses.offset(outer)},
-            "center": poses.offset(0.5 * (inner + outer)),
-        }
-        TABLES["lanes"].match(rows, where, **ours, **_bounds(line, s))
+        offsets = {"inner": inner, "outer": outer, "center": 0.5 * (inner + outer)}
+        places = {name: poses.offset(offset) for name, offset in offsets.items()}
+        names = {"types": [lanes[key].type] * len(s), "offsets": offsets, "places": places}
+        TABLES["lanes"].match(rows, where, **names, **_bounds(line, s))
 
 
 def _lanes(od: OpenDrive) -> dict[LaneKey, Lane]:
@@ -118,21 +115,18 @@ def _compare_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
         line, outline = ReferenceLine(road.geometries), "box"
         if thing.outlines:
             outline = "cornerRoad" if thing.outlines[0].on_road else "cornerLocal"
-        shape = {"origin": object_origin(line, thing), "polygon": object_rings(line, thing)[0]}
-        bounds = _bounds(line, np.array([thing.s]))
-        where = f"{path.stem} object {key}"
-        TABLES["crosswalk"].match(rows[key], where, outline=outline, **shape, **bounds)
+        names = {"origin": object_origin(line, thing), "polygon": object_rings(line, thing)[0]}
+        names |= _bounds(line, np.array([thing.s]))
+        TABLES["crosswalk"].match(rows[key], f"{path.stem} object {key}", outline=outline, **names)
 
 
 def _compare_summary(od: OpenDrive, file: Source, path: Path) -> None:
     where, compare = path.stem, file.report.compare
     TABLES["summary"].match(file, where, od=od, path=path, **_summarize(od))
     along, center = np.sum([(0.0, 0.0), *map(_driving_lengths, od.roads.values())], axis=0)
-    for key, length in {
-        "driving_s_length_m": along,
-        "driving_centreline_length_m": center,
-        "road_length_sum_m": sum(road.stated_length for road in od.roads.values()),
-    }.items():
+    lengths = {"driving_s_length_m": along, "driving_centreline_length_m": center}
+    lengths["road_length_sum_m"] = sum(road.stated_length for road in od.roads.values())
+    for key, length in lengths.items():
         atol = max(LENGTH_SHARE * abs(file[key]), LENGTH)
         file.match(where, {key: float(length)}, atol, quantity="summary")
     # of the largest gap; where many gaps are rounding noise, one as large as ours
@@ -198,8 +192,7 @@ def _compare_rows(file: Source, folder: Path) -> None:
             compare("rows of the reference", name, rows, count)
         summary = folder / f"{name}.summary.json"
         if "roads_junctions" in entry and summary.is_file():
-            values = read_json(summary)
-            ours = [values["roads"], values["junctions"]]
+            ours = [read_json(summary)[thing] for thing in ("roads", "junctions")]
             compare("roads and junctions", name, ours, entry["roads_junctions"])
 
 

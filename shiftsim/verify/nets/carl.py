@@ -15,13 +15,13 @@ from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
 
 PLANNER, NAME, TABLES = Carl, Carl.name, read_tables(__file__)
+_INPUTS = ("bev_semantics", "measurements", "value_measurements")
 _TOLD = np.ones((1, 4), np.float32)  # what the critic is told at inference
 
 
 def _verify_forward(file: Source) -> None:
     """The network on stored inputs, with each variant of the weights."""
-    names = ("bev_semantics", "measurements", "value_measurements")
-    inputs = [file[f"in.{name}"][None] for name in names]
+    inputs = [file[f"in.{name}"][None] for name in _INPUTS]
     for variant in common.match_case(file, NAME):
         says = _outputs(common.make_planner(Carl, variant).networks[0], *inputs)
         where = f"{file.name} {variant}"

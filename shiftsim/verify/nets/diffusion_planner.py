@@ -79,22 +79,16 @@ def _verify_forward(file: Source) -> None:
     scene = network.normalise(inputs)
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
-    route = network.dit[0].route_encoder(scene["route_lanes"])
-    encoded = {"encoding": network.encode(scene), "route": route}
-    TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
+    encoded, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
+    TABLES["encoded"].match(file.below("out."), file.name, NAME, encoding=encoded, route=route)
     for variant in common.match_case(file, NAME):
-        says, stored = (
-            _sampled(variant, scene, inputs, given["noise"]),
-            file.below(f"out.{variant}."),
-        )
+        says = _sampled(variant, scene, inputs, given["noise"])
+        stored, where = file.below(f"out.{variant}."), f"{file.name} {variant}"
         for section in ("sampled", "guided"):
-            where = f"{file.name} {variant}"
             TABLES[section].match(stored, where, NAME, variant=variant, **says)
 
 
-def _sampled(
-    variant: str, scene: dict[str, Any], inputs: dict[str, Any], start: Any
-) -> dict[str, Any]:
+def _sampled(variant: str, scene: Any, inputs: Any, start: Any) -> dict[str, Any]:
     """What the sampler comes to with one variant of the weights, and its calls of the network."""
     import torch
 
@@ -142,22 +136,23 @@ def _verify_agents(file: Source) -> None:
 
 def _tracks(file: Source) -> Tracks:
     """The frames as tracks, in the order of the last frame; static objects after them."""
-    names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
-    last = len(names) - 1
+    frames = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
+    last = len(frames) - 1
     rows = [
         (row, AgentKind(kind).name, *values)
         for row in range(last, -1, -1)
-        for kind, values in zip(file[f"{names[row]}_type"], file[names[row]].tolist(), strict=True)
+        for kind, values in zip(
+            file[f"{frames[row]}_type"], file[frames[row]].tolist(), strict=True
+        )
     ]
     static = zip(file["in.static_type"], file["in.static"].tolist(), strict=True)
     rows += [
         (last, _STATIC[kind], f"static {number}", np.nan, np.nan, heading, width, length, x, y)
         for number, (kind, (x, y, heading, width, length)) in enumerate(static)
     ]
-    columns = zip(
-        ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True)), strict=True
-    )
-    return tracks_of(Source(file.name, "column", dict(columns), file.report), last + 1)
+    names, values = ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True))
+    columns = dict(zip(names, values, strict=True))
+    return tracks_of(Source(file.name, "column", columns, file.report), last + 1)
 
 
 def _verify_lanes(file: Source) -> None:

@@ -109,13 +109,10 @@ def _path(case: Source, where: str) -> None:
     for progress, pose in zip(queries.tolist(), at, strict=True):
         rollout.read_pose(path, progress, np.full(3, np.nan), pose)
     points = case.take("query_xy", -1, 2).tolist()
-    ours = {
-        "progress": path.progress,
-        "projection": [project(path, x, y, 0)[0] for x, y in points],
-        "poses": at,
-        "offset_m": routes.offset_poses(poses, -1.0),
-        "offset_p": routes.offset_poses(poses, 1.0),
-    }
+    projection = [project(path, x, y, 0)[0] for x, y in points]
+    ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
+    ours["offset_m"] = routes.offset_poses(poses, -1.0)
+    ours["offset_p"] = routes.offset_poses(poses, 1.0)
     for row, (low, high) in enumerate(case.take("substring_iv", -1, 2).tolist()):
         line = path.xy[slice(*window(path, low, high))]
         if len(line) < 2:
@@ -159,12 +156,9 @@ def _compare_route(case: Source, where: str, scenario: Scenario) -> None:
     ordered = routes.in_index_order(route, selected, areas)
     lane = routes.current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
     line = centerline(road, routes.follow_route(road, route.corrected, lane).path)
-    ours = {
-        "under": route.areas.lane[ordered],
-        "errors": [errors[areas.index(area)] for area in ordered],
-    }
-    ours |= {"lane": lane, "line": line, "path": make_path(line)}
-    TABLES["routes"].match(case, where, road=road, route=route, **ours)
+    names = {"road": road, "route": route, "ordered": ordered, "lane": lane, "line": line}
+    names["errors"] = [errors[areas.index(area)] for area in ordered]
+    TABLES["routes"].match(case, where, path=make_path(line), **names)
 
 
 def _compare_idm(call: Source, where: str, scenario: Scenario) -> None:
@@ -189,11 +183,9 @@ def _compare_idm(call: Source, where: str, scenario: Scenario) -> None:
     TABLES["objects"].match(theirs, where, columns=columns, kinds=kinds)
     path, times = planner.path, seen.time_us + STEP_US * np.arange(STEPS + 1)
     assert path is not None
-    ours = {
-        "end": [path.end, *path.driven.xy[-1], wrap_angle(float(path.driven.heading[-1]))],
-        "states": np.column_stack([times, centers, speeds]),
-    }
-    TABLES["plan"].match(call, where, road=road, planner=planner, **ours)
+    end = [path.end, *path.driven.xy[-1], wrap_angle(float(path.driven.heading[-1]))]
+    states = np.column_stack([times, centers, speeds])
+    TABLES["plan"].match(call, where, road=road, planner=planner, end=end, states=states)
 
 
 CHECKS = {
