@@ -37,7 +37,8 @@ def scenes(tmp_path_factory):
     with tarfile.open(GOLDEN) as archive:
         archive.extractall(folder)
     cities = {f"bench_scene_{count}": bench_scene(count, 0) for count in (100, 300)}
-    return {**Scenes(folder / "nuplan"), **cities}
+    scenes = Scenes(folder / "nuplan")
+    return {**{name: scenes[name] for name in scenes.entries}, **cities}
 
 
 @pytest.fixture(scope="module")

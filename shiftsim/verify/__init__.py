@@ -43,7 +43,8 @@ def verify(
         raise DataError(f"{folder}: no such folder")
     options = {"scenes": scenes, "maps": maps, "store": store}
     for name, (module, *patterns) in KINDS.items():
-        if name == kind or (kind is None and _holds(folder, patterns)):
+        fits = all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns)
+        if name == kind or (kind is None and fits):
             part = getattr(import_module(f"shiftsim.verify.{module}"), f"verify_{name}")
             report, takes = Report(mode), signature(part).parameters
             part(folder, report, **{name: options[name] for name in options if name in takes})
@@ -52,7 +53,3 @@ def verify(
         f"{folder}: not recognised as a folder of reference outputs",
         hint=f"known kinds: {', '.join(KINDS)}",
     )
-
-
-def _holds(folder: Path, patterns: list[str]) -> bool:
-    return all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns)

@@ -28,7 +28,7 @@ from shiftsim.world.state import center_poses
 
 _POSITION = 2e-2  # m: README of the scripted recordings
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
-_CONFIG = ConversionConfig()
+_CONFIG = ConversionConfig()  # as by default
 Keys = list[list[LaneKey]]  # OpenDRIVE lanes that every row lies in
 Ways = dict[tuple[str, ...], list[list[Any]]]  # lanes that egos pass, by window and track
 FACTS = read_tables(__file__)
@@ -39,7 +39,6 @@ class Lanes:
     """A map at its place in UTM, with the OpenDRIVE lanes behind the lanes of ours."""
 
     def __init__(self, path: Path, site: Site) -> None:
-        """Read and convert a map file."""
         self.offset, drive = site.offset[:2], read_opendrive(path)
         x, y = self.offset.tolist()
         self.road, made = build_road_map(drive, name=path.stem, offset=(x, y), epsg=site.epsg)
@@ -119,14 +118,12 @@ def _compare_summary(expected: Source, site: Site, recording: Annotations, keys:
     stamps = read_file(folder / "frames.parquet", report)["time"].astype("datetime64[us]")
     lag = (stamps - stamps[0]).astype(np.int64) * 1e-6 - recording.clock
     yaw, moving = recording.angles[:, 0], np.arctan2(velocity[:, 1], velocity[:, 0])
-    facts = {
-        **{"recording": recording, "rate": 1.0 / recording.period, "lag": np.abs(lag)},
-        **dict(zip(("first", "last"), stamps[[0, -1]].tolist(), strict=True)),
-        "to_velocity": np.abs(wrap_angles(yaw - moving)),
-        "to_rotation": np.abs(yaw - raw["rotation_z"][order]),
-        "alone": [key for key in keys if len(key) == 1],
-        "steps": int(recording.duration / ROW_S + 1e-9) + 1,
-    }
+    facts = {"recording": recording, "rate": 1.0 / recording.period, "lag": np.abs(lag)}
+    facts |= dict(zip(("first", "last"), stamps[[0, -1]].tolist(), strict=True))
+    facts["to_velocity"] = np.abs(wrap_angles(yaw - moving))
+    facts["to_rotation"] = np.abs(yaw - raw["rotation_z"][order])
+    facts["alone"] = [key for key in keys if len(key) == 1]
+    facts["steps"] = int(recording.duration / ROW_S + 1e-9) + 1
     FACTS["summary"].match(expected, "recording", **facts)
     for number, where, track in _tracks(expected, recording):
         rows = np.flatnonzero(recording.track == number)
@@ -152,13 +149,11 @@ def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> N
     `folder` is one recording or holds several. Its maps lie in `maps`, or in a folder of that name
     beside the one of the references.
     """
-    parts: Parts = {
-        path.parent.name: partial(verify_dsc3d_synthetic, report=report, maps=maps)
-        for path in folder.glob("*/expected.json")
-    }
-    if (folder / "expected.json").is_file():  # and with it:
-        read = {"expected_ego_20hz.parquet": lambda path: None}
-        parts = {"data": lambda path: report.note(_DERIVED), **read}
+    inner = partial(verify_dsc3d_synthetic, report=report, maps=maps)
+    parts: Parts = {path.parent.name: inner for path in folder.glob("*/expected.json")}
+    if (folder / "expected.json").is_file():
+        poses = {"expected_ego_20hz.parquet": lambda path: None}  # read with `expected.json`
+        parts = {"data": lambda path: report.note(_DERIVED), **poses}
     scripted = partial(_compare_scripted, folder=folder, maps=maps)
     verify_files(folder, report, parts, {"expected.json": scripted})
 

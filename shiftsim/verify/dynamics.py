@@ -4,7 +4,7 @@
 """
 
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +24,6 @@ from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.verify.worlds import ego_states
 from shiftsim.world import state
-from shiftsim.world.state import NUM_STATE, PACIFICA, STEERING, VX
-
-Names: TypeAlias = dict[str, Any]
 
 TABLES = read_tables(__file__)
 GIVEN_STEERING = 0.1  # rad, of all states made from centres; not among their inputs
@@ -67,22 +64,22 @@ def _centers(states: FloatArray) -> FloatArray:
     return np.concatenate([state.center_poses(states[..., :3]), *moves, *sizes], axis=-1)
 
 
-def _bicycle(case: Source) -> Names:
+def _bicycle(case: Source) -> dict[str, Any]:
     """A step, or a rollout, which has an axis of time."""
-    before, dt_us = case.take("in_state", NUM_STATE), case["dt_us"]
+    before, dt_us = case.take("in_state", state.NUM_STATE), case["dt_us"]
     commands = case.take("cmd", *dt_us.shape, 2).reshape(-1, 2)
-    out = np.empty((len(commands), NUM_STATE))
+    out = np.empty((len(commands), state.NUM_STATE))
     for step, (accel, rate) in enumerate(commands.tolist()):
         dt = step_seconds(0, int(dt_us.flat[step]))
         step_bicycle(before, accel, rate, WHEEL_BASE, dt, out[step])
         before = out[step]
-    out, times = out.reshape(*dt_us.shape, NUM_STATE), case["in_time_us"] + np.cumsum(dt_us)
+    out, times = out.reshape(*dt_us.shape, state.NUM_STATE), case["in_time_us"] + np.cumsum(dt_us)
     return {"states": out, "times": times.reshape(dt_us.shape), "centers": _centers(out)}
 
 
-def _lqr_commands(case: Source) -> Names:
-    now, initial = int(case["now_us"]), case.take("ego_state", NUM_STATE)
-    time_us, speed = _stamps(case, "traj_time_us"), initial[VX]
+def _lqr_commands(case: Source) -> dict[str, Any]:
+    now, initial = int(case["now_us"]), case.take("ego_state", state.NUM_STATE)
+    time_us, speed = _stamps(case, "traj_time_us"), initial[state.VX]
     plan = now, initial, time_us, ego_states({name: case[f"traj_{name}"] for name in _POSE})
     ref = lqr.reference(*plan, lqr.NUPLAN)
     lqr.raise_for_status(ref.status, now, time_us)
@@ -93,22 +90,22 @@ def _lqr_commands(case: Source) -> Names:
     return {**names, "times": times, "speeds": speeds, "curvatures": curvatures}
 
 
-def _closed_loop(case: Source) -> Names:
+def _closed_loop(case: Source) -> dict[str, Any]:
     if case["mode"] not in ("full", "window"):
         raise DataError(f"mode {str(case['mode'])!r} is neither 'full' nor 'window'")
     jitter = (np.diff(case["iter_time_us"]) != lqr.NUPLAN.step_us).any()
     return {"jitter": jitter, **_drive(case, case["mode"] == "full", 0.0 * case["cmd"])}
 
 
-def _closed_loop_noise(case: Source) -> Names:
+def _closed_loop_noise(case: Source) -> dict[str, Any]:
     noise = noise_from_normals(parse_noise(f"{case['process']}-{case['level']}"), case["eps"])
     applied = case["cmd"] + case["noise"]
     return {"noise": noise, "applied": applied, **_drive(case, False, case["noise"])}
 
 
-def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Names:
+def _drive(case: Source, is_whole: bool, noise: FloatArray) -> dict[str, Any]:
     """A closed loop; the tracker sees the whole plan, or a window that moves on with it."""
-    plan, states = case.take("ref_pose", -1, 3), case.take("state", -1, NUM_STATE)
+    plan, states = case.take("ref_pose", -1, 3), case.take("state", -1, state.NUM_STATE)
     ref_time, iter_time = _stamps(case, "ref_time_us"), _stamps(case, "iter_time_us")
     if len(plan) != len(ref_time) or len({len(states), len(iter_time), len(noise) + 1}) != 1:
         raise DataError("arrays 'state', 'iter_time_us', 'cmd' and 'ref_*' do not belong together")
@@ -126,26 +123,26 @@ def _drive(case: Source, is_whole: bool, noise: FloatArray) -> Names:
     return {**ours, "times": iter_time, "plan_times": plan_times}
 
 
-def _trajectory_interpolation(case: Source) -> Names:
-    stamps, states = _stamps(case, "knot_time_us"), case.take("knot_state", -1, NUM_STATE)
+def _trajectory_interpolation(case: Source) -> dict[str, Any]:
+    stamps, states = _stamps(case, "knot_time_us"), case.take("knot_state", -1, state.NUM_STATE)
     queries = case["query_time_us"]
-    out = np.empty((len(queries), NUM_STATE))
+    out = np.empty((len(queries), state.NUM_STATE))
     for row, now in enumerate(queries.tolist()):
         if not interpolate(stamps, states, now, out[row]):
             raise DataError(f"query {now} is outside the trajectory")
     return {"states": out, "times": queries}
 
 
-def _ego_frames(case: Source) -> Names:
-    states, given = case.take("rear_state", NUM_STATE), case["from_centre_in"]
-    size, built = np.array([PACIFICA.length, PACIFICA.width]), np.zeros(NUM_STATE)
+def _ego_frames(case: Source) -> dict[str, Any]:
+    states, given = case.take("rear_state", state.NUM_STATE), case["from_centre_in"]
+    size, built = np.array([state.PACIFICA.length, state.PACIFICA.width]), np.zeros(state.NUM_STATE)
     built[:7], built[[state.YAW_RATE, state.YAW_ACCEL]] = given[:7], given[7:]
-    built[STEERING] = GIVEN_STEERING
+    built[state.STEERING] = GIVEN_STEERING
     corners = boxes_to_corners(state.center_poses(states[:3]), size)
     return {"centers": _centers(states), "corners": corners, "rear": state.rear_states(built)}
 
 
-def _comfort_signals(case: Source) -> Names:
+def _comfort_signals(case: Source) -> dict[str, Any]:
     names = ("heading", "vx", "ax", "ay", "omega", "alpha")
     states = ego_states({name: case[f"sig_in_{name}"] for name in names})
     signals = comfort_signals(case.take("sig_in_time_us", -1), states)
@@ -153,7 +150,7 @@ def _comfort_signals(case: Source) -> Names:
     return {"signals": signals, **{name: [*flags, all(flags)] for name, flags in within.items()}}
 
 
-def _idm_steps(case: Source) -> Names:
+def _idm_steps(case: Source) -> dict[str, Any]:
     (progress, speed), (lead, lead_speed, rear) = case["agent"].tolist(), case["lead"].tolist()
     given = speed, lead - progress - rear, lead_speed, *case.take("params", 5).tolist()
     distance, after = idm_step(*given, float(case["dt_s"]))

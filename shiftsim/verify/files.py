@@ -8,7 +8,7 @@ maps that files refer to, in nuPlan's own formats.
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import cached_property, partial
@@ -34,6 +34,7 @@ EXACT = 0.0
 MAPPING: LogMapping = (15.0, 0.0, 0.5)  # the reference scenes start at their tag
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 DAMAGED = "the file is damaged, or not what its name says; make it or get it again"
+Named: TypeAlias = Mapping[str, Any]  # values by name
 Key: TypeAlias = tuple[str, ...]  # of rows that belong together
 # Tolerance of all, or by name, "" being that of all others; exact where there is none
 Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
@@ -45,7 +46,7 @@ class Source:
 
     name: str  # name of the file without its ending; begins the names of compared quantities
     what: str  # what one of its values is called
-    values: Mapping[str, Any]  # all values by name
+    values: Named  # all of them
     report: Report  # receives the comparisons
     # names of the values that were read or noted; shared by all parts of a file
     used: set[str] = field(default_factory=set)
@@ -118,7 +119,7 @@ class Source:
     def match(
         self,
         where: str,
-        ours: Mapping[str, Any],
+        ours: Named,
         atol: Tolerances = EXACT,
         *,
         quantity: str | None = None,
@@ -170,7 +171,8 @@ def read_index(text: str) -> Any:
 
 
 Compare: TypeAlias = Callable[[Source, str], object]  # of a file or case, and what it is called
-Parts: TypeAlias = Mapping[str, Callable[[Path], object] | None]  # by pattern of names
+Files: TypeAlias = Mapping[str, Compare]  # by pattern of names
+Parts: TypeAlias = Mapping[str, Callable[[Path], object] | None]  # likewise
 
 
 def read_file(path: Path, report: Report, name: str = "") -> Source:
@@ -191,9 +193,8 @@ def read_file(path: Path, report: Report, name: str = "") -> Source:
             raise DataError(f"{path}: not a readable Parquet file ({error})", DAMAGED) from error
         return Source(name, "column", columns, report)
     content = read_json(path)
-    return Source(
-        name, "field", {"rows": content} if isinstance(content, list) else content, report
-    )
+    fields = {"rows": content} if isinstance(content, list) else content
+    return Source(name, "field", fields, report)
 
 
 def read_json(path: Path) -> Any:
@@ -223,9 +224,7 @@ class Groups(dict[Key, Source]):
         """Keys of what the report is about: of the runs of its mode, or all."""
         return [key for key in self if self._mode is None or self._mode in key]
 
-    def match(
-        self, key: Key, ours: Mapping[str, Any], atol: Tolerances | None = None, **options: Any
-    ) -> bool:
+    def match(self, key: Key, ours: Named, atol: Tolerances | None = None, **options: Any) -> bool:
         """`Source.match` for the rows of a key."""
         return self[key].match(" ".join(key), ours, self.atol if atol is None else atol, **options)
 
@@ -278,10 +277,6 @@ class Scenes:
         self.folder, self.entries = folder, {entry["scene"]: entry for entry in entries}
         self.mapping, self._read = mapping, dict[str, Scenario]()
 
-    def keys(self) -> KeysView[str]:
-        """Names of the scenes."""
-        return self.entries.keys()
-
     def __getitem__(self, scene: str) -> Scenario:
         if scene not in self._read:
             entry = self.entries[scene]
@@ -297,11 +292,6 @@ class Scenes:
         files = find_maps(self.folder / "maps")
         return {name: load_map(files, name) for name in files}
 
-    def sources(self, scene: str) -> tuple[Path, Path]:
-        """Log and map file of a scene."""
-        entry = self.entries[scene]
-        return self.folder / entry["db"], find_maps(self.folder / "maps")[entry["map"]]
-
 
 def verify_file(compare: Compare, path: Path, report: Report) -> None:
     """`compare` the values of a file; those that it does not use are not covered.
@@ -314,9 +304,7 @@ def verify_file(compare: Compare, path: Path, report: Report) -> None:
         file.finish()
 
 
-def verify_files(
-    folder: Path, report: Report, parts: Parts, files: Mapping[str, Compare] | None = None
-) -> None:
+def verify_files(folder: Path, report: Report, parts: Parts, files: Files | None = None) -> None:
     """Give every file of a folder to the part whose pattern is the first to match its name.
 
     A part compares such a file or sub-folder, and what it raises is a mismatch; it is None where

@@ -62,8 +62,8 @@ def _compare_reference_lines(od: OpenDrive, file: Source, path: Path) -> None:
     for (name,), rows in roads.items():
         where, road, s = f"{path.stem} road {name}", od.roads[name], rows["s"]
         line = ReferenceLine(road.geometries)
-        ours = {"poses": line.evaluate(s), "kinds": line.kinds(s)}
-        TABLES["refline"].match(rows, where, **ours, **_bounds(line, s))
+        ours = {"poses": line.evaluate(s), "kinds": line.kinds(s), **_bounds(line, s)}
+        TABLES["refline"].match(rows, where, **ours)
         compare("road extent", where, [0.0, road.stated_length], s[[0, -1]], atol=EXACT)
         compare("heading is wrapped", where, np.abs(rows["hdg"]).max() <= np.pi, True)
 
@@ -121,11 +121,11 @@ def _compare_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
 
 
 def _compare_summary(od: OpenDrive, file: Source, path: Path) -> None:
-    where, compare = path.stem, file.report.compare
+    where, compare, roads = path.stem, file.report.compare, od.roads.values()
     TABLES["summary"].match(file, where, od=od, path=path, **_summarize(od))
-    along, center = np.sum([(0.0, 0.0), *map(_driving_lengths, od.roads.values())], axis=0)
+    along, center = np.sum([(0.0, 0.0), *map(_driving_lengths, roads)], axis=0)
     lengths = {"driving_s_length_m": along, "driving_centreline_length_m": center}
-    lengths["road_length_sum_m"] = sum(road.stated_length for road in od.roads.values())
+    lengths["road_length_sum_m"] = sum(road.stated_length for road in roads)
     for key, length in lengths.items():
         atol = max(LENGTH_SHARE * abs(file[key]), LENGTH)
         file.match(where, {key: float(length)}, atol, quantity="summary")
@@ -140,7 +140,6 @@ def _compare_summary(od: OpenDrive, file: Source, path: Path) -> None:
 
 
 def _summarize(od: OpenDrive) -> dict[str, Any]:
-    """What `opendrive.toml` speaks of."""
     lanes, roads, links = _lanes(od), od.roads.values(), lane_links(od, Counter())
     joints = [np.array(ReferenceLine(road.geometries).joints()) for road in roads]
     gap, turn = np.concatenate([np.zeros((2, 1)), *joints], axis=1).max(axis=1)
@@ -151,15 +150,12 @@ def _summarize(od: OpenDrive) -> dict[str, Any]:
         for kind in (kind for kind in _TALLIES if name.startswith(f"{kind} ")):
             tallies[kind][name.removeprefix(f"{kind} ")] = count
     num_driving = tallies["lane type"].get("driving", 0)
-    return {
-        **{"counts": Counter(od.counts), "tallies": tallies, "links": links, "driving": driving},
-        "num_lanes": sum(tallies["lane type"].values()),
-        "num_driving": num_driving,
-        "num_ends": num_driving - len({start for start, _ in driving}),
-        "crosswalks": [thing for road in roads for thing in road.objects if is_crosswalk(thing)],
-        **{"gap": gap, "turn": turn, "bound": CUBIC if cubics else EXACT},
-        "stretch": max(map(arc_length_deviation, cubics), default=0.0),
-    }
+    names = {"counts": Counter(od.counts), "tallies": tallies, "links": links, "driving": driving}
+    names |= {"num_driving": num_driving, "num_lanes": sum(tallies["lane type"].values())}
+    names["num_ends"] = num_driving - len({start for start, _ in driving})
+    names["crosswalks"] = [item for road in roads for item in road.objects if is_crosswalk(item)]
+    names["stretch"] = max(map(arc_length_deviation, cubics), default=0.0)
+    return {**names, "gap": gap, "turn": turn, "bound": CUBIC if cubics else EXACT}
 
 
 def _driving_lengths(road: Road) -> tuple[float, float]:

@@ -53,7 +53,7 @@ _FAILURES = {  # what interPlan raises, and what our message says
 def verify_scenario_edits(folder: Path, report: Report, scenes: Path | None = None) -> None:
     """Compare everything in the folder; `scenes` holds logs and maps."""
     world = Scenes(scenes or folder.parent / "nuplan", mapping=WINDOW)
-    if not world.keys():
+    if not world.entries:
         raise DataError(
             f"{world.folder}: no scenes.json", "say where the scenes are, with --scenes"
         )

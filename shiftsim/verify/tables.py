@@ -18,7 +18,7 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.files import read_toml
-from shiftsim.verify.files import EXACT, Scenes, Source, read_file, read_index, read_json
+from shiftsim.verify.files import EXACT, Scenes, Source, read_file, read_index
 from shiftsim.verify.report import Report
 
 Row: TypeAlias = Any  # a path, text or number; a path and a tolerance; rows by name
@@ -55,12 +55,11 @@ def read_tables(*modules: str) -> dict[str, Table]:
 
 def _joined(rows: Mapping[str, Row], more: Mapping[str, Row]) -> dict[str, Row]:
     """Rows and further ones, also within a row that is rows by name."""
-    inner = {
-        name: _joined(rows[name], more[name])
-        for name in more
-        if isinstance(more[name], dict) and name in rows
-    }
-    return {**rows, **more, **inner}
+    joined = {**rows, **more}
+    for name in rows:
+        if isinstance(more.get(name), dict):
+            joined[name] = _joined(rows[name], more[name])
+    return joined
 
 
 def verify_cases(
@@ -71,10 +70,17 @@ def verify_cases(
     Cases are the entries of a `.json`; arrays whose names begin with the same number, `3_name`; the
     rows of all arrays.
     """
-    cases = _read_cases(path, report)
+    file = read_file(path, report)
+    if path.suffix == ".json":
+        cases = [Source(path.name, "field", case, report) for case in file["rows"]]
+    elif next(iter(file))[0].isdigit():
+        numbers = sorted({int(name.split("_")[0]) for name in file})
+        cases = [file.below(f"{number}_") for number in numbers]
+    else:
+        cases = rows_of(file)
     for number, case in enumerate(cases):
         scene = case["scene"] if scenes is not None else ""
-        if scenes is not None and scene not in scenes.keys():
+        if scenes is not None and scene not in scenes.entries:
             report.skip(f"{path.name}: scene {scene}, which is not at hand")
             continue
         where = f"{path.stem} {number} {scene}".strip()
@@ -82,16 +88,6 @@ def verify_cases(
             compare(case, where, *([] if scenes is None else [scenes[scene]]))
         if case.rows is None or case is cases[-1]:  # rows share what was used
             case.finish()
-
-
-def _read_cases(path: Path, report: Report) -> list[Source]:
-    if path.suffix == ".json":
-        return [Source(path.name, "field", case, report) for case in read_json(path)]
-    file = read_file(path, report)
-    if next(iter(file))[0].isdigit():
-        numbers = sorted({int(name.split("_")[0]) for name in file})
-        return [file.below(f"{number}_") for number in numbers]
-    return rows_of(file)
 
 
 def rows_of(file: Source) -> list[Source]:

@@ -116,8 +116,7 @@ def read_map(world: Source, *fields: str) -> VectorMap:
         stop_polygons=_areas(stops.items()),
     )
     # an edge of a map without blocks is in none
-    lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
-    if lost:
+    if lost := [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]:
         raise DataError(f"ids that name nothing: {', '.join(lost)}")
     return road
 
@@ -188,11 +187,9 @@ def _compare_world(world: Source, where: str) -> None:
     order = list(BOUNDED_SIGNALS.values())
     expected.match(where, {"comfort_flag_order": order}, quantity="")
     series, found = expected.each("series")[0], found_along(measured, road)
-    names = {
-        **{"result": result, "counts": at_fault_counts(measured.collisions), "flags": flags},
-        "inside": ~measured.drivable.outside.any(axis=1),
-        "ttc": np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values),
-    }
+    names = {"result": result, "counts": at_fault_counts(measured.collisions), "flags": flags}
+    names["inside"] = ~measured.drivable.outside.any(axis=1)
+    names["ttc"] = np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values)
     TABLES["series"].match(series, where, **found, **names)
     progress = {one.name: one.value for one in result.statistics}
     TABLES["progress"].match(series.each("progress_statistics")[0], where, statistics=progress)

@@ -25,7 +25,8 @@ def demo(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scenes(nuplan_reference):
-    return dict(Scenes(nuplan_reference))
+    scenes = Scenes(nuplan_reference)
+    return {name: scenes[name] for name in scenes.entries}
 
 
 def rows_outside(log, road):

@@ -9,7 +9,6 @@ from shiftsim.planners.learned.carl.view import CHANNELS, in_picture, picture_fr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.verify.files import TOLERANCE, Source
 from shiftsim.verify.nets import common
-from shiftsim.verify.nets.common import Loop
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
@@ -30,7 +29,6 @@ def _verify_forward(file: Source) -> None:
 
 
 def _outputs(network: Any, pictures: Any, measured: Any, told: Any) -> dict[str, Any]:
-    """What the network says of a batch."""
     import torch
     from torch.distributions import Beta
 
@@ -59,7 +57,7 @@ def _verify_decoding(file: Source) -> None:
         case.below("out.").match(f"{file.name} {number}", ours, TOLERANCE)
 
 
-def compare(loop: Loop) -> None:
+def compare(loop: common.Loop) -> None:
     """Compare picture, outputs and command of one iteration."""
     pictures, measured = loop.features
     theirs = loop.stored.take("bev_semantics", *pictures.shape)
@@ -75,7 +73,7 @@ def compare(loop: Loop) -> None:
         loop.match("drawn", cache, **_drawn(loop))
 
 
-def _drawn(loop: Loop) -> dict[str, Any]:
+def _drawn(loop: common.Loop) -> dict[str, Any]:
     """What was drawn, in this order: rows of the layers of the map, and of the tracks."""
     road, tracks, found = loop.road, loop.seen.tracks, loop.planner.found
     layer = np.searchsorted([road.num_roadblocks, len(road.blocks)], found, "right")

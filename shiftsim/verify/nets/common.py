@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.data.nuplan.scenarios import find_maps
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.features import PLAN_POSES
@@ -44,7 +45,6 @@ STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
 
 # As in state.STATE_COLUMNS, in the words of the files.
 FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_acceleration")
-PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
 # how one official planner fails where it has no reference line; ours falls back there
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
 
@@ -72,9 +72,7 @@ def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None
     if is_network and find_spec("torch") is None:
         report.skip(f"{part}: torch is not installed")
         return
-    files: dict[str, Callable[[Source], None]] = {
-        "route_correction_*.json": partial(verify_corrections, scenes)
-    }
+    files: dict[str, Any] = {"route_correction_*.json": partial(verify_corrections, scenes)}
     if is_network:
         module = import_module(f"shiftsim.verify.nets.{part}")
         files = {"closed_loop_*.npz": partial(verify_loop, module, scenes), **module.FILES}
@@ -88,7 +86,7 @@ def _verify(compare: Callable[[Source], None], report: Report, scenes: Scenes, p
     """Compare one file, if its scene is at hand."""
     file = read_file(path, report)
     scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
-    if scene is not None and scene not in scenes.keys():
+    if scene is not None and scene not in scenes.entries:
         report.skip(f"{path.name}: scene {scene}, which is not at hand")
         return
     compare(file)
@@ -183,10 +181,9 @@ class Loop:
         if "command" in self.row:
             self.rollout.advance(state.Command(*self.row["command"].tolist()))
         else:
-            plan, time_us = self.row["trajectory"], self.row["trajectory_time_us"]
-            states = np.zeros((len(plan), state.NUM_STATE))
-            states[:, :PLAN_COLUMNS] = plan
-            self.rollout.advance(state.Trajectory(time_us, states))
+            plan = self.row["trajectory"]  # pose, velocity, acceleration
+            states = np.pad(plan, ((0, 0), (0, state.NUM_STATE - plan.shape[1])))
+            self.rollout.advance(state.Trajectory(self.row["trajectory_time_us"], states))
 
     def compare(self, quantity: str, ours: object, theirs: object, atol: float = 0.0) -> None:
         """Compare one quantity of this iteration."""
@@ -208,16 +205,14 @@ def verify_loop(module: Any, scenes: Scenes, file: Source) -> None:
     egos, plans = file["ego/current"], file.below("out/")
     counts = [len(plans[name.partition("[")[0]]) for name in loop.tables["iteration"].rows]
     loop.compare("plans", counts, counts[:1] * len(counts))
-    paths, meta = scenes.sources(str(file["meta/scene"])), file.below("meta/")
+    entry, meta = scenes.entries[str(file["meta/scene"])], file.below("meta/")
+    paths = scenes.folder / entry["db"], find_maps(scenes.folder / "maps")[entry["map"]]
     content = [path.read_bytes() for path in paths]
-    names = {
-        "md5": [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content],
-        "crc32": [zlib.crc32(data) for data in content],
-        "paths": [path.relative_to(scenes.folder).as_posix() for path in paths],
-        "columns": FILE_COLUMNS,
-        "past": past_rows(loop.scenario, 0),
-        "time_us": loop.scenario.iteration_times[: len(egos)],
-    }
+    names = {"columns": FILE_COLUMNS, "past": past_rows(loop.scenario, 0)}
+    names["time_us"] = loop.scenario.iteration_times[: len(egos)]
+    names["md5"] = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
+    names["crc32"] = [zlib.crc32(data) for data in content]
+    names["paths"] = [path.relative_to(scenes.folder).as_posix() for path in paths]
     loop.match("scene", meta, "scene", **names)
     loop.match("sources", meta, "scene", **names)
     loop.match("ego", file.below("ego/"), **names)

@@ -17,7 +17,6 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common
-from shiftsim.verify.nets.common import Loop, make_planner, match_meta
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import tracks_of
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
@@ -75,7 +74,7 @@ def _verify_forward(file: Source) -> None:
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
     inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
-    network = make_planner(KeyedPlanner, "base").network
+    network = common.make_planner(KeyedPlanner, "base").network
     scene = network.normalise(inputs)
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
@@ -95,7 +94,7 @@ def _sampled(variant: str, scene: Any, inputs: Any, start: Any) -> dict[str, Any
     from shiftsim.planners.learned.diffusion.network import sampler
     from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
 
-    network = make_planner(KeyedPlanner, variant).network
+    network = common.make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
     prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
     seen, made = [], []
@@ -113,7 +112,7 @@ def _sampled(variant: str, scene: Any, inputs: Any, start: Any) -> dict[str, Any
     return {**calls, "plain": plain, "guided": guided, "times": sampler.SCHEDULE.call_times}
 
 
-def compare(loop: Loop) -> None:
+def compare(loop: common.Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
     loop.match("iteration", loop.row)
     if list(loop.stored):
@@ -126,7 +125,7 @@ def compare(loop: Loop) -> None:
 
 def _verify_agents(file: Source) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
-    match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
+    common.match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
     if f"in.frame{kernels.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
     made = builder.agent_features(_tracks(file), file.take("in.anchor", 3))
@@ -136,28 +135,26 @@ def _verify_agents(file: Source) -> None:
 
 def _tracks(file: Source) -> Tracks:
     """The frames as tracks, in the order of the last frame; static objects after them."""
-    frames = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
-    last = len(frames) - 1
+    names = sorted(n for n in file if n.startswith("in.frame") and not n.endswith("_type"))
+    last = len(names) - 1
     rows = [
         (row, AgentKind(kind).name, *values)
         for row in range(last, -1, -1)
-        for kind, values in zip(
-            file[f"{frames[row]}_type"], file[frames[row]].tolist(), strict=True
-        )
+        for kind, values in zip(file[f"{names[row]}_type"], file[names[row]].tolist(), strict=True)
     ]
     static = zip(file["in.static_type"], file["in.static"].tolist(), strict=True)
     rows += [
         (last, _STATIC[kind], f"static {number}", np.nan, np.nan, heading, width, length, x, y)
         for number, (kind, (x, y, heading, width, length)) in enumerate(static)
     ]
-    names, values = ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True))
-    columns = dict(zip(names, values, strict=True))
+    titles = ("iteration", "type", *_TRACK_COLUMNS)
+    columns = dict(zip(titles, map(np.array, zip(*rows, strict=True)), strict=True))
     return tracks_of(Source(file.name, "column", columns, file.report), last + 1)
 
 
 def _verify_lanes(file: Source) -> None:
     """Which lanes and route lanes are kept where there are too many, and their rows."""
-    match_meta(file, NAME, light="green, yellow, red, unknown")
+    common.match_meta(file, NAME, light="green, yellow, red, unknown")
     anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
     lines, left, right = (_lines(file, n) for n in ("lane", "left_boundary", "right_boundary"))
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}

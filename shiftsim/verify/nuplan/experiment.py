@@ -20,7 +20,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Scenes, Source, Tolerances, read_file
-from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, POSE, light_columns
+from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, light_columns
 from shiftsim.verify.nuplan.runs import (
     CATEGORIES,
     CHALLENGES,
@@ -65,6 +65,7 @@ _NO_METRICS = {
     "num_scenarios",
     "aggregator_type",
 }
+POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
 _RUNTIMES = (("mean", np.mean), ("median", np.median), ("std", np.std))
 
 FindScenario = Callable[[str], Scenario | None]  # by token; None where there is none
@@ -127,7 +128,7 @@ def _find_in(folder: Path, scenes: Path | None, store: str | None) -> FindScenar
         opened = open_named_store(store)
         return lambda token: opened.read_recorded(token) if token in opened else None
     listed = Scenes(scenes or folder.resolve().parent / "nuplan")
-    if not listed.keys():
+    if not listed.entries:
         raise DataError(
             f"{folder}: nothing says where the scenarios are",
             hint="--store NAME; shiftsim convert nuplan LOGS MAPS --store NAME makes it",

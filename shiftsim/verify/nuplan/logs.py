@@ -28,32 +28,20 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, EgoState
 
 LOG_TOLERANCES: dict[str, float] = COMPARED["log_ego.parquet"]["atol"]
-POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
 TABLES = read_tables(__file__)
-# What log_ego also holds: samples asked for, horizon in rows, direction, from which iteration
-_EXCERPTS = {
-    "past_2s": (20, 40, -1, 0),
-    "future_8s_of_iteration_0": (80, 160, 1, 0),
-    "future_8s_of_last_iteration": (16, 160, 1, -1),
-}
 _MAX_SECONDS = 60.0  # nuPlan looks so far ahead at most for a route
 _ROW, _SAMPLE = 0.05, 0.1  # s, nominal distance of log rows and of the samples asked for
 # of the tiny world, and of what the devkit read from it
 _MAPPING: Mapping = (15.0, -3.0, 0.5)  # README of the folder
-_TYPE = "near_multiple_vehicles"
 _POINT = np.array([30.0, -1.75, 0.0])  # m, where the map is asked
 _NEAR = 80.0  # m, half width of the square of `proximal`
 _DRIVABLE = np.array([[30.0, 0.0], [100.0, -6.0], [30.0, -8.0], [210.0, -6.0]])
 _ORIGINS = {32632: np.array([600000.0, 5300000.0, 0.0])}  # of the poses, by coordinate system
-_PARTS = ("ego_t0", "lane", "connector", "roadblock", "proximal")
 # columns of `map_lines` and `map_queries`
 _AXES = ("x", "y", "heading")
-_LINES = ("baseline", "left_boundary", "right_boundary")
 _EDGES = ("LANE", "LANE_CONNECTOR")
 _NEAR_POINT = 20.0  # m, half width of the square of the `near20` columns
-_HOLDING = (*_EDGES, "ROADBLOCK", "ROADBLOCK_CONNECTOR", "INTERSECTION", "CROSSWALK")  # points
-_NEARBY = (*_EDGES, "STOP_LINE")  # lie there
-_ASKED = ("DRIVABLE_AREA", "INTERSECTION")  # whether a point lies in one
+_ASKED = COMPARED["asked"]  # layers, by what is asked of them
 
 
 def verify_nuplan_import(folder: Path, report: Report) -> None:
@@ -76,20 +64,18 @@ def verify_nuplan_import(folder: Path, report: Report) -> None:
             named = sorted(script["name"] for script in entry["scripts"])
             report.compare("scenes.json scripts", name, drawn, named)
             rows = {"iteration": scene.iteration_rows}
-            for kind, (*sampled, at) in _EXCERPTS.items():
+            for kind, (*sampled, at) in COMPARED["excerpts"].items():
                 rows[kind] = excerpt_rows(scene.time_us, int(scene.iteration_times[at]), *sampled)
             for kind, read in rows.items():
                 ours = {"index": np.arange(len(read)), "time_us": scene.time_us[read]}
                 ego.match((name, kind), ours | ego_columns(scene.ego[read]))
             objects.match((name, "NR", "*"), _objects(scene, log), LOG_TOLERANCES)
             lights.match((name,), light_columns(scene))
-    ego.finish()
-    lights.finish()
     read_here = {folder / name for name in ("scenes.json", "scripted.parquet", "RESULTS.md")}
-    meta.finish()
-    for entry in scenes.entries.values():
-        entry.finish()
-        read_here.add(folder / entry["db"])
+    read_here |= {folder / entry["db"] for entry in scenes.entries.values()}
+    used: list[Groups | Source] = [ego, lights, meta, *scenes.entries.values()]
+    for source in used:
+        source.finish()
     name_rest(folder, {*expected.iterdir(), *read_here}, report)
     report.note("RESULTS.md (for reading; repeats scores.parquet)")
     report.note("maps/*.json: raster layers of the index (not used for planning)")
@@ -106,7 +92,6 @@ def name_rest(folder: Path, read: set[Path], report: Report) -> None:
 
 
 def _facts(scene: Scenario, log: Log) -> dict[str, Any]:
-    """What `logs.toml` speaks of."""
     times, begin = scene.iteration_times, log.row_of[scene.token]
     # nuPlan rule 602: both stamps become seconds first, the difference is cut to microseconds
     duration = float(times[-1]) * 1e-6 - float(times[0]) * 1e-6
@@ -166,14 +151,13 @@ def verify_nuplan_format(folder: Path, report: Report) -> None:
     with report.attempt("readback", path.name):
         names = _read_back(folder, logs[0])
         TABLES["readback"].match(expected, path.name, **names)
-        for part in _PARTS:
+        for part in ("ego_t0", "lane", "connector", "roadblock", "proximal"):
             TABLES[part].match(expected.each(part)[0], path.name, **names)
     expected.finish()
     name_rest(folder, {*logs, path}, report)
 
 
 def _read_back(folder: Path, path: Path) -> dict[str, Any]:
-    """What `format.toml` speaks of."""
     with open_log(path) as log:
         tagged = [[t, i] for t, i in zip(log.types, log.tokens, strict=True) if t != "unknown"]
         start, road = int(log.time_us[0]), load_map(find_maps(folder / "maps"), log.map_name)
@@ -185,7 +169,7 @@ def _read_back(folder: Path, path: Path) -> dict[str, Any]:
     near = world.get_proximal_map_objects(place, _NEAR, world.get_available_map_objects())
     return {
         **{"scene": scene, "ego": ego, "tagged": tagged, "listed": list_scenarios(path)},
-        "listed_of_type": list_scenarios(path, types=frozenset([_TYPE])),
+        "listed_of_type": list_scenarios(path, types=frozenset(["near_multiple_vehicles"])),
         "interval": 0.05 / scene.mapping[2],
         "goal": np.array(scene.mission_goal, np.float64) - origin,
         "past": excerpt_rows(scene.time_us, now, 20, 40, -1),
@@ -247,8 +231,8 @@ def _outline(shape: shapely.Polygon) -> dict[str, Any]:
 def _compare_lines(road: Any, layers: Any, city: str, lines: Groups) -> None:
     for name in _EDGES:
         for edge in road.objects(layers[name]):
-            sides = edge.baseline_path, edge.left_boundary, edge.right_boundary
-            for line, side in zip(_LINES, sides, strict=True):
+            sides = {"left_boundary": edge.left_boundary, "right_boundary": edge.right_boundary}
+            for line, side in {"baseline": edge.baseline_path, **sides}.items():
                 poses = side.discrete_path
                 ours = {"layer": [name] * len(poses), "index": np.arange(len(poses))}
                 ours |= {axis: [getattr(pose, axis) for pose in poses] for axis in _AXES}
@@ -256,27 +240,25 @@ def _compare_lines(road: Any, layers: Any, city: str, lines: Groups) -> None:
 
 
 def _compare_queries(road: Any, layers: Any, city: str, queries: Groups) -> None:
-    points = shapely.points(queries[city,]["x"], queries[city,]["y"])
-    answers = [_answer(road, layers, point) for point in points]
+    answers, nearby = [], [layers[name] for name in _ASKED["near20"]]
+    for point in shapely.points(queries[city,]["x"], queries[city,]["y"]):
+        found = {name: road.get_all_map_objects(point, layers[name]) for name in _ASKED["holding"]}
+        near = road.get_proximal_map_objects(point, _NEAR_POINT, nearby)
+        found |= {f"near20_{kind.name}": things for kind, things in near.items()}
+        answer = {name: ",".join(sorted(thing.id for thing in found[name])) for name in found}
+        answer |= {f"in_{name}": road.is_in_layer(point, layers[name]) for name in _ASKED["in"]}
+        _, away = road.get_distance_to_nearest_map_object(point, layers.DRIVABLE_AREA)
+        lane, distance = road.get_distance_to_nearest_map_object(point, layers.LANE)
+        answer["drivable_area_distance"] = away
+        along = road.source.progress_on(road.source.edge(lane), point.x, point.y)
+        answer |= {
+            "nearest_lane": lane,
+            "nearest_lane_distance": distance,
+            "lane_arc_length": along,
+        }
+        line = road.get_map_object(lane, layers.LANE).baseline_path
+        pose = line.get_nearest_pose_from_position(point)
+        answer |= {f"lane_pose_{axis}": getattr(pose, axis) for axis in _AXES}
+        arc = line.get_nearest_arc_length_from_position(point)
+        answers.append({**answer, "lane_curvature": line.get_curvature_at_arc_length(arc)})
     queries.match((city,), {name: [answer[name] for answer in answers] for name in answers[0]})
-
-
-def _answer(road: Any, layers: Any, point: shapely.Point) -> dict[str, Any]:
-    found = {name: road.get_all_map_objects(point, layers[name]) for name in _HOLDING}
-    near = road.get_proximal_map_objects(point, _NEAR_POINT, [layers[name] for name in _NEARBY])
-    found |= {f"near20_{kind.name}": things for kind, things in near.items()}
-    _, away = road.get_distance_to_nearest_map_object(point, layers.DRIVABLE_AREA)
-    lane, distance = road.get_distance_to_nearest_map_object(point, layers.LANE)
-    line = road.get_map_object(lane, layers.LANE).baseline_path
-    pose = line.get_nearest_pose_from_position(point)
-    arc = line.get_nearest_arc_length_from_position(point)
-    return {
-        **{name: ",".join(sorted(thing.id for thing in found[name])) for name in found},
-        **{f"in_{name}": road.is_in_layer(point, layers[name]) for name in _ASKED},
-        "drivable_area_distance": away,
-        "nearest_lane": lane,
-        "nearest_lane_distance": distance,
-        "lane_arc_length": road.source.progress_on(road.source.edge(lane), point.x, point.y),
-        **{f"lane_pose_{axis}": getattr(pose, axis) for axis in _AXES},
-        "lane_curvature": line.get_curvature_at_arc_length(arc),
-    }

@@ -15,7 +15,7 @@ from shiftsim.metrics import MetricResult, judge, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
+from shiftsim.sim.planner import Observation, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.verify import worlds
 from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Scenes, Source, open_tables
@@ -35,11 +35,7 @@ RUN_TABLES = "ego objects route collisions scores metrics statistics time_series
 EGO_TOLERANCES = COMPARED["ego.parquet"]["atol"]
 OBJECT_TOLERANCES = COMPARED["objects.parquet"]["atol"]
 EVERY = 10  # iterations between recorded plans; the last one is recorded as well
-CHALLENGES = {  # controller and traffic
-    "NR": ("lqr", "nonreactive"),
-    "PT": ("perfect", "nonreactive"),
-    "R": ("lqr", "reactive"),
-}
+CHALLENGES = COMPARED["challenges"]  # controller and traffic
 _SCRIPTED = "scripted_"
 
 
@@ -100,10 +96,9 @@ def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> 
 def _compare_profile(
     key: tuple[str, ...], result: MetricResult, entry: Source, tables: dict[str, Groups]
 ) -> None:
-    """Compare scores and statistics under one threshold set."""
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
     row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
-    row |= {"score": result.score}
+    row["score"] = result.score
     tables["scores"].match(key, {name: [value] for name, value in row.items()})
     tables["metrics"].match_keys(key, [(name,) for name in scores])
     for name, score in scores.items():
@@ -141,16 +136,19 @@ def verify_simulation(
     for key in dict.fromkeys([*runs.of_mode(), *reactive]):
         scene, challenge, planner = key
         with report.attempt("simulation", " ".join(key)):
-            if challenge not in CHALLENGES or scene not in scenes.keys():
+            if challenge not in CHALLENGES or scene not in scenes.entries:
                 raise DataError("no such challenge or scene")
             controller, traffic = CHALLENGES[challenge]
-            driver = _load_planner(planner, folder.parent / "scripted.parquet")
+            kind, args = planner, {}
+            if planner.startswith(_SCRIPTED):
+                kind, _, name = planner.partition("_")
+                args = {"file": str(folder.parent / "scripted.parquet"), "name": name}
+            driver = load_planner(kind.replace("_", "-"), args)
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
             samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
             runs.match(key, samples | ego_columns(log.ego), quantity="ego")
             if challenge == "R":
-                shown = _objects(log, replayed[scene, "NR", "*"])
-                objects.match(key, shown, quantity="reactive")
+                objects.match(key, _objects(log, replayed[scene, "NR", "*"]), quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
                 rated = worlds.known_scores(judge(measured, profile))
@@ -158,12 +156,6 @@ def verify_simulation(
                 scores.match((*key, thresholds), columns, quantity="simulated score")
     if report.mode in (None, "R"):
         objects.table.finish()
-
-
-def _load_planner(name: str, scripts: Path) -> Planner:
-    kind, _, script = name.partition("_") if name.startswith(_SCRIPTED) else (name, "", "")
-    args = {"file": str(scripts), "name": script} if script else {}
-    return load_planner(kind.replace("_", "-"), args)
 
 
 def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
@@ -197,7 +189,7 @@ def verify_planners(folder: Path, report: Report, scenes: Scenes) -> None:
         if name.startswith(_SCRIPTED):
             continue
         spec = name.replace("_", "-")
-        if spec not in PLANNERS or scene not in scenes.keys():
+        if spec not in PLANNERS or scene not in scenes.entries:
             report.skip(f"plans of {name} in {scene}, which is not known")
             continue
         with report.attempt("plan", " ".join(key)):
@@ -238,7 +230,7 @@ def plan_again(where: str, spec: str, seen: Seen, rows: Source) -> None:
         plan = planner.plan(seen.at(iteration))
         if iteration in recorded and isinstance(plan, Trajectory):
             ours = {"index": np.arange(len(plan.time_us)), "time_us": plan.time_us}
-            columns = dict(zip(EGO_COLUMNS, plan.states.T, strict=True))
-            ours |= {name: values for name, values in columns.items() if name in rows}
+            columns = zip(EGO_COLUMNS, plan.states.T, strict=True)
+            ours |= {name: values for name, values in columns if name in rows}
             here, at = rows.at(recorded == iteration), f"{where} iteration {iteration}"
             here.match(at, ours, TOLERANCE, quantity=f"{spec} plan")

@@ -46,11 +46,10 @@ def verify_pdm(folder: Path, report: Report, scenes: Path | None = None) -> None
         "idm_calls.json": partial(verify_idm_calls, report=report, scenes=known),
         "loop": partial(_verify_loops, report=report, scenes=known),
     }
-    if not known.keys():
+    if not known.entries:
         lack = "the logs and maps of the scenes are not at hand"
         parts = dict.fromkeys(parts, lambda path: report.skip(f"{path.name}: {lack}"))
-    kernels = partial(verify_kernels, report=report)
-    verify_files(folder, report, {"kernels": kernels, **parts})
+    verify_files(folder, report, {"kernels": partial(verify_kernels, report=report), **parts})
 
 
 def _verify_loops(folder: Path, report: Report, scenes: Scenes) -> None:
@@ -108,8 +107,7 @@ def _path(case: Source, where: str) -> None:
     path, at = make_path(poses), np.empty((len(queries), 3))
     for progress, pose in zip(queries.tolist(), at, strict=True):
         rollout.read_pose(path, progress, np.full(3, np.nan), pose)
-    points = case.take("query_xy", -1, 2).tolist()
-    projection = [project(path, x, y, 0)[0] for x, y in points]
+    projection = [project(path, *xy, 0)[0] for xy in case.take("query_xy", -1, 2).tolist()]
     ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
     ours["offset_m"] = routes.offset_poses(poses, -1.0)
     ours["offset_p"] = routes.offset_poses(poses, 1.0)
@@ -145,7 +143,6 @@ def _graph_search(case: Source, where: str) -> None:
 
 
 def _compare_route(case: Source, where: str, scenario: Scenario) -> None:
-    """Corrected route, current lane and centerline of PDM-Closed."""
     road, ego = scenario.map, np.zeros(NUM_STATE)
     case.note("label", "route_name", "pose_name")
     ego[:3] = case["rear_axle"]

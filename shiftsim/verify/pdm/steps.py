@@ -77,7 +77,6 @@ def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path)
 
 
 def _see(inputs: Source, ego: FloatArray, centerline: polylines.Path) -> Seen:
-    """What is seen in a recorded step."""
     center, things, parts = center_poses(ego[:3]), inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
     kinds, names = [kind_of(thing) for thing in things], [thing["token"] for thing in things]
