@@ -14,8 +14,8 @@ import pytest
 
 from shiftsim.runs.edits.interplan.build import apply_code
 from shiftsim.runs.scenarios import open_named_store
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.scenario_edits import WINDOW
-from shiftsim.verify.scenes import Scenes
 from shiftsim.world.edits.apply import apply_edit
 from shiftsim.world.edits.spec import make_edit
 

@@ -30,7 +30,7 @@ from shiftsim.planners.learned.owner import Ask, Owner, new_address
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")
@@ -84,7 +84,9 @@ def scenes(store, tmp_path_factory):
         with tarfile.open(REPOSITORY / "tests/golden/nuplan.tar.xz") as archive:
             archive.extractall(folder.parent)
     demo = open_store(store)
-    found = {**Scenes(folder), "bench_scene_100": bench_scene(100, 0)}
+    scenes = Scenes(folder)
+    found = {name: scenes[name] for name in scenes.entries}
+    found["bench_scene_100"] = bench_scene(100, 0)
     return {**found, "demo": demo.read(demo.tokens[0])}
 
 

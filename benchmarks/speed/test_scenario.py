@@ -23,7 +23,7 @@ from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
 from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s
@@ -37,7 +37,8 @@ def scenes(tmp_path_factory):
     with tarfile.open(GOLDEN) as archive:
         archive.extractall(folder)
     cities = {f"bench_scene_{count}": bench_scene(count, 0) for count in (100, 300)}
-    return {**Scenes(folder / "nuplan"), **cities}
+    scenes = Scenes(folder / "nuplan")
+    return {**{name: scenes[name] for name in scenes.entries}, **cities}
 
 
 @pytest.fixture(scope="module")

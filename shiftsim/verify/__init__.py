@@ -25,7 +25,7 @@ def verify(
     maps: Path | None = None,
     store: str | None = None,
 ) -> Report:
-    """Compare everything in a reference folder with what shiftsim computes.
+    """Report on a comparison of everything in a reference folder with what shiftsim computes.
 
     Args:
         folder: Reference folder.
@@ -36,26 +36,20 @@ def verify(
         maps: Folder with OpenDRIVE maps; by default a folder `maps` beside the parent of `folder`.
         store: Store with the scenarios of nuPlan's results, by name, path or URL.
 
-    Returns:
-        The report.
-
     Raises:
         DataError: The folder is of no known kind, or a file in it is broken.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
-    options = {"mode": mode, "scenes": scenes, "maps": maps, "store": store}
+    options = {"scenes": scenes, "maps": maps, "store": store}
     for name, (module, *patterns) in KINDS.items():
-        if name == kind or (kind is None and _holds(folder, patterns)):
+        fits = all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns)
+        if name == kind or (kind is None and fits):
             part = getattr(import_module(f"shiftsim.verify.{module}"), f"verify_{name}")
-            report, takes = Report(), signature(part).parameters
+            report, takes = Report(mode), signature(part).parameters
             part(folder, report, **{name: options[name] for name in options if name in takes})
             return report
     raise DataError(
         f"{folder}: not recognised as a folder of reference outputs",
         hint=f"known kinds: {', '.join(KINDS)}",
     )
-
-
-def _holds(folder: Path, patterns: list[str]) -> bool:
-    return all(any(any(folder.glob(p)) for p in either.split("|")) for either in patterns)

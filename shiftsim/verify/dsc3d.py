@@ -1,7 +1,7 @@
 """Compares DSC3D conversion with known answers: a real sample, and scripted recordings."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, product
@@ -21,13 +21,15 @@ from shiftsim.data.opendrive.map import Origin, build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
-from shiftsim.verify.files import Compare, Source, open_tables, read_table, verify_files
+from shiftsim.verify.files import Compare, Parts, Source, open_tables, read_file, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.world.state import center_poses
 
 _POSITION = 2e-2  # m: README of the scripted recordings
 _MIN_PIECE = 10  # samples; shorter pieces at the ends of a lane sequence may be missing
+_CONFIG = ConversionConfig()  # as by default
+Keys = list[list[LaneKey]]  # OpenDRIVE lanes that every row lies in
 Ways = dict[tuple[str, ...], list[list[Any]]]  # lanes that egos pass, by window and track
 FACTS = read_tables(__file__)
 _DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
@@ -37,7 +39,6 @@ class Lanes:
     """A map at its place in UTM, with the OpenDRIVE lanes behind the lanes of ours."""
 
     def __init__(self, path: Path, site: Site) -> None:
-        """Read and convert a map file."""
         self.offset, drive = site.offset[:2], read_opendrive(path)
         x, y = self.offset.tolist()
         self.road, made = build_road_map(drive, name=path.stem, offset=(x, y), epsg=site.epsg)
@@ -86,68 +87,52 @@ def verify_dsc3d_sample(folder: Path, report: Report) -> None:
     verify_files(folder, report, {"data": lambda path: report.note(_DERIVED)}, files)
 
 
-def _compare_rows(
-    file: Source, site: Site, recording: Annotations, keys: list[list[LaneKey]]
-) -> None:
+def _compare_rows(file: Source, site: Site, recording: Annotations, keys: Keys) -> None:
     """All boxes as recorded, by track and frame."""
-    utm = recording.bottom[:, :2] + site.offset[:2]
-    lanes = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
-    FACTS["rows"].match(
-        file.at(np.lexsort((file["frame_id"], file["track_id"]))),
-        "recording",
-        **{"recording": recording, "utm": utm, "lanes": lanes},
-        frames=recording.frame * site.frame_distance,
-        ids=recording.track_ids[recording.track],
-        degrees=pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T),
-    )
+    rows = file.at(np.lexsort((file["frame_id"], file["track_id"])))
+    utm, frames = recording.bottom[:, :2] + site.offset[:2], recording.frame * site.frame_distance
+    names = {"recording": recording, "track": recording.track, "utm": utm, "frames": frames}
+    names["lanes"] = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
+    degrees = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T)
+    FACTS["rows"].match(rows, "recording", degrees=degrees, **names)
 
 
 def _compare_samples(file: Source, recording: Annotations) -> None:
     """The bottoms of all boxes at 20 Hz, by track and time."""
     recording = replace(recording, centers=recording.bottom)
-    runs = find_runs(recording, ConversionConfig().max_hole_s)
+    runs = find_runs(recording, _CONFIG.max_hole_s)
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
     run = np.repeat(np.arange(len(first)), last - first + 1)
     step = np.concatenate([*map(np.arange, first, last + 1)])
     time = step * ROW_S
-    ours = {"ids": recording.track_ids[runs.track[run]], "steps": step, "time": time}
+    names = {"recording": recording, "track": runs.track[run], "step": step, "time": time}
     samples = sample_runs(recording, runs, run, time)
-    FACTS["samples"].match(file, "recording", samples=samples, **ours)
+    FACTS["samples"].match(file, "recording", samples=samples, **names)
 
 
-def _compare_summary(
-    expected: Source, site: Site, recording: Annotations, keys: list[list[LaneKey]]
-) -> None:
+def _compare_summary(expected: Source, site: Site, recording: Annotations, keys: Keys) -> None:
     report, folder = expected.report, site.folder / "annotations" / recording.name
-    raw = read_table(folder / "annotations.parquet", report)
+    raw = read_file(folder / "annotations.parquet", report)
     order = np.lexsort((raw["frame_id"], raw["track_id"]))
     velocity = np.column_stack([raw[f"velocity_{axis}"] for axis in "xyz"])[order]
-    stamps = read_table(folder / "frames.parquet", report)["time"].astype("datetime64[us]")
+    stamps = read_file(folder / "frames.parquet", report)["time"].astype("datetime64[us]")
     lag = (stamps - stamps[0]).astype(np.int64) * 1e-6 - recording.clock
     yaw, moving = recording.angles[:, 0], np.arctan2(velocity[:, 1], velocity[:, 0])
-    facts = {
-        "recording": recording,
-        "rate": 1.0 / recording.period,
-        **{n: str(stamps[i]).replace("T", " ") for n, i in {"first": 0, "last": -1}.items()},
-        "lag": np.abs(lag).max(),
-        "to_velocity": np.abs(wrap_angles(yaw - moving)).max(),
-        "to_rotation": np.abs(yaw - raw["rotation_z"][order]).max(),
-        "alone": [key for key in keys if len(key) == 1],
-        "steps": int(recording.duration / ROW_S + 1e-9) + 1,
-    }
+    facts = {"recording": recording, "rate": 1.0 / recording.period, "lag": np.abs(lag)}
+    facts |= dict(zip(("first", "last"), stamps[[0, -1]].tolist(), strict=True))
+    facts["to_velocity"] = np.abs(wrap_angles(yaw - moving))
+    facts["to_rotation"] = np.abs(yaw - raw["rotation_z"][order])
+    facts["alone"] = [key for key in keys if len(key) == 1]
+    facts["steps"] = int(recording.duration / ROW_S + 1e-9) + 1
     FACTS["summary"].match(expected, "recording", **facts)
     for number, where, track in _tracks(expected, recording):
         rows = np.flatnonzero(recording.track == number)
         lanes = {(key.road, key.lane) for row in rows for key in keys[row]}
         track.values["road_lane"].sort()
-        facts = {
-            "category": recording.categories[number],
-            "size": recording.sizes[number],
-            "speed": sorted(np.linalg.norm(velocity[rows], axis=1)),
-            "way": np.hypot(*np.diff(recording.bottom[rows, :2], axis=0).T).sum(),
-            "lanes": [list(lane) for lane in sorted(lanes)],
-        }
-        FACTS["track"].match(track, where, **facts)
+        facts = {"recording": recording, "number": number, "lanes": [*map(list, sorted(lanes))]}
+        steps = np.hypot(*np.diff(recording.bottom[rows, :2], axis=0).T)
+        speed = np.linalg.norm(velocity[rows], axis=1)
+        FACTS["track"].match(track, where, speed=speed, steps=steps, **facts)
 
 
 def _tracks(expected: Source, recording: Annotations) -> Iterator[tuple[int, str, Source]]:
@@ -164,53 +149,46 @@ def verify_dsc3d_synthetic(folder: Path, report: Report, maps: Path | None) -> N
     `folder` is one recording or holds several. Its maps lie in `maps`, or in a folder of that name
     beside the one of the references.
     """
-    parts: dict[str, Callable[[Path], object]] = {
-        path.parent.name: partial(verify_dsc3d_synthetic, report=report, maps=maps)
-        for path in folder.glob("*/expected.json")
-    }
+    inner = partial(verify_dsc3d_synthetic, report=report, maps=maps)
+    parts: Parts = {path.parent.name: inner for path in folder.glob("*/expected.json")}
     if (folder / "expected.json").is_file():
-        parts = {"data": lambda path: report.note(_DERIVED)}
-        parts["expected_ego_20hz.parquet"] = lambda path: None  # with `expected.json`
+        poses = {"expected_ego_20hz.parquet": lambda path: None}  # read with `expected.json`
+        parts = {"data": lambda path: report.note(_DERIVED), **poses}
     scripted = partial(_compare_scripted, folder=folder, maps=maps)
     verify_files(folder, report, parts, {"expected.json": scripted})
 
 
 def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | None) -> None:
-    report, name, config = expected.report, folder.name, ConversionConfig()
-    site = open_site(folder / "data")
+    report, name, site = expected.report, folder.name, open_site(folder / "data")
     recording = read_recording(site, site.recordings[0])
     FACTS["recording"].match(expected, name, recording=recording, rate=1.0 / recording.period)
     for number, where, track in _tracks(expected, recording):
-        kind, size = recording.categories[number], recording.sizes[number]
-        FACTS["scripted"].match(track, where, category=kind, size=size)
-    ways = _compare_windows(expected, recording, config, name)
+        FACTS["scripted"].match(track, where, recording=recording, number=number)
+    ways = _compare_windows(expected, recording, name)
     expected.used.add("note")
     places = [maps / expected["map"]] if maps is not None else []
     places += [folder / "data/map/map.xodr"]
     places += [parent / "maps" / expected["map"] for parent in folder.resolve().parents[:4]]
     if found := next(filter(Path.is_file, places), None):
         lanes = Lanes(found, site)
-        made = convert_recording(recording, lanes.road, lanes.offset, config)
-        _compare_scenarios(folder, made, lanes, ways, report)
+        made = convert_recording(recording, lanes.road, lanes.offset, _CONFIG)
+        _compare_made(folder, made, lanes, ways, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
 
 
-def _compare_windows(
-    expected: Source, recording: Annotations, config: ConversionConfig, name: str
-) -> Ways:
+def _compare_windows(expected: Source, recording: Annotations, name: str) -> Ways:
     """Compare windows and verdicts; what the file says of lanes, by window and ego."""
     report, ids, ways = expected.report, recording.track_ids.tolist(), Ways()
-    windows = judge_windows(recording, find_runs(recording, config.max_hole_s), config)
+    windows = judge_windows(recording, find_runs(recording, _CONFIG.max_hole_s), _CONFIG)
     wanted = expected.each("windows")
     report.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):
         where, given = f"{name} window {window.span.start_s:g} s", theirs["verdict"]
-        judged = zip(window.tracks, window.verdicts, window.partners, strict=True)
-        verdicts = {
-            str(ids[number]): verdict if partner < 0 else f"{verdict} with {ids[partner]}"
-            for number, verdict, partner in judged
-        }
+        verdicts, judged = {}, zip(window.tracks, window.verdicts, window.partners, strict=True)
+        for number, verdict, partner in judged:
+            other = f" with {ids[partner]}" if partner >= 0 else ""
+            verdicts[str(ids[number])] = f"{verdict}{other}"
         egos = [int(name) for name, verdict in verdicts.items() if verdict == EGO]
         FACTS["window"].match(theirs, where, window=window, egos=egos)
         report.compare("tracks seen", where, sorted(verdicts), sorted(given))
@@ -221,9 +199,7 @@ def _compare_windows(
     return ways
 
 
-def _compare_scenarios(
-    folder: Path, made: Converted, lanes: Lanes, ways: Ways, report: Report
-) -> None:
+def _compare_made(folder: Path, made: Converted, lanes: Lanes, ways: Ways, report: Report) -> None:
     """Poses and lanes of the converted scenarios, brought back to the local frame."""
     poses = open_tables(folder, report, "expected_ego_20hz")["expected_ego_20hz"]
     egos, seen = {ego.name: ego for ego in made.egos}, set()

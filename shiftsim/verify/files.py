@@ -2,16 +2,16 @@
 
 The values of a file are the arrays of an `.npz`, the columns of a `.parquet` or the fields of a
 `.json`. All three are a `Source`: what it hands out counts as used, `finish` names the rest as not
-covered. `match` compares values of ours with those of the same names.
+covered. `match` compares values of ours with those of the same names. `Scenes` are the logs and
+maps that files refer to, in nuPlan's own formats.
 """
 
 import json
 import re
-import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,16 +20,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
+from shiftsim.data.nuplan.mapping import Mapping as LogMapping
+from shiftsim.data.nuplan.scenarios import find_maps, load_map, read_scenario
 from shiftsim.errors import DataError
+from shiftsim.files import read_toml
 from shiftsim.verify.report import Report
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 
 # keys and tolerances of tables, and how folders are recognised
-COMPARED: dict[str, Any] = tomllib.loads(
-    (Path(__file__).parent / "compared.toml").read_text("utf-8")
-)
+COMPARED = read_toml(Path(__file__).with_name("compared.toml"))
 EXACT = 0.0
+MAPPING: LogMapping = (15.0, 0.0, 0.5)  # the reference scenes start at their tag
 TOLERANCE = 1e-9  # of floats, unless a comparison names another
 DAMAGED = "the file is damaged, or not what its name says; make it or get it again"
+Named: TypeAlias = Mapping[str, Any]  # values by name
+Key: TypeAlias = tuple[str, ...]  # of rows that belong together
 # Tolerance of all, or by name, "" being that of all others; exact where there is none
 Tolerances: TypeAlias = float | Mapping[str, ArrayLike]
 
@@ -40,7 +46,7 @@ class Source:
 
     name: str  # name of the file without its ending; begins the names of compared quantities
     what: str  # what one of its values is called
-    values: Mapping[str, Any]  # all values by name
+    values: Named  # all of them
     report: Report  # receives the comparisons
     # names of the values that were read or noted; shared by all parts of a file
     used: set[str] = field(default_factory=set)
@@ -91,9 +97,9 @@ class Source:
         values = {n.removeprefix(prefix): v for n, v in self.values.items() if n.startswith(prefix)}
         return replace(self, values=values, prefix=self.prefix + prefix)
 
-    def groups(self, *key: str) -> "dict[tuple[str, ...], Source]":
+    def groups(self, *key: str) -> "dict[Key, Source]":
         """The rows by the values of key columns, in the order of the file."""
-        groups: dict[tuple[str, ...], list[int]] = {}
+        groups: dict[Key, list[int]] = {}
         for row, values in enumerate(zip(*(self[name].tolist() for name in key), strict=True)):
             groups.setdefault(tuple(map(str, values)), []).append(row)
         return {values: self.at(np.array(rows)) for values, rows in groups.items()}
@@ -113,7 +119,7 @@ class Source:
     def match(
         self,
         where: str,
-        ours: Mapping[str, Any],
+        ours: Named,
         atol: Tolerances = EXACT,
         *,
         quantity: str | None = None,
@@ -165,29 +171,30 @@ def read_index(text: str) -> Any:
 
 
 Compare: TypeAlias = Callable[[Source, str], object]  # of a file or case, and what it is called
+Files: TypeAlias = Mapping[str, Compare]  # by pattern of names
+Parts: TypeAlias = Mapping[str, Callable[[Path], object] | None]  # likewise
 
 
-def read_arrays(path: Path, report: Report, name: str = "") -> Source:
-    """The arrays of an `.npz`; `name` is another name for it."""
-    with np.load(path, allow_pickle=False) as archive:
-        return Source(name or path.stem, "array", {n: archive[n] for n in archive.files}, report)
+def read_file(path: Path, report: Report, name: str = "") -> Source:
+    """The values of a file, which may have another `name`.
 
-
-def read_table(path: Path, report: Report) -> Source:
-    """The columns of a `.parquet`: strings are object arrays, absent values None or NaN."""
-    try:
-        table = pq.read_table(path)
-        columns = {name: table[name].to_numpy() for name in table.column_names}
-    except (OSError, UnicodeError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable Parquet file ({error})", DAMAGED) from error
-    return Source(path.stem, "column", columns, report)
-
-
-def read_fields(path: Path, report: Report, name: str = "") -> Source:
-    """The fields of a `.json`, a list as the field `rows`; `name` is another name for it."""
+    Strings of a `.parquet` are object arrays, its absent values None or NaN; a `.json` that is a
+    list has the one field `rows`.
+    """
+    name = name or path.stem
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as archive:
+            return Source(name, "array", dict(archive), report)
+    if path.suffix == ".parquet":
+        try:
+            table = pq.read_table(path)
+            columns = {column: table[column].to_numpy() for column in table.column_names}
+        except (OSError, UnicodeError, pa.ArrowException) as error:
+            raise DataError(f"{path}: not a readable Parquet file ({error})", DAMAGED) from error
+        return Source(name, "column", columns, report)
     content = read_json(path)
     fields = {"rows": content} if isinstance(content, list) else content
-    return Source(name or path.stem, "field", fields, report)
+    return Source(name, "field", fields, report)
 
 
 def read_json(path: Path) -> Any:
@@ -198,43 +205,38 @@ def read_json(path: Path) -> Any:
         raise DataError(f"{path}: not readable JSON: {error}") from error
 
 
-class Groups(dict[tuple[str, ...], Source]):
+class Groups(dict[Key, Source]):
     """The rows of a `.parquet` by key, and which of them were asked for; other keys have no rows.
 
     `atol` holds unless a comparison names another.
     """
 
     def __init__(self, table: Source, key: Sequence[str], atol: Tolerances = EXACT) -> None:
-        self.table, self.atol, self._asked = table, atol, set[tuple[str, ...]]()
+        self.table, self.atol, self._asked = table, atol, set[Key]()
+        self._mode = table.report.mode if "challenge" in key else None
         super().__init__(table.groups(*key) if table.values else {})
 
-    def __getitem__(self, key: tuple[str, ...]) -> Source:
+    def __getitem__(self, key: Key) -> Source:
         self._asked.add(key)
         return super().__getitem__(key) if key in self else self.table.at(np.zeros(0, np.int64))
 
-    def of_mode(self, mode: str | None) -> list[tuple[str, ...]]:
-        """Keys of the runs of one mode, or all."""
-        return [key for key in self if mode is None or mode in key]
+    def of_mode(self) -> list[Key]:
+        """Keys of what the report is about: of the runs of its mode, or all."""
+        return [key for key in self if self._mode is None or self._mode in key]
 
-    def match(
-        self,
-        key: tuple[str, ...],
-        ours: Mapping[str, Any],
-        atol: Tolerances | None = None,
-        **options: Any,
-    ) -> bool:
+    def match(self, key: Key, ours: Named, atol: Tolerances | None = None, **options: Any) -> bool:
         """`Source.match` for the rows of a key."""
         return self[key].match(" ".join(key), ours, self.atol if atol is None else atol, **options)
 
-    def match_keys(self, key: tuple[str, ...], ours: list[tuple[str, ...]]) -> None:
+    def match_keys(self, key: Key, ours: list[Key]) -> None:
         """Compare which keys begin with `key`, by the rest of them."""
         theirs = [name[len(key) :] for name in self if name[: len(key)] == key]
         label, where = f"{self.table.name} present", " ".join(key)
         self.table.report.compare(label, where, sorted(ours), sorted(theirs))
 
-    def finish(self, mode: str | None = None) -> None:
-        """Name rows that nothing asked for (of one mode only), and columns that nothing used."""
-        for key in self.of_mode(mode):
+    def finish(self) -> None:
+        """Name rows of the mode that nothing asked for, and columns that nothing used."""
+        for key in self.of_mode():
             if key not in self._asked:
                 self.table.report.skip(f"{self.table.name}: rows of {' '.join(key)}")
         if self._asked & set(self):
@@ -248,13 +250,47 @@ def open_tables(folder: Path, report: Report, *names: str) -> dict[str, Groups]:
     """
     tables = {}
     for path in (folder / f"{name}.parquet" for name in names):
-        if not path.is_file():
+        if path.is_file():
+            table = read_file(path, report)
+        else:
             report.skip(f"{path.name} is missing")
-        table = (
-            read_table(path, report) if path.is_file() else Source(path.stem, "column", {}, report)
-        )
+            table = Source(path.stem, "column", {}, report)
         tables[path.stem] = Groups(table, **COMPARED[path.name])
     return tables
+
+
+class Scenes:
+    """The scenarios of a nuplan reference folder by scene name, each read when first asked for.
+
+    Attributes:
+        folder: Holds `scenes.json`, `logs` and `maps`; without `scenes.json` there are no scenes.
+        entries: What `scenes.json` says, by scene name; `report` takes what is compared with it.
+        mapping: Duration [s], offset [s] and subsample ratio that the scenarios are cut with.
+    """
+
+    def __init__(
+        self, folder: Path, report: Report | None = None, mapping: LogMapping = MAPPING
+    ) -> None:
+        path, used = folder / "scenes.json", report or Report()
+        listed = read_json(path) if path.is_file() else []
+        entries = [Source("scenes.json", "field", entry, used) for entry in listed]
+        self.folder, self.entries = folder, {entry["scene"]: entry for entry in entries}
+        self.mapping, self._read = mapping, dict[str, Scenario]()
+
+    def __getitem__(self, scene: str) -> Scenario:
+        if scene not in self._read:
+            entry = self.entries[scene]
+            if entry["map"] not in self.maps:
+                raise DataError(f"{self.folder / 'scenes.json'}: unknown map {entry['map']!r}")
+            path, road = self.folder / entry["db"], self.maps[entry["map"]]
+            self._read[scene] = read_scenario(path, entry["token"], road, self.mapping)
+        return self._read[scene]
+
+    @cached_property
+    def maps(self) -> dict[str, VectorMap]:
+        """All maps of the folder by name."""
+        files = find_maps(self.folder / "maps")
+        return {name: load_map(files, name) for name in files}
 
 
 def verify_file(compare: Compare, path: Path, report: Report) -> None:
@@ -262,19 +298,13 @@ def verify_file(compare: Compare, path: Path, report: Report) -> None:
 
     The file is named without the number that its name may end with.
     """
-    read = {".npz": read_arrays, ".parquet": read_table}.get(path.suffix, read_fields)
-    file = replace(read(path, report), name=re.sub(r"_\d+$", "", path.stem))
+    file = read_file(path, report, re.sub(r"_\d+$", "", path.stem))
     compare(file, path.stem)
     if file.what != "column" or file.num_rows:
         file.finish()
 
 
-def verify_files(
-    folder: Path,
-    report: Report,
-    parts: Mapping[str, Callable[[Path], object] | None],
-    files: Mapping[str, Compare] | None = None,
-) -> None:
+def verify_files(folder: Path, report: Report, parts: Parts, files: Files | None = None) -> None:
     """Give every file of a folder to the part whose pattern is the first to match its name.
 
     A part compares such a file or sub-folder, and what it raises is a mismatch; it is None where

@@ -13,7 +13,7 @@ from shiftsim.data.opendrive.curves import ReferenceLine, arc_length_deviation
 from shiftsim.data.opendrive.lanes import LaneKey, lane_links, section_borders
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.data.opendrive.records import Lane, OpenDrive, Road
-from shiftsim.verify.files import Compare, Source, read_json, read_table, verify_files
+from shiftsim.verify.files import Compare, Source, read_file, read_json, verify_files
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 
@@ -62,8 +62,8 @@ def _compare_reference_lines(od: OpenDrive, file: Source, path: Path) -> None:
     for (name,), rows in roads.items():
         where, road, s = f"{path.stem} road {name}", od.roads[name], rows["s"]
         line = ReferenceLine(road.geometries)
-        ours = {"poses": line.evaluate(s), "kinds": line.kinds(s)}
-        TABLES["refline"].match(rows, where, **ours, **_bounds(line, s))
+        ours = {"poses": line.evaluate(s), "kinds": line.kinds(s), **_bounds(line, s)}
+        TABLES["refline"].match(rows, where, **ours)
         compare("road extent", where, [0.0, road.stated_length], s[[0, -1]], atol=EXACT)
         compare("heading is wrapped", where, np.abs(rows["hdg"]).max() <= np.pi, True)
 
@@ -81,13 +81,10 @@ def _compare_lanes(od: OpenDrive, file: Source, path: Path) -> None:
         compare("lane rows lie in their section", where, inside, True)
         line, borders = ReferenceLine(road.geometries), section_borders(road, key.section, s)
         inner, outer, poses = borders.inner[key.lane], borders.outer[key.lane], line.evaluate(s)
-        ours = {
-            "types": [lanes[key].type] * len(s),
-            **{"inner": inner, "inside": poses.offset(inner)},
-            **{"outer": outer, "outside": poses.offset(outer)},
-            "center": poses.offset(0.5 * (inner + outer)),
-        }
-        TABLES["lanes"].match(rows, where, **ours, **_bounds(line, s))
+        offsets = {"inner": inner, "outer": outer, "center": 0.5 * (inner + outer)}
+        places = {name: poses.offset(offset) for name, offset in offsets.items()}
+        names = {"types": [lanes[key].type] * len(s), "offsets": offsets, "places": places}
+        TABLES["lanes"].match(rows, where, **names, **_bounds(line, s))
 
 
 def _lanes(od: OpenDrive) -> dict[LaneKey, Lane]:
@@ -118,21 +115,18 @@ def _compare_crosswalks(od: OpenDrive, file: Source, path: Path) -> None:
         line, outline = ReferenceLine(road.geometries), "box"
         if thing.outlines:
             outline = "cornerRoad" if thing.outlines[0].on_road else "cornerLocal"
-        shape = {"origin": object_origin(line, thing), "polygon": object_rings(line, thing)[0]}
-        bounds = _bounds(line, np.array([thing.s]))
-        where = f"{path.stem} object {key}"
-        TABLES["crosswalk"].match(rows[key], where, outline=outline, **shape, **bounds)
+        names = {"origin": object_origin(line, thing), "polygon": object_rings(line, thing)[0]}
+        names |= _bounds(line, np.array([thing.s]))
+        TABLES["crosswalk"].match(rows[key], f"{path.stem} object {key}", outline=outline, **names)
 
 
 def _compare_summary(od: OpenDrive, file: Source, path: Path) -> None:
-    where, compare = path.stem, file.report.compare
+    where, compare, roads = path.stem, file.report.compare, od.roads.values()
     TABLES["summary"].match(file, where, od=od, path=path, **_summarize(od))
-    along, center = np.sum([(0.0, 0.0), *map(_driving_lengths, od.roads.values())], axis=0)
-    for key, length in {
-        "driving_s_length_m": along,
-        "driving_centreline_length_m": center,
-        "road_length_sum_m": sum(road.stated_length for road in od.roads.values()),
-    }.items():
+    along, center = np.sum([(0.0, 0.0), *map(_driving_lengths, roads)], axis=0)
+    lengths = {"driving_s_length_m": along, "driving_centreline_length_m": center}
+    lengths["road_length_sum_m"] = sum(road.stated_length for road in roads)
+    for key, length in lengths.items():
         atol = max(LENGTH_SHARE * abs(file[key]), LENGTH)
         file.match(where, {key: float(length)}, atol, quantity="summary")
     # of the largest gap; where many gaps are rounding noise, one as large as ours
@@ -146,7 +140,6 @@ def _compare_summary(od: OpenDrive, file: Source, path: Path) -> None:
 
 
 def _summarize(od: OpenDrive) -> dict[str, Any]:
-    """What `opendrive.toml` speaks of."""
     lanes, roads, links = _lanes(od), od.roads.values(), lane_links(od, Counter())
     joints = [np.array(ReferenceLine(road.geometries).joints()) for road in roads]
     gap, turn = np.concatenate([np.zeros((2, 1)), *joints], axis=1).max(axis=1)
@@ -157,15 +150,12 @@ def _summarize(od: OpenDrive) -> dict[str, Any]:
         for kind in (kind for kind in _TALLIES if name.startswith(f"{kind} ")):
             tallies[kind][name.removeprefix(f"{kind} ")] = count
     num_driving = tallies["lane type"].get("driving", 0)
-    return {
-        **{"counts": Counter(od.counts), "tallies": tallies, "links": links, "driving": driving},
-        "num_lanes": sum(tallies["lane type"].values()),
-        "num_driving": num_driving,
-        "num_ends": num_driving - len({start for start, _ in driving}),
-        "crosswalks": [thing for road in roads for thing in road.objects if is_crosswalk(thing)],
-        **{"gap": gap, "turn": turn, "bound": CUBIC if cubics else EXACT},
-        "stretch": max(map(arc_length_deviation, cubics), default=0.0),
-    }
+    names = {"counts": Counter(od.counts), "tallies": tallies, "links": links, "driving": driving}
+    names |= {"num_driving": num_driving, "num_lanes": sum(tallies["lane type"].values())}
+    names["num_ends"] = num_driving - len({start for start, _ in driving})
+    names["crosswalks"] = [item for road in roads for item in road.objects if is_crosswalk(item)]
+    names["stretch"] = max(map(arc_length_deviation, cubics), default=0.0)
+    return {**names, "gap": gap, "turn": turn, "bound": CUBIC if cubics else EXACT}
 
 
 def _driving_lengths(road: Road) -> tuple[float, float]:
@@ -194,12 +184,11 @@ def _compare_rows(file: Source, folder: Path) -> None:
         tables = [folder / f"{name}.{kind}.parquet" for kind in ("refline", "lanes")]
         compare("status", name, "compared" if tables[0].is_file() else "no golden", entry["status"])
         for table, count in zip(tables, entry.get("rows", ()), strict=False):
-            rows = read_table(table, file.report).num_rows if table.is_file() else None
+            rows = read_file(table, file.report).num_rows if table.is_file() else None
             compare("rows of the reference", name, rows, count)
         summary = folder / f"{name}.summary.json"
         if "roads_junctions" in entry and summary.is_file():
-            values = read_json(summary)
-            ours = [values["roads"], values["junctions"]]
+            ours = [read_json(summary)[thing] for thing in ("roads", "junctions")]
             compare("roads and junctions", name, ours, entry["roads_junctions"])
 
 

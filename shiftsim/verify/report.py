@@ -37,6 +37,7 @@ class Quantity:
 class Report:
     """All comparisons so far."""
 
+    mode: str | None = None  # only runs of this challenge are compared; None for all
     # tally by quantity, in the order of first appearance
     quantities: dict[str, Quantity] = field(default_factory=dict)
     mismatches: list[str] = field(default_factory=list)  # one line per case that differs

@@ -26,9 +26,8 @@ from shiftsim.runs.edits.interplan.build import SORTS, Built, assemble, build
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.scripted import Scripted, share_walked
-from shiftsim.verify.files import Source, read_fields
+from shiftsim.verify.files import Scenes, Source, read_file
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 from shiftsim.world.edits.density import safe_speed
 from shiftsim.world.edits.spec import MANNERS, make_edit
 from shiftsim.world.scenario import Scenario
@@ -54,12 +53,12 @@ _FAILURES = {  # what interPlan raises, and what our message says
 def verify_scenario_edits(folder: Path, report: Report, scenes: Path | None = None) -> None:
     """Compare everything in the folder; `scenes` holds logs and maps."""
     world = Scenes(scenes or folder.parent / "nuplan", mapping=WINDOW)
-    if not len(world):
+    if not world.entries:
         raise DataError(
             f"{world.folder}: no scenes.json", "say where the scenes are, with --scenes"
         )
 
-    parts = {name: read_fields(folder / f"{name}.json", report) for name in _PARTS}
+    parts = {name: read_file(folder / f"{name}.json", report) for name in _PARTS}
     details: dict[str, Any] = {}
     for name, compare in _PARTS.items():
         part = parts[name]

@@ -3,39 +3,23 @@
 A section has a row for every value of a reference: its name there, and where ours is, as a path
 among the names that the module hands over: through attributes, items and results of methods. A row
 with its own tolerance is a list; the row `"*"` says what holds for the others, and how the report
-calls the section; it may also name `angles` and `unordered` values (`Source.match`).
-
-    [routes]                                        # a case of routes.json
-    "*" = { called = "PDM", atol = 1e-9, optional = false }
-    start_block = "blocks of route.start.block"     # ids in a layer of the map `road`, or `tracks`
-    type = "contacts[*].kind"                       # of every one
-    incoming = "ids of lane.incoming_edges"         # of objects behind nuPlan's map interface
-    route = "text of route"                         # `,` between the words of every item
-    n_centerline = "number of line"
-    centerline_last = ["line[-1, :2]", 1e-6]        # m
-    poses = ["poses", [1e-3, 1e-3, 1e-4]]           # m, m, rad: of each column
-    "ends[..., :2]" = "line[-2:, :2]"               # a part of a value
-    score = ["score", { base = 1e-5, drive = 1e-4 }]  # by the name `variant`
-    x = ["line.x", "gap"]                           # what the module calls `gap`
-    roads = "counts[road with trams]"               # an item by name
-    planner = "= PDM-Closed *"                      # a text, which may go on in any way
-    samples = 41                                    # a number
+calls the section; it may also name `angles` and `unordered` values (`Source.match`). The words of
+rows stand in `tables.toml`, by example.
 """
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from inspect import ismethod
+from inspect import isroutine
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.verify.files import EXACT, Source, read_arrays, read_index, read_json
+from shiftsim.files import read_toml
+from shiftsim.verify.files import EXACT, Scenes, Source, read_file, read_index
 from shiftsim.verify.report import Report
-from shiftsim.world.scenario import Scenario
 
 Row: TypeAlias = Any  # a path, text or number; a path and a tolerance; rows by name
 
@@ -65,36 +49,38 @@ def read_tables(*modules: str) -> dict[str, Table]:
     """The sections of the files beside modules, given by their paths; later ones add rows."""
     sections: dict[str, Any] = {}
     for module in modules:
-        content = tomllib.loads(Path(module).with_suffix(".toml").read_text("utf-8"))
-        sections = _joined(sections, content)
+        sections = _joined(sections, read_toml(Path(module).with_suffix(".toml")))
     return {name: Table(rows) for name, rows in sections.items()}
 
 
 def _joined(rows: Mapping[str, Row], more: Mapping[str, Row]) -> dict[str, Row]:
     """Rows and further ones, also within a row that is rows by name."""
-    inner = {
-        name: _joined(rows[name], more[name])
-        for name in more
-        if isinstance(more[name], dict) and name in rows
-    }
-    return {**rows, **more, **inner}
+    joined = {**rows, **more}
+    for name in rows:
+        if isinstance(more.get(name), dict):
+            joined[name] = _joined(rows[name], more[name])
+    return joined
 
 
 def verify_cases(
-    compare: Callable[..., None],
-    path: Path,
-    report: Report,
-    scenes: Mapping[str, Scenario] | None = None,
+    compare: Callable[..., None], path: Path, report: Report, scenes: Scenes | None = None
 ) -> None:
     """`compare` every case of a file, also with its scene; cases of other scenes are not covered.
 
     Cases are the entries of a `.json`; arrays whose names begin with the same number, `3_name`; the
     rows of all arrays.
     """
-    cases = _read_cases(path, report)
+    file = read_file(path, report)
+    if path.suffix == ".json":
+        cases = [Source(path.name, "field", case, report) for case in file["rows"]]
+    elif next(iter(file))[0].isdigit():
+        numbers = sorted({int(name.split("_")[0]) for name in file})
+        cases = [file.below(f"{number}_") for number in numbers]
+    else:
+        cases = rows_of(file)
     for number, case in enumerate(cases):
         scene = case["scene"] if scenes is not None else ""
-        if scenes is not None and scene not in scenes:
+        if scenes is not None and scene not in scenes.entries:
             report.skip(f"{path.name}: scene {scene}, which is not at hand")
             continue
         where = f"{path.stem} {number} {scene}".strip()
@@ -102,16 +88,6 @@ def verify_cases(
             compare(case, where, *([] if scenes is None else [scenes[scene]]))
         if case.rows is None or case is cases[-1]:  # rows share what was used
             case.finish()
-
-
-def _read_cases(path: Path, report: Report) -> list[Source]:
-    if path.suffix == ".json":
-        return [Source(path.name, "field", case, report) for case in read_json(path)]
-    file = read_arrays(path, report)
-    if next(iter(file))[0].isdigit():
-        numbers = sorted({int(name.split("_")[0]) for name in file})
-        return [file.below(f"{number}_") for number in numbers]
-    return rows_of(file)
 
 
 def rows_of(file: Source) -> list[Source]:
@@ -168,12 +144,15 @@ def _follow(names: Mapping[str, Any], path: str) -> Any:
     for name, index in re.findall(r"(\w+)|\[(.*?)\]", path):
         if index == "*":
             found = [inner for thing in found for inner in thing]
+        elif index:
+            key = names[index] if index in names else read_index(index)
+            found = [thing[key] for thing in found]
         else:
-            found = [thing[read_index(index)] if index else _member(thing, name) for thing in found]
+            found = [_member(thing, name) for thing in found]
     return found if "[*]" in path else found[0]
 
 
 def _member(thing: Any, name: str) -> Any:
     """An item of a mapping, an attribute, or what a method returns."""
     value = thing[name] if isinstance(thing, Mapping) else getattr(thing, name)
-    return value() if ismethod(value) else value
+    return value() if isroutine(value) else value

@@ -29,10 +29,8 @@ from shiftsim.world.state import AgentKind, Tracks, tracks_of_boxes
 TABLES = read_tables(__file__)
 SCORE_TOLERANCES: dict[str, float] = COMPARED["scores.parquet"]["atol"]
 # Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
-EGO_COLUMNS = (
-    *("x", "y", "heading", "vx", "vy", "ax", "ay"),
-    *("tire_steering_angle", "tire_steering_rate", "angular_velocity", "angular_acceleration"),
-)
+_STEERING = ("tire_steering_angle", "tire_steering_rate")
+EGO_COLUMNS = (*state.STATE_COLUMNS[:7], *_STEERING, "angular_velocity", "angular_acceleration")
 CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
 BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
 _IS_CONNECTOR = {"lane": False, "connector": True, "roadblock": False, "roadblock_connector": True}
@@ -118,8 +116,7 @@ def read_map(world: Source, *fields: str) -> VectorMap:
         stop_polygons=_areas(stops.items()),
     )
     # an edge of a map without blocks is in none
-    lost = [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]
-    if lost:
+    if lost := [flaw for flaw in road.flaws if blocks or "roadblock" not in flaw]:
         raise DataError(f"ids that name nothing: {', '.join(lost)}")
     return road
 
@@ -182,27 +179,23 @@ def _compare_world(world: Source, where: str) -> None:
     kinds = road.block_of >= road.num_roadblocks
     is_connector = np.arange(len(road.edges)) >= road.num_lanes
     report.compare("kind of edges and their roadblocks", where, kinds, is_connector)
-    expected, measured = world.each("expected")[0], measure(log, road)
+    expected, measured, flags = world.each("expected")[0], measure(log, road), {}
     for name, profile in (("deepplan", DEEPPLAN), ("default", NUPLAN)):
         scores, result = expected.each(f"scores_{name}")[0], judge(measured, profile)
         scores.match(f"{where} {name}", known_scores(result), SCORE_TOLERANCES, quantity="score")
+        flags[name] = within_bounds(measured.comfort, profile)
     order = list(BOUNDED_SIGNALS.values())
     expected.match(where, {"comfort_flag_order": order}, quantity="")
     series, found = expected.each("series")[0], found_along(measured, road)
-    names = {
-        **{"result": result, "counts": at_fault_counts(measured.collisions)},
-        "inside": ~measured.drivable.outside.any(axis=1),
-        "ttc": np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values),
-        "flags": within_bounds(measured.comfort, NUPLAN),
-        "deepplan": within_bounds(measured.comfort, DEEPPLAN),
-        "statistics": {one.name: one.value for one in result.statistics},
-    }
+    names = {"result": result, "counts": at_fault_counts(measured.collisions), "flags": flags}
+    names["inside"] = ~measured.drivable.outside.any(axis=1)
+    names["ttc"] = np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values)
     TABLES["series"].match(series, where, **found, **names)
-    TABLES["progress"].match(series.each("progress_statistics")[0], where, **names)
-    contacts = series.each("collisions")
-    report.compare("number of collisions", where, len(found["types"]), len(contacts))
-    ours = zip(measured.collisions, found["types"], contacts, strict=False)
-    for contact, kind, theirs in ours:
+    progress = {one.name: one.value for one in result.statistics}
+    TABLES["progress"].match(series.each("progress_statistics")[0], where, statistics=progress)
+    listed, contacts = series.each("collisions"), measured.collisions
+    report.compare("number of collisions", where, len(contacts), len(listed))
+    for contact, kind, theirs in zip(contacts, found["types"], listed, strict=False):
         TABLES["collisions"].match(theirs, f"{where} {contact.token}", contact=contact, kind=kind)
 
 

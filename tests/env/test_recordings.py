@@ -11,7 +11,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded
-from shiftsim.verify.scenes import Scenes
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.worlds import read_world
 from shiftsim.world.state import PACIFICA, center_poses
 
@@ -25,7 +25,8 @@ def demo(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scenes(nuplan_reference):
-    return dict(Scenes(nuplan_reference))
+    scenes = Scenes(nuplan_reference)
+    return {name: scenes[name] for name in scenes.entries}
 
 
 def rows_outside(log, road):

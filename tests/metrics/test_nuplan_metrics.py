@@ -9,9 +9,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nuplan.runs import verify_nuplan_metrics
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 pytestmark = pytest.mark.golden
 TABLES = (
@@ -57,8 +57,8 @@ def test_all_recorded_rollouts_of_the_reference_agree(shared: Path) -> None:
 
 
 def test_a_mode_limits_the_runs(nuplan_reference: Path, scenes: Scenes) -> None:
-    report = Report()
-    verify_nuplan_metrics(nuplan_reference / "expected", report, scenes, "XX")
+    report = Report("XX")
+    verify_nuplan_metrics(nuplan_reference / "expected", report, scenes)
     assert report.num_cases == 0
 
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.files import Source, verify_files
+from shiftsim.verify.files import Groups, Source, verify_files
 from shiftsim.verify.report import Report
 
 
@@ -75,3 +75,18 @@ def test_files_without_a_part_are_named_and_what_breaks_a_part_is_a_mismatch(tmp
     report = Report()
     verify_files(tmp_path, report, {})
     assert set(report.not_covered) == {"file note.txt", "file broken.json"}
+
+
+@pytest.mark.parametrize(
+    ("key", "missed"),
+    [
+        (("scene", "challenge"), ["table: rows of a NR"]),
+        (("scene",), ["table: rows of a", "table: rows of b"]),
+    ],
+)
+def test_only_rows_of_runs_are_limited_to_a_mode(key, missed):
+    report = Report("NR")
+    rows = {"scene": ["a", "b"], "challenge": ["NR", "R"]}
+    columns = {name: np.array(values, object) for name, values in rows.items()}
+    Groups(Source("table", "column", columns, report), key).finish()
+    assert list(report.not_covered) == missed

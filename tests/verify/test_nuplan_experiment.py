@@ -17,7 +17,7 @@ from commands import call
 
 from shiftsim.errors import DataError, MissingExtraError
 from shiftsim.verify import verify
-from shiftsim.verify.files import read_table
+from shiftsim.verify.files import read_file
 from shiftsim.verify.nuplan import simulation_log
 from shiftsim.verify.nuplan.experiment import _compare_means
 from shiftsim.verify.nuplan.simulation_log import find_simulation_logs, read_simulation_log
@@ -132,7 +132,7 @@ def test_a_changed_mean_is_named(folder, row):
     for column in ("score", "ego_is_comfortable", "num_scenarios"):
         change(path, column, row, 1e-6)
     report = Report()
-    _compare_means(read_table(path, report))
+    _compare_means(read_file(path, report))
     name = pq.read_table(path)["scenario"][row].as_py()
     assert sorted(line.split(": ")[1] for line in report.mismatches) == [
         f"{name} SimplePlanner {column}"

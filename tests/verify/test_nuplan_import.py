@@ -12,10 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.verify.nuplan.logs import verify_nuplan_format, verify_nuplan_import
-from shiftsim.verify.nuplan.maps import verify_maps
+from shiftsim.verify.files import Scenes
+from shiftsim.verify.nuplan.logs import verify_maps, verify_nuplan_format, verify_nuplan_import
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 GOLDEN = places.GOLDEN / "nuplan_format"
 pytestmark = pytest.mark.golden

@@ -7,9 +7,9 @@ import pytest
 
 from shiftsim.errors import DataError
 from shiftsim.verify import verify
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nuplan.runs import verify_simulation
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 pytestmark = pytest.mark.golden
 
@@ -22,8 +22,8 @@ def scenes(nuplan_reference):
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "runs"), [("NR", 46), ("PT", 2)])
 def test_closed_loops_end_where_the_official_ones_do(nuplan_reference, scenes, mode, runs):
-    report = Report()
-    verify_simulation(nuplan_reference / "expected", report, scenes, mode)
+    report = Report(mode)
+    verify_simulation(nuplan_reference / "expected", report, scenes)
     assert report.mismatches == []
     assert report.quantities["ego x"].cases == runs
     scored = [q for name, q in report.quantities.items() if name.startswith("simulated score")]

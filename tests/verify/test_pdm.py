@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from shiftsim.verify import verify
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.pdm.cases import verify_kernels, verify_routes
 from shiftsim.verify.pdm.steps import verify_calls
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 GOLDEN = places.GOLDEN / "pdm"
 RUN = "s02_curve_objects"

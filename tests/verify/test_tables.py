@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from shiftsim.verify import tables
 from shiftsim.verify.files import Source
 from shiftsim.verify.report import ERRORS, Report
 from shiftsim.verify.tables import Table, read_tables, verify_cases
@@ -23,6 +24,7 @@ NAMES = {
     "road": ROAD,
     "tracks": SimpleNamespace(tokens=("t0", "t1")),
     "step": SimpleNamespace(best=2, poses=np.arange(6.0).reshape(2, 3)),
+    "third": 2,
     "made": {"lanes": [4, 5, 6], "lanes in it": 3},
     "chosen": np.array([2, 0]),
     "lane": Lane(),
@@ -41,6 +43,9 @@ def compared(rows, theirs, **names):
         ("step.best", 2, 3),
         ("made[lanes in it]", 3, 4),
         ("made.lanes", [4, 5, 6], [4, 5, 7]),
+        ("made.lanes[third]", 6, 5),
+        ("step.poses.T[chosen][0]", [2.0, 5.0], [0.0, 3.0]),
+        ("step.poses.max", 5.0, 4.0),
         ("step.poses[1, 2]", 5.0, 5.1),
         ("step.poses[-1]", [3.0, 4.0, 5.0], [3.0, 4.0, 5.1]),
         ("step.poses[:, :2]", [[0.0, 1.0], [3.0, 4.0]], [[0.0, 1.0], [3.0, 4.1]]),
@@ -189,6 +194,35 @@ def test_a_table_is_read_from_beside_the_module(tmp_path):
     tables = read_tables(str(tmp_path / "part.py"))
     assert tables["ends"].rows == {"a/b": "line[-1]"}
     assert tables["ends"].about["atol"] == 1e-9
+
+
+EXAMPLES = {
+    "start_block": ({"road": ROAD, "route": SimpleNamespace(start=SimpleNamespace(block=1))}, "B1"),
+    "type": ({"contacts": [SimpleNamespace(kind="CAR")]}, ["CAR"]),
+    "incoming": ({"lane": SimpleNamespace(incoming_edges=[SimpleNamespace(id="E0")])}, ["E0"]),
+    "route": ({"route": [["B0", "B1"], ["B2"]]}, ["B0,B1", "B2"]),
+    "n_centerline": ({"line": np.zeros((4, 3))}, 4),
+    "centerline_last": ({"line": np.eye(3)}, [1e-7, 0.0]),
+    "poses": ({"poses": np.zeros((2, 3))}, [[1e-3, 1e-3, 1e-4], [0.0, 0.0, 0.0]]),
+    "ends[..., :2]": ({"line": np.eye(3)}, [[0.0, 1.0, 9.0], [0.0, 0.0, 9.0]]),
+    "score": ({"variant": "drive", "score": 0.5}, 0.50005),
+    "x": ({"line": SimpleNamespace(x=1.0), "gap": 0.5}, 1.25),
+    "roads": ({"counts": {"road with trams": 2}}, 2),
+    "category": ({"categories": ["car", "van"], "track": 1}, "van"),
+    "best_score": ({"scores": np.array([0.5, 0.75])}, 0.75),
+    "planner": ({}, "PDM-Closed of anybody"),
+    "samples": ({}, 41),
+}
+
+
+@pytest.mark.parametrize("name", read_tables(tables.__file__)["routes"].rows)
+def test_the_examples_of_rows_mean_what_they_say(name):
+    section, (names, value) = read_tables(tables.__file__)["routes"], EXAMPLES[name]
+    report, stored = Report(), np.asarray(value) if isinstance(value, list) else value
+    one = Table({"*": section.about, name: section.rows[name]})
+    one.match(Source("file", "array", {name.partition("[")[0]: stored}, report), "case", **names)
+    assert report.mismatches == []
+    assert report.num_cases == 1
 
 
 def test_a_later_table_adds_rows_and_replaces_those_of_the_same_name(tmp_path):

@@ -1,6 +1,5 @@
 """CaRL against the official code: network, decoding, and closed loops from the scenes' own logs."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,19 +9,18 @@ from shiftsim.planners.learned.carl.view import CHANNELS, in_picture, picture_fr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.verify.files import TOLERANCE, Source
 from shiftsim.verify.nets import common
-from shiftsim.verify.nets.common import Loop
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, AgentKind
 
-NAME, TABLES = Carl.name, read_tables(__file__)
+PLANNER, NAME, TABLES = Carl, Carl.name, read_tables(__file__)
+_INPUTS = ("bev_semantics", "measurements", "value_measurements")
 _TOLD = np.ones((1, 4), np.float32)  # what the critic is told at inference
 
 
 def _verify_forward(file: Source) -> None:
     """The network on stored inputs, with each variant of the weights."""
-    names = ("bev_semantics", "measurements", "value_measurements")
-    inputs = [file[f"in.{name}"][None] for name in names]
+    inputs = [file[f"in.{name}"][None] for name in _INPUTS]
     for variant in common.match_case(file, NAME):
         says = _outputs(common.make_planner(Carl, variant).networks[0], *inputs)
         where = f"{file.name} {variant}"
@@ -31,7 +29,6 @@ def _verify_forward(file: Source) -> None:
 
 
 def _outputs(network: Any, pictures: Any, measured: Any, told: Any) -> dict[str, Any]:
-    """What the network says of a batch."""
     import torch
     from torch.distributions import Beta
 
@@ -60,7 +57,7 @@ def _verify_decoding(file: Source) -> None:
         case.below("out.").match(f"{file.name} {number}", ours, TOLERANCE)
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: common.Loop) -> None:
     """Compare picture, outputs and command of one iteration."""
     pictures, measured = loop.features
     theirs = loop.stored.take("bev_semantics", *pictures.shape)
@@ -76,7 +73,7 @@ def _compare(loop: Loop) -> None:
         loop.match("drawn", cache, **_drawn(loop))
 
 
-def _drawn(loop: Loop) -> dict[str, Any]:
+def _drawn(loop: common.Loop) -> dict[str, Any]:
     """What was drawn, in this order: rows of the layers of the map, and of the tracks."""
     road, tracks, found = loop.road, loop.seen.tracks, loop.planner.found
     layer = np.searchsorted([road.num_roadblocks, len(road.blocks)], found, "right")
@@ -98,9 +95,4 @@ def _drawn(loop: Loop) -> dict[str, Any]:
     }
 
 
-FILES = {
-    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
-    "forward_*.npz": _verify_forward,
-    "action_decode.npz": _verify_decoding,
-    "closed_loop_*.npz": partial(common.verify_loop, Carl, TABLES, _compare),
-}
+FILES = {"forward_*.npz": _verify_forward, "action_decode.npz": _verify_decoding}

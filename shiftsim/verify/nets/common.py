@@ -1,7 +1,9 @@
 """The nets folder: the learned planners with deterministic weights against the official code.
 
 Here is what is compared of all: the manifest of a network, closed loops, routes as the planners
-correct them. Weights are deterministic: anybody can make them again from the names of the tensors.
+correct them. The module of a planner has the `PLANNER`, its `TABLES`, `compare`, which looks at one
+iteration of a closed loop, and `FILES`: what compares a further file, by glob pattern.
+Weights are deterministic: anybody can make them again from the names of the tensors.
 In a closed loop a rollout of ours is moved by what is recorded; the planner sees it, and what it
 says is compared.
 """
@@ -10,46 +12,39 @@ import hashlib
 import json
 import re
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
-from inspect import signature
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
+from shiftsim.data.nuplan.scenarios import find_maps
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
+from shiftsim.planners.learned.features import PLAN_POSES
 from shiftsim.planners.learned.match import network_module
+from shiftsim.planners.learned.plan_states import STEP
 from shiftsim.planners.routes import correction
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import past_rows
-from shiftsim.verify.files import Source, read_arrays, read_fields, verify_files
+from shiftsim.verify.files import Scenes, Source, read_file, verify_files
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
-from shiftsim.verify.tables import Table, read_tables
+from shiftsim.verify.tables import read_tables
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 
-Tables: TypeAlias = Mapping[str, Table]  # by section
 TABLES = read_tables(__file__)
-PARTS = {  # sub-folder → module with `FILES`: what compares a file, by glob pattern
-    "carl": "carl",
-    "diffusion_planner": "diffusion",
-    "plantf": "plantf",
-    "pluto": "pluto",
-    "route_correction": "common",
-}
+PARTS = ("carl", "diffusion_planner", "plantf", "pluto", "route_correction")  # sub-folders
 SQUARE = 1.0  # m, half width
 STATE = 1e-8  # m, rad, m/s, …: logged and simulated ego states
 
 # As in state.STATE_COLUMNS, in the words of the files.
 FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_acceleration")
-PLAN_COLUMNS = 7  # of a state, in stored plans: pose, velocity, acceleration
 # how one official planner fails where it has no reference line; ours falls back there
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
 
@@ -59,7 +54,10 @@ def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> 
 
     `scenes` holds the logs and maps, by default `nuplan` beside `nets`.
     """
-    home, part = folder.resolve().parent, _part_of(folder)
+    home, manifest = folder.resolve().parent, folder / "state_dict.json"
+    part = read_file(manifest, Report())["planner"] if manifest.is_file() else ""
+    if any(folder.glob("route_correction_*.json")):
+        part = "route_correction"
     known = Scenes(scenes or (home.parent if part in PARTS else home) / "nuplan")
     if part in PARTS:
         verify_part(part, folder, report, known)
@@ -68,34 +66,30 @@ def verify_nets(folder: Path, report: Report, *, scenes: Path | None = None) -> 
         verify_files(folder, report, parts)
 
 
-def _part_of(folder: Path) -> str:
-    """Which part a folder is by itself; empty where it holds the parts."""
-    if any(folder.glob("route_correction_*.json")):
-        return "route_correction"
-    manifest = folder / "state_dict.json"
-    return str(read_fields(manifest, Report())["planner"]) if manifest.is_file() else ""
-
-
 def verify_part(part: str, folder: Path, report: Report, scenes: Scenes) -> None:
     """Compare every file of a sub-folder, whose name as in `PARTS` is `part`."""
     is_network = part != "route_correction"
     if is_network and find_spec("torch") is None:
         report.skip(f"{part}: torch is not installed")
         return
-    files = import_module(f"shiftsim.verify.nets.{PARTS[part]}").FILES
+    files: dict[str, Any] = {"route_correction_*.json": partial(verify_corrections, scenes)}
+    if is_network:
+        module = import_module(f"shiftsim.verify.nets.{part}")
+        files = {"closed_loop_*.npz": partial(verify_loop, module, scenes), **module.FILES}
+        files["state_dict.json"] = partial(verify_manifest, module)
     parts = {pattern: partial(_verify, files[pattern], report, scenes) for pattern in files}
     with import_module("torch").no_grad() if is_network else nullcontext():
         verify_files(folder, report, parts)
 
 
-def _verify(compare: Any, report: Report, scenes: Scenes, path: Path) -> None:
-    """Compare one file, with its scenes if it asks for them and has one that is at hand."""
-    file = (read_arrays if path.suffix == ".npz" else read_fields)(path, report)
+def _verify(compare: Callable[[Source], None], report: Report, scenes: Scenes, path: Path) -> None:
+    """Compare one file, if its scene is at hand."""
+    file = read_file(path, report)
     scene = next((str(file[name]) for name in ("meta/scene", "scene") if name in file), None)
-    if scene is not None and scene not in scenes:
+    if scene is not None and scene not in scenes.entries:
         report.skip(f"{path.name}: scene {scene}, which is not at hand")
         return
-    compare(file, *([scenes] if "scenes" in signature(compare).parameters else []))
+    compare(file)
     file.finish()
 
 
@@ -117,13 +111,14 @@ def match_case(file: Source, planner: str) -> list[str]:
     return variants
 
 
-def verify_manifest(planner: str, tables: Tables, file: Source, /, **names: Any) -> None:
+def verify_manifest(compared: Any, file: Source) -> None:
     """Compare `state_dict.json`: names, shapes, types, rules and weights, and the other fields.
 
-    Section `manifest` of the tables has these, among `names`; `weights` has by field which weights
-    it counts, as a pattern of their names: the trainable ones if it says so.
+    Section `manifest` of the tables has these; `weights` has by field which weights it counts, as
+    a pattern of their names: the trainable ones if it says so.
     """
-    report, module = file.report, network_module(planner)
+    report, tables, planner = file.report, compared.TABLES, compared.PLANNER.name
+    module = network_module(planner)
     network, rules = module.build_network(), getattr(module, "RULES", {})
     built = {name: value.detach().numpy() for name, value in network.state_dict().items()}
     trained = {name for name, _ in network.named_parameters()}
@@ -149,8 +144,9 @@ def verify_manifest(planner: str, tables: Tables, file: Source, /, **names: Any)
         layer: {"C": len(head.gain), **{name: list(v) for name, v in asdict(head).items()}}
         for layer, head in getattr(module, "DRIVE_HEADS", {}).items()
     }
-    scales, called = getattr(module, "DRIVE_SCALES", {}), f"{planner} manifest"
-    names |= {"network": module, "heads": heads, "scales": scales}
+    called, made = f"{planner} manifest", import_module(compared.PLANNER.__module__)
+    names = {"network": module, "heads": heads, "scales": getattr(module, "DRIVE_SCALES", {})}
+    names |= {"planner": made, "step": STEP, "future": PLAN_POSES * STEP}
     tables["manifest"].match(file, file.name, called, **names)
     counts = {}
     for field, pattern in tables["weights"].rows.items():
@@ -163,13 +159,11 @@ def verify_manifest(planner: str, tables: Tables, file: Source, /, **names: Any)
 class Loop:
     """One closed-loop file, and its iteration that is compared just now."""
 
-    def __init__(
-        self, file: Source, make: Callable[[str], Any], tables: Tables, scenario: Scenario
-    ) -> None:
-        self.file, self.tables, self.where = file, {**TABLES, **tables}, file.name
+    def __init__(self, module: Any, file: Source, scenario: Scenario) -> None:
+        self.file, self.tables, self.where = file, {**TABLES, **module.TABLES}, file.name
         self.scenario, self.road, self.tracks = scenario, scenario.map, scenario.tracks
         self.variant = str(file["meta/variant"])  # of its weights
-        self.planner = make_planner(make, self.variant)  # after this iteration
+        self.planner = make_planner(module.PLANNER, self.variant)  # after this iteration
         self.name, self.rollout = self.planner.name, Rollout(scenario, self.planner)
 
     def step(self, number: int) -> None:
@@ -187,10 +181,9 @@ class Loop:
         if "command" in self.row:
             self.rollout.advance(state.Command(*self.row["command"].tolist()))
         else:
-            plan, time_us = self.row["trajectory"], self.row["trajectory_time_us"]
-            states = np.zeros((len(plan), state.NUM_STATE))
-            states[:, :PLAN_COLUMNS] = plan
-            self.rollout.advance(state.Trajectory(time_us, states))
+            plan = self.row["trajectory"]  # pose, velocity, acceleration
+            states = np.pad(plan, ((0, 0), (0, state.NUM_STATE - plan.shape[1])))
+            self.rollout.advance(state.Trajectory(self.row["trajectory_time_us"], states))
 
     def compare(self, quantity: str, ours: object, theirs: object, atol: float = 0.0) -> None:
         """Compare one quantity of this iteration."""
@@ -203,23 +196,26 @@ class Loop:
         self.tables[section].match(theirs, self.where, called, **{**vars(self), **names})
 
 
-def verify_loop(
-    make: Callable[[str], Any],
-    tables: Tables,
-    compare: Callable[[Loop], None],
-    file: Source,
-    scenes: Scenes,
-) -> None:
-    """Make every step of a closed loop again, and `compare` it.
+def verify_loop(module: Any, scenes: Scenes, file: Source) -> None:
+    """Make every step of a closed loop again, and compare it.
 
-    `make` makes the planner from the name of its weights; the arrays of section `iteration` have a
-    row for every plan.
+    The arrays of section `iteration` of the tables have a row for every plan.
     """
-    loop = Loop(file, make, tables, scenes[str(file["meta/scene"])])
+    loop = Loop(module, file, scenes[str(file["meta/scene"])])
     egos, plans = file["ego/current"], file.below("out/")
-    counts = [len(plans[name.partition("[")[0]]) for name in tables["iteration"].rows]
+    counts = [len(plans[name.partition("[")[0]]) for name in loop.tables["iteration"].rows]
     loop.compare("plans", counts, counts[:1] * len(counts))
-    _compare_scene(loop, scenes, len(egos))
+    entry, meta = scenes.entries[str(file["meta/scene"])], file.below("meta/")
+    paths = scenes.folder / entry["db"], find_maps(scenes.folder / "maps")[entry["map"]]
+    content = [path.read_bytes() for path in paths]
+    names = {"columns": FILE_COLUMNS, "past": past_rows(loop.scenario, 0)}
+    names["time_us"] = loop.scenario.iteration_times[: len(egos)]
+    names["md5"] = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
+    names["crc32"] = [zlib.crc32(data) for data in content]
+    names["paths"] = [path.relative_to(scenes.folder).as_posix() for path in paths]
+    loop.match("scene", meta, "scene", **names)
+    loop.match("sources", meta, "scene", **names)
+    loop.match("ego", file.below("ego/"), **names)
     failure = f"iteration {counts[0]}: {FAILURE}" if counts[0] < len(egos) else ""
     loop.compare("failure", failure, str(file["meta/error"]))
     for number, ego in enumerate(egos):
@@ -228,51 +224,24 @@ def verify_loop(
         # where the official planner failed, ours says that its answer is a fallback
         loop.compare("fallback", bool(loop.planner.degraded), number == counts[0])
         if number < counts[0]:
-            compare(loop)
+            module.compare(loop)
             loop.advance()
 
 
-def _compare_scene(loop: Loop, scenes: Scenes, count: int) -> None:
-    """Compare what the file says about its scene, and which files that was made from."""
-    rows, paths = past_rows(loop.scenario, 0), scenes.sources(str(loop.file["meta/scene"]))
-    content, meta = [path.read_bytes() for path in paths], loop.file.below("meta/")
-    names = {
-        "md5": [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content],
-        "crc32": [zlib.crc32(data) for data in content],
-        "paths": [path.relative_to(scenes.folder).as_posix() for path in paths],
-        "columns": FILE_COLUMNS,
-        "ego": loop.scenario.ego[rows],
-        "past_us": loop.scenario.time_us[rows],
-        "time_us": loop.scenario.iteration_times[:count],
-    }
-    loop.match("scene", meta, "scene", **names)
-    loop.match("sources", meta, "scene", **names)
-    loop.match("ego", loop.file.below("ego/"), **names)
-
-
-def verify_corrections(file: Source, scenes: Scenes) -> None:
+def verify_corrections(scenes: Scenes, file: Source) -> None:
     """Correct every route of a file as the learned planners do."""
     scenario = scenes[str(file["scene"])]
+    road, size = scenario.map, np.array([state.PACIFICA.length, state.PACIFICA.width])
     TABLES["corrected_scene"].match(file, file.name, scenario=scenario)
     for number, case in enumerate(file.each("cases")):
-        at = f"{file.name} {number} ({case['case']})"
-        with file.report.attempt("corrected route", at):
-            _compare_correction(case, at, scenario)
-
-
-def _compare_correction(case: Source, where: str, scenario: Scenario) -> None:
-    road, rear_axle = scenario.map, np.array(case["rear_axle"], np.float64).reshape(3)
-    if case["case"] == "as_logged":
-        TABLES["logged"].match(case, where, scenario=scenario)
-    blocks = correction.known_blocks(road, case["route"], "of the file", "route correction")
-    size = np.array([state.PACIFICA.length, state.PACIFICA.width])
-    footprint = boxes_to_corners(state.center_poses(rear_axle), size)
-    start = correction.find_start(road, blocks, rear_axle, footprint)
-    ours = {
-        "square": correction.RouteCorrector(road, blocks, SQUARE).at(rear_axle),
-        "footprint": correction.correct_route(road, blocks, start),
-    }
-    TABLES["corrections"].match(case, where, road=road, **ours)
-
-
-FILES = {"route_correction_*.json": verify_corrections}
+        where = f"{file.name} {number} ({case['case']})"
+        with file.report.attempt("corrected route", where):
+            rear_axle = np.array(case["rear_axle"], np.float64).reshape(3)
+            if case["case"] == "as_logged":
+                TABLES["logged"].match(case, where, scenario=scenario)
+            blocks = correction.known_blocks(road, case["route"], "of the file", "route correction")
+            square = correction.RouteCorrector(road, blocks, SQUARE).at(rear_axle)
+            corners = boxes_to_corners(state.center_poses(rear_axle), size)
+            start = correction.find_start(road, blocks, rear_axle, corners)
+            around = {"square": square, "footprint": correction.correct_route(road, blocks, start)}
+            TABLES["corrections"].match(case, where, road=road, **around)

@@ -1,7 +1,8 @@
 """PlanTF, and what its comparisons share with PLUTO's: features, inputs and outputs of networks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,15 +10,16 @@ import numpy as np
 from shiftsim.planners.learned import features as builder
 from shiftsim.planners.learned.match import network_module
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
-from shiftsim.planners.learned.plantf import planner as plantf
+from shiftsim.planners.learned.plantf.planner import PlanTF, make_batch
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
-from shiftsim.verify.nets.common import Loop, Tables, make_planner, verify_loop, verify_manifest
-from shiftsim.verify.tables import read_tables
+from shiftsim.verify.nets.common import Loop, make_planner
+from shiftsim.verify.tables import Table, read_tables
 
+Tables: TypeAlias = Mapping[str, Table]  # by section
 Outputs: TypeAlias = Callable[[Any, Any], dict[str, Any]]  # of a network, from its inputs
 
-NAME, TABLES = plantf.PlanTF.name, read_tables(__file__)
+PLANNER, TABLES = PlanTF, read_tables(__file__)
 FEATURE = 5e-5  # m, rad, …: features are stored as 32 bit floats
 LAYERS = np.array(["LANE", "LANE_CONNECTOR", "CROSSWALK"])
 CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
@@ -33,7 +35,6 @@ def compare_features(loop: Loop, agents: Any, road: Any, route: Any, **names: An
         **{"agents": agents, "near": road, "route": route, "layers": LAYERS[road.kind]},
         "agent_tokens": ["ego", *(loop.tracks.tokens[i] for i in agents.tracks)],
         "map_ids": [ids[row] for row in road.objects],
-        "ego": loop.seen.history.ego[-1],
         "targets": np.zeros((len(agents.valid), 0, 3)),
         "sides": np.tile(np.arange(3), (len(road.kind), 1)),
     }
@@ -48,13 +49,8 @@ def compare_network(loop: Loop, outputs: Outputs, batch: Any, *sections: str) ->
         loop.match(section, loop.stored.below("net/"), f"({loop.variant})", **ours)
 
 
-def verify_forward(
-    planner: Any, tables: Tables, outputs: Outputs, radius: float, file: Source
-) -> None:
-    """Compare the network alone, on synthetic inputs as the official code batched them.
-
-    `radius` [m] is that of the features.
-    """
+def verify_forward(planner: Any, tables: Tables, outputs: Outputs, file: Source) -> None:
+    """Compare the network alone, on synthetic inputs as the official code batched them."""
     import torch
 
     variant, stored, tensors = str(file["meta/variant"]), file.below("in/"), {}
@@ -68,6 +64,7 @@ def verify_forward(
         called = f"{planner.name} ({variant})"
         table.match(file.below("out/"), file.name, called, variant=variant, **ours)
     codes = {tables["inputs"].rows[field] for field in CODES if field in tensors}
+    radius = import_module(planner.__module__).RADIUS  # m, of the features
     _compare_inputs(stored, planner.name, radius, {*codes, "map.polygon_road_block_id"})
     file.note("the network does not read them", "in/origin", "in/angle")
     file.note("the network does not read the yaw rate, the last value of in/current_state")
@@ -134,24 +131,17 @@ def _outputs(network: Any, inputs: Any) -> dict[str, Any]:
     return {**made, "poses": likeliest(made["trajectory"], made["probability"])}
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: Loop) -> None:
     """Compare features, raw outputs and plan of one iteration."""
-    recorded = loop.row["trajectory"][1:, :3]
-    again = plan_of_poses(recorded, loop.seen.history)
+    again = plan_of_poses(loop.row["trajectory"][1:, :3], loop.seen.history)
     loop.match("iteration", loop.row)
     loop.match("motion", loop.row, "recorded", again=again)
     if list(loop.stored):
         agents, road, state, route = loop.features
         # the official code gives every agent the category of the ego at inference
-        others = {"state": state, "category": np.zeros(len(agents.valid), np.int64)}
-        compare_features(loop, agents, road, route, **others)
-        batch = plantf.make_batch([loop.features], "cpu")
-        compare_network(loop, _outputs, batch, "outputs", "large")
+        category = np.zeros(len(agents.valid), np.int64)
+        compare_features(loop, agents, road, route, state=state, category=category)
+        compare_network(loop, _outputs, make_batch([loop.features], "cpu"), "outputs", "large")
 
 
-MANIFEST = partial(verify_manifest, builder=builder, history=2.0, future=builder.PLAN_POSES * STEP)
-FILES = {
-    "state_dict.json": partial(MANIFEST, NAME, TABLES, planner=plantf),
-    "forward_*.npz": partial(verify_forward, plantf.PlanTF, TABLES, _outputs, plantf.RADIUS),
-    "closed_loop_*.npz": partial(verify_loop, plantf.PlanTF, TABLES, _compare),
-}
+FILES = {"forward_*.npz": partial(verify_forward, PlanTF, TABLES, _outputs)}

@@ -10,17 +10,15 @@ from shiftsim.planners.learned.pluto import brake, inputs, planner, scoring
 from shiftsim.planners.learned.pluto.proposals import headings_of
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common, plantf
-from shiftsim.verify.nets.common import Loop
 from shiftsim.verify.tables import read_tables, rows_of
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY
 
-NAME, TABLES = planner.Pluto.name, read_tables(plantf.__file__, __file__)
+PLANNER, TABLES = planner.Pluto, read_tables(plantf.__file__, __file__)
 NEAR_TIE = 1e-4  # between the two best final scores; below it the choice may differ
 LINE = 1e-9  # m, rad: reference lines are made by the same operations
 
 
 def _verify_brake(file: Source) -> None:
-    """Unit cases of the emergency brake."""
     file.match("file", {"columns": list(common.FILE_COLUMNS)})
     for number, case in enumerate(rows_of(file)):
         ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
@@ -49,20 +47,26 @@ def _outputs(network: Any, batch: Any) -> dict[str, Any]:
     }
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: common.Loop) -> None:
     """Compare everything stored of one iteration."""
     from shiftsim.planners.learned.pluto.network import Inputs
 
     choice, stored = loop.planner.choice, loop.stored.below("post/")
     loop.match("choice", stored)
-    parts = (stored["multi"], stored["weighted"], stored["progress"])
+    parts = (stored[name] for name in ("multi", "weighted", "progress"))
     progress, rule = scoring.aggregate(*parts)
     loop.match("aggregated", stored, "aggregated", progress=progress, rule=rule)
     if "agent_tokens" in loop.stored:  # one of the iterations stored in full
         _compare_sight(loop)
         batch = Inputs(*inputs.stack([loop.features], "cpu"))
         plantf.compare_network(loop, _outputs, batch, "outputs")
-        _compare_from_stored(loop, stored)
+        # what the scores of the stored proposals are, against the stored predictions
+        agents, proposals = choice.agents, np.ascontiguousarray(stored["cand"])
+        agents = agents._replace(poses=stored["agents_pred"], speeds=stored["agents_vel"])
+        again = loop.planner.rate(loop.seen, proposals, stored["lscore"], agents)
+        line = scoring.nearest_line(loop.planner.sight.lines, loop.seen.history.ego[-1])
+        loop.match("from_sight", stored, line=line)
+        loop.match("from_stored", stored, "stored proposals'", scores=again.scores)
     best, total = int(loop.row["best_index"]), stored["rule"] + 0.3 * stored["lscore"]
     first, second = np.sort(total)[-2:][::-1] if len(total) > 1 else (np.inf, 0.0)
     if choice.best != best and first - second <= NEAR_TIE:
@@ -72,7 +76,7 @@ def _compare(loop: Loop) -> None:
         loop.match("iteration", loop.row)
 
 
-def _compare_sight(loop: Loop) -> None:
+def _compare_sight(loop: common.Loop) -> None:
     """Compare what was made before the network."""
     sight, given, road = loop.planner.sight, loop.features, loop.road
     near, lines = sight.road, sight.lines
@@ -80,19 +84,19 @@ def _compare_sight(loop: Loop) -> None:
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
     ]
-    made = {"blocks": np.array(blocks, np.int64), "projection": np.zeros((len(lines), 8, 2))}
-    made |= {"inputs": given, "state": given.current_state, "category": given.category}
-    route = loop.planner.route.blocks
-    plantf.compare_features(loop, sight.agents, near, route, **made)
+    names = {"blocks": np.array(blocks, np.int64), "projection": np.zeros((len(lines), 8, 2))}
+    names["inputs"] = given
+    plantf.compare_features(loop, sight.agents, near, loop.planner.route.blocks, **names)
     stored = loop.stored.below("reference_line_")
     loop.compare("reference lines", len(lines), len(list(stored)))
     numbered = {str(number): line for number, line in enumerate(lines)}
     stored.match(loop.where, numbered, LINE, quantity=f"{loop.name} reference line")
     # the official code takes static objects out of a set: their order means nothing
-    theirs, pose = loop.stored.below("feature/static_objects."), given.object_pose
-    order, their_order = _by_place(pose[:, :2]), _by_place(theirs["position"])
-    ours = {name: value[order] for name, value in given._asdict().items() if "object" in name}
-    loop.match("static_objects", theirs.at(their_order), "static_objects", **ours)
+    theirs = loop.stored.below("feature/static_objects.")
+    names = {"inputs": given, "order": _by_place(given.object_pose[:, :2])}
+    loop.match(
+        "static_objects", theirs.at(_by_place(theirs["position"])), "static_objects", **names
+    )
 
 
 def _by_place(positions: Any) -> Any:
@@ -100,22 +104,5 @@ def _by_place(positions: Any) -> Any:
     return np.lexsort(np.rint(np.asarray(positions, np.float64) * 100.0).T[::-1])
 
 
-def _compare_from_stored(loop: Loop, stored: Source) -> None:
-    """Compare what the scores of the stored proposals are, against the stored predictions."""
-    motion = {"poses": stored["agents_pred"], "speeds": stored["agents_vel"]}
-    agents = loop.planner.choice.agents._replace(**motion)
-    proposals = np.ascontiguousarray(stored["cand"])
-    again = loop.planner.rate(loop.seen, proposals, stored["lscore"], agents)
-    line = scoring.nearest_line(loop.planner.sight.lines, loop.seen.history.ego[-1])
-    loop.match("from_sight", stored, line=line)
-    loop.match("from_stored", stored, "stored proposals'", scores=again.scores)
-
-
-FILES = {
-    "state_dict.json": partial(plantf.MANIFEST, NAME, TABLES, planner=planner),
-    "forward_*.npz": partial(
-        plantf.verify_forward, planner.Pluto, TABLES, _outputs, planner.RADIUS
-    ),
-    "closed_loop_*.npz": partial(common.verify_loop, planner.Pluto, TABLES, _compare),
-    "emergency_brake.npz": _verify_brake,
-}
+_FORWARD = partial(plantf.verify_forward, planner.Pluto, TABLES, _outputs)
+FILES = {"forward_*.npz": _FORWARD, "emergency_brake.npz": _verify_brake}

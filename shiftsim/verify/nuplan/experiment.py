@@ -19,8 +19,8 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
-from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
-from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, POSE, light_columns
+from shiftsim.verify.files import EXACT, TOLERANCE, Groups, Scenes, Source, Tolerances, read_file
+from shiftsim.verify.nuplan.logs import LOG_TOLERANCES, light_columns
 from shiftsim.verify.nuplan.runs import (
     CATEGORIES,
     CHALLENGES,
@@ -39,7 +39,6 @@ from shiftsim.verify.nuplan.simulation_log import (
     read_simulation_log,
 )
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.worlds import (
     EGO_COLUMNS,
     SCORE_TOLERANCES,
@@ -66,6 +65,7 @@ _NO_METRICS = {
     "num_scenarios",
     "aggregator_type",
 }
+POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
 _RUNTIMES = (("mean", np.mean), ("median", np.median), ("std", np.std))
 
 FindScenario = Callable[[str], Scenario | None]  # by token; None where there is none
@@ -98,7 +98,6 @@ class Run:
 def verify_experiment(
     folder: Path,
     report: Report,
-    mode: str | None = None,
     scenes: Path | None = None,
     store: str | None = None,
 ) -> None:
@@ -117,8 +116,8 @@ def verify_experiment(
         )
     find = _find_in(folder, scenes, store)
     for path in sorted(made):
-        challenge = _challenge(path, mode)
-        if mode in (None, challenge):
+        challenge = _challenge(path, report.mode)
+        if report.mode in (None, challenge):
             _verify_results(path, challenge, find, report)
 
 
@@ -129,7 +128,7 @@ def _find_in(folder: Path, scenes: Path | None, store: str | None) -> FindScenar
         opened = open_named_store(store)
         return lambda token: opened.read_recorded(token) if token in opened else None
     listed = Scenes(scenes or folder.resolve().parent / "nuplan")
-    if not len(listed):
+    if not listed.entries:
         raise DataError(
             f"{folder}: nothing says where the scenarios are",
             hint="--store NAME; shiftsim convert nuplan LOGS MAPS --store NAME makes it",
@@ -192,7 +191,7 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
     """Tables by name; their rows by scenario, which a column names, and planner."""
     found = {}
     for file in sorted(folder.glob(f"{pattern}.parquet")):
-        table = read_table(file, report)
+        table = read_file(file, report)
         has_means = "num_scenarios" in table
         for name in (token, "planner_name", *(("scenario_type",) if has_means else ())):
             if name not in table:

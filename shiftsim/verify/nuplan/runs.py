@@ -4,7 +4,6 @@ A recorded rollout is scored by us and by the official stack. A simulated run is
 recorded one state by state; a reactive one object by object too, a scored one score by score.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,12 @@ from shiftsim.metrics import MetricResult, judge, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
+from shiftsim.sim.planner import Observation, observe_log, scene_info
 from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.verify import worlds
-from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Source, open_tables
+from shiftsim.verify.files import COMPARED, EXACT, TOLERANCE, Groups, Scenes, Source, open_tables
 from shiftsim.verify.nuplan.logs import verify_nuplan_import
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import EGO_COLUMNS, SCORE_TOLERANCES, ego_columns, ego_states
 from shiftsim.world.map import VectorMap
@@ -34,37 +32,27 @@ PROFILES = {"default": "nuplan", "deepplan": "deepplan"}
 # how the devkit files each metric, and the units of scores that have one
 RECORDED, CATEGORIES, UNITS = (COMPARED[what] for what in ("recorded", "category", "unit"))
 RUN_TABLES = "ego objects route collisions scores metrics statistics time_series".split()
-EGO_TOLERANCES, OBJECT_TOLERANCES = (
-    COMPARED[f"{name}.parquet"]["atol"] for name in ("ego", "objects")
-)
+EGO_TOLERANCES = COMPARED["ego.parquet"]["atol"]
+OBJECT_TOLERANCES = COMPARED["objects.parquet"]["atol"]
 EVERY = 10  # iterations between recorded plans; the last one is recorded as well
-CHALLENGES = {  # controller and traffic
-    "NR": ("lqr", "nonreactive"),
-    "PT": ("perfect", "nonreactive"),
-    "R": ("lqr", "reactive"),
-}
+CHALLENGES = COMPARED["challenges"]  # controller and traffic
 _SCRIPTED = "scripted_"
 
 
-def verify_nuplan(folder: Path, report: Report, mode: str | None = None) -> None:
+def verify_nuplan(folder: Path, report: Report) -> None:
     """Compare every table of the folder; of one mode only its runs, but the importer always."""
     scenes = Scenes(folder)
     with report.attempt("importer", folder.name):
         verify_nuplan_import(folder, report)
     for verify in (verify_planners, verify_simulation, verify_nuplan_metrics):
         with report.attempt(verify.__name__, folder.name):
-            verify(folder / "expected", report, scenes, mode)
+            verify(folder / "expected", report, scenes)
 
 
 def verify_nuplan_metrics(
-    expected: Path,
-    report: Report,
-    scenes: Scenes,
-    mode: str | None = None,
-    *,
-    logged: Path | None = None,
+    expected: Path, report: Report, scenes: Scenes, logged: Path | None = None
 ) -> None:
-    """Score the recorded rollout of every run of `ego.parquet` (of one mode).
+    """Score the recorded rollout of every run of `ego.parquet`.
 
     `expected` holds the tables of the runs, and where there is no `logged` those of the logs.
     """
@@ -72,7 +60,7 @@ def verify_nuplan_metrics(
     replayed = open_tables(logged, report, "objects")["objects"] if logged else tables["objects"]
     experts = open_tables(logged or expected, report, "log_ego")["log_ego"]
     tables["objects"].table.note("no metric reads it", "height")
-    for run in tables["ego"].of_mode(mode):
+    for run in tables["ego"].of_mode():
         scene, challenge, _ = run
         with report.attempt("recorded rollout", " ".join(run)):
             entry, road = scenes.entries[scene], scenes.maps[scenes.entries[scene]["map"]]
@@ -95,7 +83,7 @@ def verify_nuplan_metrics(
                 if profile == "nuplan":
                     _compare_series(run, result, tables["time_series"])
     for table in tables.values():
-        table.finish(mode)
+        table.finish()
 
 
 def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> SimulationLog:
@@ -108,10 +96,9 @@ def _rollout(rows: Source, expert: Source, objects: Source, road: VectorMap) -> 
 def _compare_profile(
     key: tuple[str, ...], result: MetricResult, entry: Source, tables: dict[str, Groups]
 ) -> None:
-    """Compare scores and statistics under one threshold set."""
     scores = {name: np.nan if s is None else s for name, s in result.scores.items()}
     row = {"scenario": entry["token"], "scenario_type": entry["scenario_type"], **scores}
-    row |= {"score": result.score}
+    row["score"] = result.score
     tables["scores"].match(key, {name: [value] for name, value in row.items()})
     tables["metrics"].match_keys(key, [(name,) for name in scores])
     for name, score in scores.items():
@@ -137,46 +124,38 @@ def _compare_series(run: tuple[str, ...], result: MetricResult, table: Groups) -
 
 
 def verify_simulation(
-    folder: Path,
-    report: Report,
-    scenes: Mapping[str, Scenario],
-    mode: str | None = None,
-    *,
-    logged: Path | None = None,
+    folder: Path, report: Report, scenes: Scenes, logged: Path | None = None
 ) -> None:
-    """Simulate every run of `ego.parquet` (of one mode) and compare states, objects and scores.
+    """Simulate every run of `ego.parquet` and compare states, objects and scores.
 
     `scripted.parquet` is beside the folder; `logged` has the table of logged objects.
     """
     runs, objects, scores = open_tables(folder, report, "ego", "objects", "scores").values()
     replayed = open_tables(logged, report, "objects")["objects"] if logged else objects
-    reactive = [key for key in objects.of_mode(mode) if key[1] == "R"]
-    for key in dict.fromkeys([*runs.of_mode(mode), *reactive]):
+    reactive = [key for key in objects.of_mode() if key[1] == "R"]
+    for key in dict.fromkeys([*runs.of_mode(), *reactive]):
         scene, challenge, planner = key
         with report.attempt("simulation", " ".join(key)):
-            if challenge not in CHALLENGES or scene not in scenes:
+            if challenge not in CHALLENGES or scene not in scenes.entries:
                 raise DataError("no such challenge or scene")
             controller, traffic = CHALLENGES[challenge]
-            driver = _load_planner(planner, folder.parent / "scripted.parquet")
+            kind, args = planner, {}
+            if planner.startswith(_SCRIPTED):
+                kind, _, name = planner.partition("_")
+                args = {"file": str(folder.parent / "scripted.parquet"), "name": name}
+            driver = load_planner(kind.replace("_", "-"), args)
             log = simulate(scenes[scene], driver, controller=controller, traffic=traffic)
             samples = {"iteration": np.arange(len(log.time_us)), "time_us": log.time_us}
             runs.match(key, samples | ego_columns(log.ego), quantity="ego")
             if challenge == "R":
-                shown = _objects(log, replayed[scene, "NR", "*"])
-                objects.match(key, shown, quantity="reactive")
+                objects.match(key, _objects(log, replayed[scene, "NR", "*"]), quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
                 rated = worlds.known_scores(judge(measured, profile))
                 columns = {name: [score] for name, score in rated.items()}
                 scores.match((*key, thresholds), columns, quantity="simulated score")
-    if mode in (None, "R"):
+    if report.mode in (None, "R"):
         objects.table.finish()
-
-
-def _load_planner(name: str, scripts: Path) -> Planner:
-    kind, _, script = name.partition("_") if name.startswith(_SCRIPTED) else (name, "", "")
-    args = {"file": str(scripts), "name": script} if script else {}
-    return load_planner(kind.replace("_", "-"), args)
 
 
 def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
@@ -202,17 +181,15 @@ def _objects(log: SimulationLog, replayed: Source) -> dict[str, Any]:
     return {**ours, "height": [heights.get(pair, np.nan) for pair in pairs]}
 
 
-def verify_planners(
-    folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
-) -> None:
-    """Plan again at every iteration of `trajectories.parquet` (of one mode) and compare states."""
+def verify_planners(folder: Path, report: Report, scenes: Scenes) -> None:
+    """Plan again at every iteration of `trajectories.parquet` and compare states."""
     plans, egos, objects = open_tables(folder, report, "trajectories", "ego", "objects").values()
-    for key in dict.fromkeys([*egos.of_mode(mode), *plans.of_mode(mode)]):
+    for key in dict.fromkeys([*egos.of_mode(), *plans.of_mode()]):
         scene, challenge, name = key
         if name.startswith(_SCRIPTED):
             continue
         spec = name.replace("_", "-")
-        if spec not in PLANNERS or scene not in scenes:
+        if spec not in PLANNERS or scene not in scenes.entries:
             report.skip(f"plans of {name} in {scene}, which is not known")
             continue
         with report.attempt("plan", " ".join(key)):
@@ -223,7 +200,7 @@ def verify_planners(
             due = sorted({*range(0, last + 1, EVERY), last})
             report.compare("plan iterations", " ".join(key), due, sorted(set(recorded)))
             plan_again(" ".join(key), spec, seen, plans[key])
-    plans.finish(mode)
+    plans.finish()
 
 
 class Seen:
@@ -253,7 +230,7 @@ def plan_again(where: str, spec: str, seen: Seen, rows: Source) -> None:
         plan = planner.plan(seen.at(iteration))
         if iteration in recorded and isinstance(plan, Trajectory):
             ours = {"index": np.arange(len(plan.time_us)), "time_us": plan.time_us}
-            columns = dict(zip(EGO_COLUMNS, plan.states.T, strict=True))
-            ours |= {name: values for name, values in columns.items() if name in rows}
+            columns = zip(EGO_COLUMNS, plan.states.T, strict=True)
+            ours |= {name: values for name, values in columns if name in rows}
             here, at = rows.at(recorded == iteration), f"{where} iteration {iteration}"
             here.match(at, ours, TOLERANCE, quantity=f"{spec} plan")

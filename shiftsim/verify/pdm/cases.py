@@ -3,7 +3,6 @@
 Kernels need no map; recorded routes and calls are made again from the log and map of a scene.
 """
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,13 +22,12 @@ from shiftsim.planners.proposals.areas import select_areas
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, drive_proposals
-from shiftsim.planners.routes.graph import Search, centerline, search_cheapest, search_levels
+from shiftsim.planners.routes.graph import centerline, search_cheapest, search_levels
 from shiftsim.sim.planner import observe_log, scene_info
-from shiftsim.verify.files import TOLERANCE, Source, verify_files
+from shiftsim.verify.files import TOLERANCE, Parts, Scenes, Source, verify_files
 from shiftsim.verify.nuplan.runs import verify_nuplan_metrics, verify_simulation
 from shiftsim.verify.pdm.steps import verify_calls, verify_step, verify_summary
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 from shiftsim.verify.tables import read_tables, verify_cases
 from shiftsim.verify.worlds import object_columns
 from shiftsim.world.scenario import Scenario
@@ -40,35 +38,31 @@ COORDINATES = 2e-9  # m, coordinates near 4e6 are spaced 5e-10
 SIGNAL_TOLERANCE = 1e-6  # comfort signals: rounded to 8 decimals, then differentiated
 
 
-def verify_pdm(
-    folder: Path, report: Report, *, mode: str | None = None, scenes: Path | None = None
-) -> None:
+def verify_pdm(folder: Path, report: Report, scenes: Path | None = None) -> None:
     """Compare every file of the folder; arguments as for `shiftsim.verify.verify`."""
     known = Scenes(scenes or folder.resolve().parent / "nuplan")
-    parts: dict[str, Callable[[Path], object]] = {
+    parts: Parts = {
         "routes.json": partial(verify_routes, report=report, scenes=known),
         "idm_calls.json": partial(verify_idm_calls, report=report, scenes=known),
-        "loop": partial(_verify_loops, report=report, scenes=known, mode=mode),
+        "loop": partial(_verify_loops, report=report, scenes=known),
     }
-    if not known:
+    if not known.entries:
         lack = "the logs and maps of the scenes are not at hand"
         parts = dict.fromkeys(parts, lambda path: report.skip(f"{path.name}: {lack}"))
-    kernels = partial(verify_kernels, report=report)
-    verify_files(folder, report, {"kernels": kernels, **parts})
+    verify_files(folder, report, {"kernels": partial(verify_kernels, report=report), **parts})
 
 
-def _verify_loops(folder: Path, report: Report, scenes: Scenes, mode: str | None) -> None:
-    """Compare every run (of one mode) of the `loop` folder: its calls, then driven freely."""
-    verify_calls(folder, report, scenes, mode)
-    logged = scenes.folder / "expected"
-    verify_nuplan_metrics(folder, report, scenes, mode, logged=logged)
-    verify_simulation(folder, report, scenes, mode, logged=logged)
+def _verify_loops(folder: Path, report: Report, scenes: Scenes) -> None:
+    """Compare every run of the `loop` folder: its calls, then driven freely."""
+    verify_calls(folder, report, scenes)
+    for verify in (verify_nuplan_metrics, verify_simulation):
+        verify(folder, report, scenes, logged=scenes.folder / "expected")
 
 
 def verify_kernels(folder: Path, report: Report) -> None:
     """Compare every file of the folder."""
     facts: dict[str, dict[str, Any]] = {}
-    parts: dict[str, Callable[[Path], object]] = {
+    parts: Parts = {
         **{name: partial(verify_cases, CHECKS[name], report=report) for name in CHECKS},
         "step_core_summary.json": partial(verify_summary, report, facts),  # sorted behind the steps
         "step_*.json": partial(verify_step, report, facts),
@@ -113,14 +107,10 @@ def _path(case: Source, where: str) -> None:
     path, at = make_path(poses), np.empty((len(queries), 3))
     for progress, pose in zip(queries.tolist(), at, strict=True):
         rollout.read_pose(path, progress, np.full(3, np.nan), pose)
-    points = case.take("query_xy", -1, 2).tolist()
-    ours = {
-        "progress": path.progress,
-        "projection": [project(path, x, y, 0)[0] for x, y in points],
-        "poses": at,
-        "offset_m": routes.offset_poses(poses, -1.0),
-        "offset_p": routes.offset_poses(poses, 1.0),
-    }
+    projection = [project(path, *xy, 0)[0] for xy in case.take("query_xy", -1, 2).tolist()]
+    ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
+    ours["offset_m"] = routes.offset_poses(poses, -1.0)
+    ours["offset_p"] = routes.offset_poses(poses, 1.0)
     for row, (low, high) in enumerate(case.take("substring_iv", -1, 2).tolist()):
         line = path.xy[slice(*window(path, low, high))]
         if len(line) < 2:
@@ -136,30 +126,23 @@ def _graph_search(case: Source, where: str) -> None:
     for edge in case["edges"]:
         start, end = edge if is_forward else edge[::-1]
         after[start].append(end)
-    search = _search_blocks if case["kind"] == "bfs_roadblock" else _search_lanes
-    found = search(case, after)
+    if case["kind"] == "bfs_roadblock":
+        goals = {int(target) for target in case["targets"]}
+        found = search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
+    else:
+        allowed = set(map(int, case["candidates"]))
+        lengths, blocks = (case.take(name, case["n"]).tolist() for name in ("length", "block"))
+        found = search_cheapest(
+            case["start"],
+            lambda lane: [n for n in after[lane] if n in allowed],
+            lengths.__getitem__,
+            lambda lane: blocks[lane] == case["target_block"],
+        )
     path = [str(node) for node in (found.path if is_forward else found.path[::-1])]
     case.match(where, {"found": found.found, "path": path}, quantity=case["kind"])
 
 
-def _search_blocks(case: Source, after: list[list[int]]) -> Search:
-    goals = {int(target) for target in case["targets"]}
-    return search_levels(after.__getitem__, int(case["start"]), goals, case["max_depth"])
-
-
-def _search_lanes(case: Source, after: list[list[int]]) -> Search:
-    allowed = set(map(int, case["candidates"]))
-    lengths, blocks = (case.take(name, case["n"]).tolist() for name in ("length", "block"))
-    return search_cheapest(
-        case["start"],
-        lambda lane: [n for n in after[lane] if n in allowed],
-        lengths.__getitem__,
-        lambda lane: blocks[lane] == case["target_block"],
-    )
-
-
 def _compare_route(case: Source, where: str, scenario: Scenario) -> None:
-    """Corrected route, current lane and centerline of PDM-Closed."""
     road, ego = scenario.map, np.zeros(NUM_STATE)
     case.note("label", "route_name", "pose_name")
     ego[:3] = case["rear_axle"]
@@ -170,12 +153,9 @@ def _compare_route(case: Source, where: str, scenario: Scenario) -> None:
     ordered = routes.in_index_order(route, selected, areas)
     lane = routes.current_lane(road, route, selected, ego, center, ego_box(PACIFICA))
     line = centerline(road, routes.follow_route(road, route.corrected, lane).path)
-    ours = {
-        "under": route.areas.lane[ordered],
-        "errors": [errors[areas.index(area)] for area in ordered],
-    }
-    ours |= {"lane": lane, "line": line, "path": make_path(line)}
-    TABLES["routes"].match(case, where, road=road, route=route, **ours)
+    names = {"road": road, "route": route, "ordered": ordered, "lane": lane, "line": line}
+    names["errors"] = [errors[areas.index(area)] for area in ordered]
+    TABLES["routes"].match(case, where, path=make_path(line), **names)
 
 
 def _compare_idm(call: Source, where: str, scenario: Scenario) -> None:
@@ -200,11 +180,9 @@ def _compare_idm(call: Source, where: str, scenario: Scenario) -> None:
     TABLES["objects"].match(theirs, where, columns=columns, kinds=kinds)
     path, times = planner.path, seen.time_us + STEP_US * np.arange(STEPS + 1)
     assert path is not None
-    ours = {
-        "end": [path.end, *path.driven.xy[-1], wrap_angle(float(path.driven.heading[-1]))],
-        "states": np.column_stack([times, centers, speeds]),
-    }
-    TABLES["plan"].match(call, where, road=road, planner=planner, **ours)
+    end = [path.end, *path.driven.xy[-1], wrap_angle(float(path.driven.heading[-1]))]
+    states = np.column_stack([times, centers, speeds])
+    TABLES["plan"].match(call, where, road=road, planner=planner, end=end, states=states)
 
 
 CHECKS = {

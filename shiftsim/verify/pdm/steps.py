@@ -1,6 +1,5 @@
 """Planning steps of PDM-Closed: recorded with all their inputs, and as calls in closed loops."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,12 @@ from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
 from shiftsim.sim.planner import scene_info
-from shiftsim.verify.files import Source, open_tables, read_arrays, read_fields, read_json
+from shiftsim.verify.files import Scenes, Source, open_tables, read_file, read_json
 from shiftsim.verify.nuplan import runs
 from shiftsim.verify.report import Report
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import BOX_COLUMNS, kind_of
 from shiftsim.world.layers import make_layer, make_polygons
-from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, PACIFICA, center_poses, tracks_of_boxes
 
 TABLES = read_tables(__file__)
@@ -42,8 +40,8 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
     The `.json` has its inputs, the `.npz` beside it the outputs; `facts` takes what
     `step_core_summary.json` lists of the step.
     """
-    inputs, where = read_fields(path, report, "step_NNN.json"), path.stem
-    file = read_arrays(path.with_suffix(".npz"), report, "PDM")
+    inputs, where = read_file(path, report, "step_NNN.json"), path.stem
+    file = read_file(path.with_suffix(".npz"), report, "PDM")
     ego, limit, planner = np.array(inputs["ego_state"]), inputs["speed_limit_mps"], PdmClosed()
     paths = planner.follow(np.array(inputs["centerline"], np.float64))
     seen = _see(inputs, ego, paths.at(0))
@@ -52,9 +50,7 @@ def verify_step(report: Report, facts: dict[str, dict[str, Any]], path: Path) ->
         **{"seen": seen, "collided": planner.collided, "step": step, "arrays": step_arrays(step)},
         "boxes": seen.forecast.others.boxes[[0, 5, 20]],  # two time indices each
         "times": int(inputs["ego_time_us"]) + STEP_US * np.arange(STEPS + 1),
-        "best_score": step.scores.total.max(),
-        "objects": inputs["objects"],
-        "red": inputs["red_light_lane_ids"],
+        "inputs": inputs,
         "zero": np.flatnonzero(step.scores.total == 0.0),
         "at_fault": np.flatnonzero(np.isfinite(step.scores.collision_index)),
         "too_near": np.flatnonzero(np.isfinite(step.scores.ttc_index)),
@@ -81,7 +77,6 @@ def verify_summary(report: Report, facts: dict[str, dict[str, Any]], path: Path)
 
 
 def _see(inputs: Source, ego: FloatArray, centerline: polylines.Path) -> Seen:
-    """What is seen in a recorded step."""
     center, things, parts = center_poses(ego[:3]), inputs.each("objects"), inputs.each("drivable")
     values = np.array([[thing[name] for name in BOX_COLUMNS] for thing in things], np.float64)
     kinds, names = [kind_of(thing) for thing in things], [thing["token"] for thing in things]
@@ -152,26 +147,23 @@ def _in_line(states: FloatArray, others: Others) -> BoolArray:
     return out
 
 
-def verify_calls(
-    folder: Path, report: Report, scenes: Mapping[str, Scenario], mode: str | None = None
-) -> None:
-    """Make every planning call of closed loops (of one mode) again from the recorded ego state."""
+def verify_calls(folder: Path, report: Report, scenes: Scenes) -> None:
+    """Make every planning call of closed loops again from the recorded ego state."""
     tables = open_tables(folder, report, "ego", "objects", "steps", "proposals")
     egos, objects, steps, proposals = tables.values()
-    static = read_fields(folder / "static.json", report, "static.json")
-    for key in egos:
+    static = read_file(folder / "static.json", report, "static.json")
+    for key in egos.of_mode():
         call, where = key[:2], " ".join(key[:2])
-        if mode in (None, key[1]):
-            with report.attempt("PDM loop", where):
-                seen = runs.Seen(scenes[key[0]], egos[key], objects[key], key[1])
-                file = read_arrays(folder / f"{'_'.join(call)}.npz", report, "PDM")
-                names = {"road": seen.scenario.map, "scenario": seen.scenario}
-                names["planner"] = _compare_calls(where, seen, steps[call], proposals[call], file)
-                facts = static.each(key[0])[0].each(key[1])[0]
-                TABLES["facts"].match(facts, where, nothing=None, **names)
-    for table in (steps, proposals):
-        table.finish(mode)
-    if mode is None:
+        with report.attempt("PDM loop", where):
+            seen = runs.Seen(scenes[key[0]], egos[key], objects[key], key[1])
+            file = read_file(folder / f"{'_'.join(call)}.npz", report, "PDM")
+            names = {"road": seen.scenario.map, "scenario": seen.scenario}
+            names["planner"] = _compare_calls(where, seen, steps[call], proposals[call], file)
+            facts = static.each(key[0])[0].each(key[1])[0]
+            TABLES["facts"].match(facts, where, nothing=None, **names)
+    steps.finish()
+    proposals.finish()
+    if report.mode is None:
         static.finish()
     known = {f"{name}.parquet" for name in (*runs.RUN_TABLES, "steps", "proposals")}
     known |= {"static.json", *(f"{'_'.join(key[:2])}.npz" for key in egos)}
@@ -199,9 +191,8 @@ def _compare_calls(
         step, sight = planner.step(observation), planner.seen
         assert sight is not None
         row, theirs = steps.at(index), proposals.at(numbers + index * per_call)
-        names = {"road": road, "seen": observation, "sight": sight}
-        names |= {"limit": road.speed_limits[sight.lane], "collided": ",".join(planner.collided)}
-        names["best_score"] = theirs["score"].max()
+        names = {"road": road, "seen": observation, "sight": sight, "lane": sight.lane}
+        names |= {"collided": ",".join(planner.collided), "scores": theirs["score"]}
         TABLES["call"].match(row, at, **names)
         TABLES["ends"].match(theirs, at, ends=step.driven.states[:, -1])
         if compare_scores(at, seen.ego[index], sight, step, theirs, row):

@@ -9,8 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.scenarios import read_scenario
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nuplan.runs import verify_planners
 from shiftsim.verify.pdm.cases import verify_idm_calls
 from shiftsim.verify.report import Report
@@ -22,15 +21,7 @@ pytestmark = pytest.mark.golden
 
 @pytest.fixture(scope="module")
 def scenes(nuplan_reference):
-    maps, out = {}, {}
-    for scene in json.loads((nuplan_reference / "scenes.json").read_text()):
-        name = scene["map"]
-        if name not in maps:
-            maps[name] = read_map(next(nuplan_reference.glob(f"maps/{name}/*/map.gpkg")), name)
-        out[scene["scene"]] = read_scenario(
-            nuplan_reference / scene["db"], scene["token"], maps[name], (15.0, 0.0, 0.5)
-        )
-    return out
+    return Scenes(nuplan_reference)
 
 
 def test_every_recorded_plan_comes_out_again(nuplan_reference, scenes):
@@ -96,9 +87,10 @@ def test_an_additional_column_is_named(falsified, nuplan_reference, scenes):
     path = folder / "trajectories.parquet"
     content = pq.read_table(path)
     pq.write_table(content.append_column("z", pa.array(np.zeros(len(content)))), path)
-    report = Report()
-    verify_planners(folder, report, scenes, "PT")
-    verify_planners(folder, report, scenes, "NR")
+    report = Report("PT")
+    verify_planners(folder, report, scenes)
+    report.mode = "NR"
+    verify_planners(folder, report, scenes)
     assert list(report.not_covered) == ["trajectories: column 'z'"]
 
 

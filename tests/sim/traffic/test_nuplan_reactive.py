@@ -7,9 +7,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nuplan.runs import verify_simulation
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 SCENE, PLANNER = "s04_left_turn", "log_future"
 
@@ -32,8 +32,8 @@ def one_run(nuplan_reference: Path, tmp_path: Path) -> Path:
 
 
 def verified(folder: Path, scenes: Scenes) -> Report:
-    report = Report()
-    verify_simulation(folder / "expected", report, scenes, "R")
+    report = Report("R")
+    verify_simulation(folder / "expected", report, scenes)
     return report
 
 

@@ -9,9 +9,9 @@ import places
 import pytest
 
 from shiftsim.verify import verify
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nets.common import verify_part
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.golden, pytest.mark.learned]

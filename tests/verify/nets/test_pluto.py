@@ -6,9 +6,9 @@ import numpy as np
 import places
 import pytest
 
+from shiftsim.verify.files import Scenes
 from shiftsim.verify.nets.common import verify_nets, verify_part
 from shiftsim.verify.report import Report
-from shiftsim.verify.scenes import Scenes
 
 pytest.importorskip("torch")
 pytestmark = [pytest.mark.learned, pytest.mark.golden, pytest.mark.slow]

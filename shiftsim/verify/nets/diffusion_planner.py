@@ -5,7 +5,6 @@ Everything is made from the scene's own log and map; stored features are only co
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from shiftsim.planners.learned.diffusion.planner import INPUTS, NOISE_SHAPE, Dif
 from shiftsim.sim.planner import Observation
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common
-from shiftsim.verify.nets.common import Loop, make_planner, match_meta
 from shiftsim.verify.tables import read_tables
 from shiftsim.verify.worlds import tracks_of
 from shiftsim.world.layers import Polylines, make_polygons, make_polylines
@@ -76,33 +74,27 @@ def _verify_forward(file: Source) -> None:
     known = {name.replace("speed", "has_speed"): given[name] != 0.0 for name in limits}
     given.match(file.name, {"noise": start_noise(case)[None], **known}, quantity=NAME)
     inputs = {name: torch.from_numpy(given[name]) for name in (*INPUTS, limits[1])}
-    network = make_planner(KeyedPlanner, "base").network
+    network = common.make_planner(KeyedPlanner, "base").network
     scene = network.normalise(inputs)
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
-    route = network.dit[0].route_encoder(scene["route_lanes"])
-    encoded = {"encoding": network.encode(scene), "route": route}
-    TABLES["encoded"].match(file.below("out."), file.name, NAME, **encoded)
+    encoded, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
+    TABLES["encoded"].match(file.below("out."), file.name, NAME, encoding=encoded, route=route)
     for variant in common.match_case(file, NAME):
-        says, stored = (
-            _sampled(variant, scene, inputs, given["noise"]),
-            file.below(f"out.{variant}."),
-        )
+        says = _sampled(variant, scene, inputs, given["noise"])
+        stored, where = file.below(f"out.{variant}."), f"{file.name} {variant}"
         for section in ("sampled", "guided"):
-            where = f"{file.name} {variant}"
             TABLES[section].match(stored, where, NAME, variant=variant, **says)
 
 
-def _sampled(
-    variant: str, scene: dict[str, Any], inputs: dict[str, Any], start: Any
-) -> dict[str, Any]:
+def _sampled(variant: str, scene: Any, inputs: Any, start: Any) -> dict[str, Any]:
     """What the sampler comes to with one variant of the weights, and its calls of the network."""
     import torch
 
     from shiftsim.planners.learned.diffusion.network import sampler
     from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
 
-    network = make_planner(KeyedPlanner, variant).network
+    network = common.make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
     prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
     seen, made = [], []
@@ -120,7 +112,7 @@ def _sampled(
     return {**calls, "plain": plain, "guided": guided, "times": sampler.SCHEDULE.call_times}
 
 
-def _compare(loop: Loop) -> None:
+def compare(loop: common.Loop) -> None:
     """Compare one iteration; features, ids and all outputs are stored for some."""
     loop.match("iteration", loop.row)
     if list(loop.stored):
@@ -133,7 +125,7 @@ def _compare(loop: Loop) -> None:
 
 def _verify_agents(file: Source) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
-    match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
+    common.match_meta(file, NAME, frame_columns=["track", *_TRACK_COLUMNS[1:]])
     if f"in.frame{kernels.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
     made = builder.agent_features(_tracks(file), file.take("in.anchor", 3))
@@ -155,15 +147,14 @@ def _tracks(file: Source) -> Tracks:
         (last, _STATIC[kind], f"static {number}", np.nan, np.nan, heading, width, length, x, y)
         for number, (kind, (x, y, heading, width, length)) in enumerate(static)
     ]
-    columns = zip(
-        ("iteration", "type", *_TRACK_COLUMNS), map(np.array, zip(*rows, strict=True)), strict=True
-    )
-    return tracks_of(Source(file.name, "column", dict(columns), file.report), last + 1)
+    titles = ("iteration", "type", *_TRACK_COLUMNS)
+    columns = dict(zip(titles, map(np.array, zip(*rows, strict=True)), strict=True))
+    return tracks_of(Source(file.name, "column", columns, file.report), last + 1)
 
 
 def _verify_lanes(file: Source) -> None:
     """Which lanes and route lanes are kept where there are too many, and their rows."""
-    match_meta(file, NAME, light="green, yellow, red, unknown")
+    common.match_meta(file, NAME, light="green, yellow, red, unknown")
     anchor, owner = file.take("in.anchor", 3), file["in.owner"].tolist()
     lines, left, right = (_lines(file, n) for n in ("lane", "left_boundary", "right_boundary"))
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
@@ -190,12 +181,11 @@ def _lines(file: Source, name: str) -> Polylines:
     return make_polylines(np.split(xy, np.cumsum(lengths)[:-1]))
 
 
+PLANNER = KeyedPlanner
 FILES = {
     "args.json": _verify_args,
     "sampler.json": _verify_sampler,
-    "state_dict.json": partial(common.verify_manifest, NAME, TABLES),
     "forward_*.npz": _verify_forward,
-    "closed_loop_*.npz": partial(common.verify_loop, KeyedPlanner, TABLES, _compare),
     "overflow_agents_*.npz": _verify_agents,
     "overflow_lanes_*.npz": _verify_lanes,
 }
