@@ -224,10 +224,10 @@ class Idm:
             )
             if lead == _DONE:
                 break
-            line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
             footprint = boxes_to_corners(centers[step], np.array(policy[:2]))
             unsure = np.flatnonzero(sides[step] == OPEN).tolist() if lead == _TIED else [lead]
             for index in unsure:
+                line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
                 side = exact_side(line, 0.5 * policy.width, footprint, objects, index)
                 sides[step, index] = side
             if lead == _TIED:
@@ -295,6 +295,16 @@ def _pose(path: Path, progress: float) -> tuple[float, float, float]:
     return x, y, wrap_angle(heading)
 
 
+@lean_kernel
+def _accelerate(policy: Policy, speed: float, gap: float, speed_ahead: float) -> float:
+    """Acceleration behind a lead, within the limits [m/s^2]."""
+    _, _, target, min_gap, headway, accel_max, decel_max = policy
+    accel = idm_acceleration(
+        speed, gap, speed_ahead, target, min_gap, headway, accel_max, decel_max
+    )
+    return min(max(accel, -decel_max), accel_max)
+
+
 @kernel
 def _roll_on(
     first: int,  # row that is known
@@ -311,8 +321,8 @@ def _roll_on(
     Returns:
         The row, and the OPEN object to decide, _TIED where several are touched, or _DONE.
     """
-    length, width, target, min_gap, headway, accel_max, decel_max = policy
-    footprint, ends = np.empty((4, 2)), np.empty((4, 2))
+    length, width, target = policy.length, policy.width, policy.target_velocity
+    footprint, ends, accels = np.empty((4, 2)), np.empty((4, 2)), np.empty(len(objects.speeds))
     if first == 0:
         start_survey(survey, path, objects, motion[0, 0] + STEP * min(motion[0, 1], 0.0))
     for step in range(first, STEPS):
@@ -323,20 +333,20 @@ def _roll_on(
         find_sides(path, low, high, footprint, objects, survey, ends, sides[step])
         # nuPlan rule 158: all objects stand still during the roll-out; their speeds count only here
         lead, gap = find_lead(footprint, objects, survey.bounds, sides[step])
-        speed_ahead = 0.0
         if lead < 0:
-            gap = path.progress[-1] - progress - 0.5 * length
+            accel = _accelerate(policy, speed, path.progress[-1] - progress - 0.5 * length, 0.0)
         elif sides[step, lead] == OPEN:
             return step, lead
-        elif gap == 0.0 and is_tied(footprint, heading, objects, sides[step], lead):
-            return step, _TIED
         else:
-            speed_ahead = lead_speed(objects, lead, heading)
-        accel = idm_acceleration(
-            speed, gap, speed_ahead, target, min_gap, headway, accel_max, decel_max
-        )
+            accel = _accelerate(policy, speed, gap, lead_speed(objects, lead, heading))
+        if gap == 0.0:
+            for index in range(len(accels)):
+                accels[index] = _accelerate(policy, speed, gap, lead_speed(objects, index, heading))
+            # most often the ego brakes as hard as it can for each of them
+            if is_tied(footprint, objects, sides[step], accels, lead):
+                return step, _TIED
         motion[step + 1, 0] = progress + STEP * speed
-        motion[step + 1, 1] = max(0.0, speed + STEP * min(max(accel, -decel_max), accel_max))
+        motion[step + 1, 1] = max(0.0, speed + STEP * accel)
         x, y, heading = _pose(path, motion[step + 1, 0])
         centers[step + 1, 0], centers[step + 1, 1], centers[step + 1, 2] = x, y, heading
     return STEPS, _DONE

@@ -238,14 +238,16 @@ def lead_speed(objects: Objects, index: int, heading: float) -> float:
 
 @lean_kernel
 def is_tied(
-    footprint: FloatArray, heading: float, objects: Objects, sides: IntArray, lead: int
+    footprint: FloatArray, objects: Objects, sides: IntArray, answers: FloatArray, lead: int
 ) -> bool:
-    """Whether the footprint (4, 2) touches a lead, and also an object of another speed."""
-    speed = lead_speed(objects, lead, heading)
+    """Whether the footprint (4, 2) touches a lead, and also an object with another answer.
+
+    `answers` (M,) are what follows where an object is the lead.
+    """
     for index in range(len(sides)):
-        if sides[index] != CLEAR and index != lead:
+        if sides[index] != CLEAR and index != lead and answers[index] != answers[lead]:
             ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
-            if rings_touch(footprint, ring) and lead_speed(objects, index, heading) != speed:
+            if rings_touch(footprint, ring):
                 return True
     return False
 
@@ -258,8 +260,10 @@ def settle_tie(footprint: FloatArray, objects: Objects, sides: IntArray) -> None
     # nuPlan rule 159: the index of what is in the corridor answers with the first that it finds
     found = np.flatnonzero(sides == HIT)
     rings = [objects.xy[objects.ptr[i] : objects.ptr[i + 1]] for i in found.tolist()]
-    polygons = np.array([shapely.Polygon(ring) for ring in rings])
-    box = shapely.Polygon(footprint)
+    rings.append(footprint)
+    owners = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    made = shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=owners))
+    polygons, box = made[:-1], made[-1]
     nearest = found[shapely.STRtree(polygons).nearest(box)]
     touching = found[shapely.intersects(polygons, box)]
     sides[touching[touching != nearest]] = CLEAR

@@ -118,15 +118,14 @@ def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_orde
     for rings, lead in (([high, far, low], 2), ([low, far, high], 0)):
         objects = objects_of(rings)._replace(speeds=np.array([1.0, 9.0, 3.0]))
         sides = np.full(3, HIT)
-        assert is_tied(footprint, 0.0, objects, sides, 0)
+        assert is_tied(footprint, objects, sides, objects.speeds, 0)
         settle_tie(footprint, objects, sides)
         assert sides.tolist() == [HIT if i in (1, lead) else CLEAR for i in range(3)]
-        assert not is_tied(footprint, 0.0, objects, sides, lead)
+        assert not is_tied(footprint, objects, sides, objects.speeds, lead)
 
 
-def test_objects_of_one_speed_are_no_tie():
+def test_objects_of_one_answer_are_no_tie():
     footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
-    objects = objects_of([footprint + 1.0, footprint - 1.0])._replace(headings=np.array([0.0, 2.0]))
-    assert not is_tied(footprint, 0.5, objects, np.full(2, HIT), 0)  # both stand
-    moving = objects._replace(speeds=np.ones(2))
-    assert is_tied(footprint, 0.5, moving, np.full(2, HIT), 0)
+    objects, sides = objects_of([footprint + 1.0, footprint - 1.0]), np.full(2, HIT)
+    assert not is_tied(footprint, objects, sides, np.zeros(2), 0)
+    assert is_tied(footprint, objects, sides, np.array([0.0, 1.0]), 0)
