@@ -266,25 +266,25 @@ class PointsEncoder(nn.Module):
         super().__init__()
         self.first_mlp = _points_mlp(channels, 128, 256)
         self.second_mlp = _points_mlp(512, 256, DIM)
-        self._kept: tuple[_FoldedMlp, _FoldedMlp] | None = None  # for inference
+        self._kept: _Layers | None = None  # for inference
         self.register_load_state_dict_post_hook(_forget)  # type: ignore[no-untyped-call]
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, 128)."""
         lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
         size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
-        first, second = self._folded()
+        layers = self._folded()
         parts = zip(torch.split(lines, size), torch.split(valid, size), strict=True)
-        encoded = torch.cat([_encode_lines(*part, first, second) for part in parts])
+        encoded = torch.cat([_encode_lines(*part, layers) for part in parts])
         return encoded.reshape(*keep.shape[:2], encoded.shape[1])
 
-    def _folded(self) -> "tuple[_FoldedMlp, _FoldedMlp]":
+    def _folded(self) -> "_Layers":
         if self._kept is not None and torch.is_inference_mode_enabled():
             return self._kept
-        both = _folded(self.first_mlp), _folded(self.second_mlp)
+        layers = _joined(self.first_mlp, self.second_mlp)
         if torch.is_inference_mode_enabled():
-            self._kept = both
-        return both
+            self._kept = layers
+        return layers
 
 
 def _forget(encoder: PointsEncoder, keys: object) -> None:
@@ -292,36 +292,50 @@ def _forget(encoder: PointsEncoder, keys: object) -> None:
     encoder._kept = None
 
 
-class _FoldedMlp(NamedTuple):
-    """Weight and bias of the first layer with the normalisation in them, and the last layer."""
+class _Layers(NamedTuple):
+    """Layers of an encoder, with normalisation in the one before, joined where no ReLU is between.
 
-    weight: Tensor
-    bias: Tensor
-    last: nn.Module
+    The second part reads a point and what its line says, which is the same for all of its points.
+    """
+
+    enter: tuple[Tensor, Tensor]  # weight and bias: (channels) to (128)
+    leave: nn.Module  # (128) to (256), of which the line has the maximum
+    own: Tensor  # (256, 128) weight from within the first part to within the second one
+    line: tuple[Tensor, Tensor]  # weight and bias: the maximum (256) to (256)
+    last: nn.Module  # (256) to the outputs
 
 
-def _folded(mlp: nn.Sequential) -> _FoldedMlp:
-    layer, norm, _, last = mlp
+def _joined(first: nn.Sequential, second: nn.Sequential) -> _Layers:
+    weight, bias = _folded(second)
+    leave = first[3]
+    assert isinstance(leave, Linear)
+    half = leave.out_features
+    # rounded once
+    own = weight[:, :half].double() @ leave.weight.double()
+    line_bias = bias.double() + weight[:, :half].double() @ leave.bias.double()
+    line = weight[:, half:], line_bias.to(bias.dtype)
+    return _Layers(_folded(first), leave, own.to(weight.dtype), line, second[3])
+
+
+def _folded(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
+    """Weight and bias of the first layer with the normalisation in them."""
+    layer, norm, _, _ = mlp
     assert isinstance(layer, Linear)
     assert isinstance(norm, nn.BatchNorm1d)
     assert norm.running_mean is not None
     assert norm.running_var is not None
     scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    bias = (layer.bias - norm.running_mean) * scale + norm.bias
-    return _FoldedMlp(layer.weight * scale[:, None], bias, last)
+    return layer.weight * scale[:, None], (layer.bias - norm.running_mean) * scale + norm.bias
 
 
-def _encode_lines(points: Tensor, keep: Tensor, first: _FoldedMlp, second: _FoldedMlp) -> Tensor:
+def _encode_lines(points: Tensor, keep: Tensor, layers: _Layers) -> Tensor:
     """(M, out) from (M, K, channels) with `keep` (M, K)."""
     (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
-    rows = points.flatten(0, 1)[row]
-    hidden = first.last(linear(rows, first.weight, first.bias).relu_())
-    pooled = _pooled(hidden, row, keep)
-    # Linear([point, pooled]) in two parts: that of the line is the same for all its points
-    half = hidden.shape[1]
-    mixed = linear(hidden, second.weight[:, :half])
-    mixed += linear(pooled, second.weight[:, half:], second.bias)[row // keep.shape[1]]
-    return _pooled(second.last(mixed.relu_()), row, keep)
+    inner = linear(points.flatten(0, 1)[row], *layers.enter).relu_()
+    pooled = _pooled(layers.leave(inner), row, keep)
+    mixed = linear(inner, layers.own)
+    mixed += linear(pooled, *layers.line)[row // keep.shape[1]]
+    return _pooled(layers.last(mixed.relu_()), row, keep)
 
 
 def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
