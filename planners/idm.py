@@ -216,15 +216,14 @@ class Idm:
         objects = objects_around(observation, self._lights.at(observation.lights))
         count = len(objects.speeds)
         survey = make_survey(path.driven, 0.5 * policy.width, count)
-        sides = np.full((STEPS, count), UNKNOWN)
+        sides, footprint = np.full((STEPS, count), UNKNOWN), np.empty((4, 2))
         step = 0
         while True:
             step, lead = _roll_on(
-                step, path.driven, objects, policy, centers, motion, survey, sides
+                step, path.driven, objects, policy, centers, motion, survey, sides, footprint
             )
             if lead == _DONE:
                 break
-            footprint = boxes_to_corners(centers[step], np.array(policy[:2]))
             unsure = np.flatnonzero(sides[step] == OPEN).tolist() if lead == _TIED else [lead]
             for index in unsure:
                 line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
@@ -315,6 +314,7 @@ def _roll_on(
     motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
     survey: Survey,
     sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
+    footprint: FloatArray,  # (4, 2) receives the corners of the ego in the row returned [m]
 ) -> tuple[int, int]:
     """Fill the rows behind `first` until the end, or until it is open what the lead is.
 
@@ -322,7 +322,7 @@ def _roll_on(
         The row, and the OPEN object to decide, _TIED where several are touched, or _DONE.
     """
     length, width, target = policy.length, policy.width, policy.target_velocity
-    footprint, ends, accels = np.empty((4, 2)), np.empty((4, 2)), np.empty(len(objects.speeds))
+    ends, accels = np.empty((4, 2)), np.empty(len(objects.speeds))
     if first == 0:
         start_survey(survey, path, objects, motion[0, 0] + STEP * min(motion[0, 1], 0.0))
     for step in range(first, STEPS):
