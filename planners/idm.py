@@ -122,18 +122,18 @@ def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
     return path
 
 
-def exact_side(
-    line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, index: int
-) -> int:
-    """The side of an OPEN object, by the polygon nuPlan uses.
+def exact_sides(
+    line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, unsure: list[int]
+) -> list[int]:
+    """HIT or CLEAR for each of some OPEN objects, by the polygon nuPlan uses.
 
     The corridor is the stretch of path (K, 3), buffered by `half_width` [m], and the `footprint`
     (4, 2) of the ego.
     """
     corridor = corridor_polygon(shapely.LineString(line[:, :2]), half_width)
     corridor = corridor.union(shapely.Polygon(footprint))
-    ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
-    return HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR
+    rings = (objects.xy[objects.ptr[index] : objects.ptr[index + 1]] for index in unsure)
+    return [HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR for ring in rings]
 
 
 class Policy(NamedTuple):
@@ -225,10 +225,10 @@ class Idm:
             if lead == _DONE:
                 break
             unsure = np.flatnonzero(sides[step] == OPEN).tolist() if lead == _TIED else [lead]
-            for index in unsure:
+            if unsure:
                 line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
-                side = exact_side(line, 0.5 * policy.width, footprint, objects, index)
-                sides[step, index] = side
+                half_width = 0.5 * policy.width
+                sides[step, unsure] = exact_sides(line, half_width, footprint, objects, unsure)
             if lead == _TIED:
                 settle_tie(footprint, objects, sides[step])
         centers[0] = _pose(path.driven, start)

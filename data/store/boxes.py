@@ -113,7 +113,8 @@ def first_place(
 ) -> np.uint64:
     """Which box of the dense arrays a span begins at; `end` or more if that is none of them.
 
-    Boxes before the first row are there as well: less than 0 is a large one, until it is not.
+    A span may begin before the first row. Its box is then less than 0, which is a very large number
+    here; counted up row by row it comes to 0 where the arrays begin.
     """
     to = place[np.uint64(spans[span, 2])]
     return np.uint64(spans[span, 1]) * num + np.uint64(to - 1) if to > 0 else end

@@ -33,7 +33,7 @@ _UNUSED = {
     *("inline_inlinables", "rewrite_dynamic_raises", "rewrite_semantic_constants"),
     *("find_literally", "literal_unroll", "literal_propagation", "dead_branch_prune"),
     *("nopython_supported_feature_validation", "annotate_types", "dump_parfor_diagnostics"),
-    *("nopython_rewrites",),
+    "nopython_rewrites",
 }
 
 
