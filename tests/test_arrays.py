@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -57,7 +58,7 @@ def test_a_kernel_is_compiled_once_for_each_signature(file, tmp_path, caplog):
     assert first(1, 2) == again(1, 2) == 4
     assert first(1.5, 2) == again(1.5, 2) == 5.0
     assert (hits(first), hits(again)) == (0, 2)
-    assert len(kept(tmp_path)) == 4
+    assert len(kept(tmp_path)) == 6  # of each type: both parts, and what Python calls
     assert not caplog.records
 
 
@@ -95,7 +96,7 @@ def test_a_damaged_file_is_noticed_wherever_the_damage_is(file, tmp_path, caplog
 def test_code_of_another_signature_source_or_constant_is_not_used(file, tmp_path, monkeypatch):
     add = load(file)
     assert (add(1, 2), add(1.5, 2)) == (4, 5.0)
-    one, other = (path for path in kept(tmp_path) if ".add-" in path.name)
+    one, other = (path for path in kept(tmp_path) if re.search(r"\.add-.*\.nbc$", path.name))
     whole = one.read_bytes(), other.read_bytes()
     one.write_bytes(whole[1])
     other.write_bytes(whole[0])
@@ -133,7 +134,7 @@ def test_a_folder_that_goes_away_or_becomes_a_file_costs_time_only(file, tmp_pat
     assert add(1.5, 2) == 5.0
     shutil.rmtree(tmp_path / "kept")
     assert add(1, 2) == 4
-    assert len(kept(tmp_path)) == 2
+    assert len(kept(tmp_path)) == 3
     shutil.rmtree(tmp_path / "kept")
     (tmp_path / "kept").touch()
     assert load(file)(1, 2) == 4
@@ -155,7 +156,7 @@ def test_kernels_are_kept_for_the_user_where_the_first_folder_cannot_be_written(
     (tmp_path / "a file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "a file"))
     assert load(file)(1, 2) == 4
-    assert len(kept(tmp_path)) == 2
+    assert len(kept(tmp_path)) == 3
     again = load(file)
     assert again(1, 2) == 4
     assert hits(again) == 1
@@ -178,7 +179,33 @@ def test_processes_at_the_same_time_leave_whole_files(file, tmp_path):
     add = load(file)
     assert (add(1, 2), add(1.5, 2), add(1, 2.5)) == (4, 5.0, 4.5)
     assert hits(add) == 3
-    assert len(kept(tmp_path)) == 5
+    assert len(kept(tmp_path)) == 8
+
+
+CALLED = """
+import sys
+from shiftsim.arrays import kernel
+
+@kernel
+def inner(pair):
+    return pair[0] + pair[1]
+
+@kernel
+def outer(pair):
+    return inner(pair)
+
+print(globals()[sys.argv[1]]((1.5, 2)))
+"""
+
+
+def test_python_calls_what_another_process_compiled_for_a_kernel(file, tmp_path):
+    """The part is there before numba knows how to unpack what it takes."""
+    file.write_text(CALLED)
+    place = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(PACKAGE.parent)}
+    for name in ("outer", "inner"):
+        command = [sys.executable, str(file), name]
+        done = subprocess.run(command, env=os.environ | place, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, "3.5\n"), done.stderr
 
 
 LOADED = """
