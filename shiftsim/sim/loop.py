@@ -149,7 +149,7 @@ class Rollout:
         self._go_on()
 
     def drive_on(self) -> None:
-        """Let the planner take the steps that are left at once, if it can and nothing else acts.
+        """Let the planner take steps at once, as far as it goes, if it can and nothing else acts.
 
         Each counts with the mean of their times.
         """
@@ -322,6 +322,7 @@ def simulate(
 def drive(rollout: Rollout) -> SimulationLog:
     """Drive a fresh rollout to its end; errors are those of `simulate`."""
     planner = rollout.planner
+    rollout.drive_on()
     while not rollout.done:
         plan, seconds = None, 0.0
         if planner is not None:
@@ -330,8 +331,6 @@ def drive(rollout: Rollout) -> SimulationLog:
             plan = planner.plan(observation)
             seconds = perf_counter() - began
         rollout.advance(plan, seconds)
-        if rollout.iteration == 1:
-            rollout.drive_on()
     return rollout.log()
 
 
