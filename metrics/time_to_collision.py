@@ -38,6 +38,7 @@ _NUM_TESTS = 29
 _STOPPED_SPEED = 5e-3  # m/s
 _AHEAD, _BESIDE, _BEHIND = range(3)
 _WELL_AHEAD = float(np.cos(AHEAD)) + 1e-9  # more than rounding can change a cosine by
+_WELL_BESIDE = float(np.cos(AHEAD)) - 1e-9  # likewise, and of the angle behind with a minus
 
 
 class TimeToCollision(NamedTuple):
@@ -122,7 +123,8 @@ def _time_to_collision(
             vx = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 0]
             vy = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 1]
             # generous: what is elongated and further away than this cannot touch
-            reach = 0.5 * (sizes[i, j, 0] + sizes[i, j, 1]) + HORIZON * (abs(vx) + abs(vy)) + SLACK
+            reach = 0.5 * (sizes[i, j, 0] + sizes[i, j, 1]) + HORIZON * np.sqrt(vx * vx + vy * vy)
+            reach += SLACK
             dx, dy = poses[i, j, 0] - middle_x, poses[i, j, 1] - middle_y
             if abs(dx * cos + dy * sin) > lon + reach or abs(dx * sin - dy * cos) > lat + reach:
                 continue
@@ -152,8 +154,11 @@ def _time_to_collision(
 @lean_kernel
 def _place(cosine: float) -> int:
     """Where a track is whose bearing from the ego has this cosine; beside where it has none."""
-    if _WELL_AHEAD < cosine <= 1.0:  # most often, and without an arc cosine
+    # most often without an arc cosine
+    if _WELL_AHEAD < cosine <= 1.0:
         return _AHEAD
+    if abs(cosine) < _WELL_BESIDE:
+        return _BESIDE
     angle = np.arccos(cosine)
     if angle < AHEAD:
         return _AHEAD
@@ -184,11 +189,12 @@ def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tup
     if len(boxes) < 2:
         return 0, 0
     for k in range(1, _NUM_TESTS + 1):
-        for index in range(len(boxes)):
-            # nuPlan rule 67: positions accumulate rounding step by step
+        # nuPlan rule 67: positions accumulate rounding step by step
+        boxes[0, 0] += steps[0, 0]
+        boxes[0, 1] += steps[0, 1]
+        for index in range(1, len(boxes)):
             boxes[index, 0] += steps[index, 0]
             boxes[index, 1] += steps[index, 1]
-        for index in range(1, len(boxes)):
             dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
             reach = boxes[0, 7] + boxes[index, 7]
             # most are too far away, which is told without a call

@@ -13,7 +13,9 @@ from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners, wrap_angle
 from shiftsim.geometry.polylines import CLEAR, HIT, OPEN, Path, corridor_polygon, pose_at
 from shiftsim.planners.routes.corridor import (
+    MET,
     UNKNOWN,
+    Index,
     Objects,
     Survey,
     find_lead,
@@ -21,7 +23,6 @@ from shiftsim.planners.routes.corridor import (
     is_tied,
     lead_speed,
     make_survey,
-    settle_tie,
     start_survey,
 )
 from shiftsim.planners.routes.graph import (
@@ -42,6 +43,7 @@ from shiftsim.world.state import (
     LAST_AGENT_KIND,
     NUM_STATE,
     VX,
+    Tracks,
     Trajectory,
     VehicleParameters,
     rear_poses,
@@ -53,6 +55,9 @@ STEP_US = 500_000
 HORIZON = STEPS * STEP  # s
 RADIUS = 40.0  # m, objects with their centre nearer than this to the ego's are seen
 _EGO_TOKEN = "ego_token"
+_OVERLOOKED = frozenset(  # all its parts
+    _EGO_TOKEN[i:j] for i in range(len(_EGO_TOKEN)) for j in range(i, len(_EGO_TOKEN) + 1)
+)
 _DONE, _TIED = -1, -2  # instead of an object to decide
 
 
@@ -213,11 +218,12 @@ class Idm:
         centers[0] = ego.center
         start = path.project(centers[0, 0], centers[0, 1])
         motion[0] = start, ego.values[VX]
-        objects = objects_around(observation, self._lights.at(observation.lights))
+        red = self._lights.at(observation.lights)
+        objects = objects_around(observation.history.tracks, centers[0], red)
         count = len(objects.speeds)
         survey = make_survey(path.driven, 0.5 * policy.width, count)
         sides, footprint = np.full((STEPS, count), UNKNOWN), np.empty((4, 2))
-        step = 0
+        step, tree = 0, Index(objects)
         while True:
             step, lead = _roll_on(
                 step, path.driven, objects, policy, centers, motion, survey, sides, footprint
@@ -230,7 +236,7 @@ class Idm:
                 half_width = 0.5 * policy.width
                 sides[step, unsure] = exact_sides(line, half_width, footprint, objects, unsure)
             if lead == _TIED:
-                settle_tie(footprint, objects, sides[step])
+                tree.settle(sides[step], footprint)
         centers[0] = _pose(path.driven, start)
         return centers, motion[:, 1]
 
@@ -254,16 +260,16 @@ class Idm:
         return self.path
 
 
-def objects_around(observation: Observation, red: RedLights) -> Objects:
-    """What the ego sees around it, then red lights."""
-    tracks, center = observation.history.tracks, observation.ego.center
+def objects_around(tracks: Tracks, center: FloatArray, red: RedLights) -> Objects:
+    """What the ego, whose box centre is (3,), sees of the last row of tracks, then red lights."""
     poses, sizes = tracks.poses[-1], tracks.sizes[-1]
     distance = np.hypot(poses[:, 0] - center[0], poses[:, 1] - center[1])
     near = np.flatnonzero(tracks.valid[-1] & (distance < RADIUS))
     # nuPlan rule 157: whatever has a part of "ego_token" for a token is overlooked
-    if any(tracks.tokens[i] in _EGO_TOKEN for i in near.tolist()):
-        near = near[[tracks.tokens[i] not in _EGO_TOKEN for i in near.tolist()]]
-    poses, sizes, velocities = poses[near], sizes[near], tracks.velocities[-1, near]
+    if not _OVERLOOKED.isdisjoint([tracks.tokens[i] for i in near.tolist()]):
+        near = near[[tracks.tokens[i] not in _OVERLOOKED for i in near.tolist()]]
+    poses, sizes = poses.take(near, 0), sizes.take(near, 0)
+    velocities = tracks.velocities[-1].take(near, 0)
     speeds = np.hypot(velocities[:, 0], velocities[:, 1])
     speeds[tracks.kinds[near] > LAST_AGENT_KIND] = 0.0
     count, nothing = len(near), np.zeros(len(red.lanes))
@@ -339,11 +345,13 @@ def _roll_on(
             return step, lead
         else:
             accel = _accelerate(policy, speed, gap, lead_speed(objects, lead, heading))
-        if gap == 0.0:
+        if lead >= 0 and sides[step, lead] == MET:
             for index in range(len(accels)):
-                accels[index] = _accelerate(policy, speed, gap, lead_speed(objects, index, heading))
+                if sides[step, index] == MET:
+                    speed_ahead = lead_speed(objects, index, heading)
+                    accels[index] = _accelerate(policy, speed, gap, speed_ahead)
             # most often the ego brakes as hard as it can for each of them
-            if is_tied(footprint, objects, sides[step], accels, lead):
+            if is_tied(sides[step], accels, lead):
                 return step, _TIED
         motion[step + 1, 0] = progress + STEP * speed
         motion[step + 1, 1] = max(0.0, speed + STEP * accel)

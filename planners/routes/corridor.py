@@ -32,7 +32,8 @@ from shiftsim.geometry.rings import (
     rings_touch,
 )
 
-UNKNOWN = -1  # instead of CLEAR, HIT or OPEN: not looked at yet
+# beside CLEAR, HIT and OPEN: not looked at yet, and touched by the ego's footprint itself
+UNKNOWN, MET = -1, 3
 
 
 class Objects(NamedTuple):
@@ -92,7 +93,7 @@ def find_sides(
 ) -> None:
     """Decide which objects touch the corridor or the footprint, as far as distances can.
 
-    CLEAR, HIT or OPEN is written to `out` where UNKNOWN stands.
+    CLEAR, HIT, OPEN or MET is written to `out` where UNKNOWN stands.
     """
     # the stretch: both ends, and the vertices `first` ... `stop` - 1 between them, as in `sub_path`
     first = int(np.searchsorted(path.progress, low, side="right"))
@@ -106,7 +107,7 @@ def find_sides(
             continue
         ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
         if rings_touch(footprint, ring):
-            out[index] = HIT
+            out[index] = MET
         elif not has_length:
             out[index] = OPEN
         elif survey.runs[index, 0] == UNKNOWN:
@@ -215,8 +216,11 @@ def find_lead(
     """The object nearest to the footprint (4, 2) and its gap [m]; (-1, inf) if all are CLEAR.
 
     `bounds` (M, 4) are those of the objects. It may be OPEN; those farther away need not be
-    decided.
+    decided. Of those that are MET it is the first.
     """
+    for index in range(len(sides)):
+        if sides[index] == MET:
+            return index, 0.0
     low_x, low_y, high_x, high_y = ring_bounds(footprint)
     found, best, best_gap = -1, np.inf, np.inf
     for index in range(len(sides)):
@@ -237,45 +241,58 @@ def lead_speed(objects: Objects, index: int, heading: float) -> float:
 
 
 @lean_kernel
-def is_tied(
-    footprint: FloatArray, objects: Objects, sides: IntArray, answers: FloatArray, lead: int
-) -> bool:
-    """Whether the footprint (4, 2) touches a lead, and also an object with another answer.
+def is_tied(sides: IntArray, answers: FloatArray, lead: int) -> bool:
+    """Whether another object than the lead is MET, and has another answer.
 
-    `answers` (M,) are what follows where an object is the lead.
+    `answers` (M,) are what follows where an object is the lead, read where one is MET.
     """
     for index in range(len(sides)):
-        if sides[index] != CLEAR and index != lead and answers[index] != answers[lead]:
-            ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
-            if rings_touch(footprint, ring):
-                return True
+        if sides[index] == MET and index != lead and answers[index] != answers[lead]:
+            return True
     return False
 
 
-def settle_tie(footprint: FloatArray, objects: Objects, sides: IntArray) -> None:
-    """Keep one of the objects that touch the footprint (4, 2); the others become CLEAR.
+class Index:
+    """The spatial index that nuPlan asks for the lead."""
 
-    No object may be OPEN.
-    """
-    # nuPlan rule 159: the index of what is in the corridor answers with the first that it finds
-    found = np.flatnonzero(sides == HIT)
-    rings = [objects.xy[objects.ptr[i] : objects.ptr[i + 1]] for i in found.tolist()]
-    rings.append(footprint)
-    owners = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
-    made = shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=owners))
-    polygons, box = made[:-1], made[-1]
-    nearest = found[shapely.STRtree(polygons).nearest(box)]
-    touching = found[shapely.intersects(polygons, box)]
-    sides[touching[touching != nearest]] = CLEAR
+    def __init__(self, objects: Objects) -> None:
+        """Take the objects that may stand in the corridor."""
+        self._objects = objects
+        self._found: list[int] = []
+        self._tree: shapely.STRtree | None = None
+
+    def settle(self, sides: IntArray, footprint: FloatArray) -> None:
+        """Keep one of the objects that the footprint (4, 2) touches; the others become CLEAR.
+
+        `sides` (M,) says which are MET. No object may be OPEN.
+        """
+        # nuPlan rule 159: the index of what is in the corridor answers with the first that it finds
+        found = np.flatnonzero(sides != CLEAR).tolist()
+        if self._tree is None or found != self._found:  # seldom more than once in a plan
+            self._found, self._tree = found, shapely.STRtree(self._polygons(found))
+        lead = found[self._tree.nearest(shapely.polygons(footprint))]
+        met = np.flatnonzero(sides == MET)
+        sides[met[met != lead]] = CLEAR
+
+    def _polygons(self, indices: list[int]) -> np.ndarray:
+        """(K,) polygons of some objects."""
+        xy, ptr = self._objects.xy, self._objects.ptr.tolist()
+        rings = [xy[ptr[i] : ptr[i + 1]] for i in indices]
+        owners = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+        polygons: np.ndarray = shapely.polygons(
+            shapely.linearrings(np.concatenate(rings), indices=owners)
+        )
+        return polygons
 
 
 @lean_kernel
 def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """Distance between a box and a ring, and the same measured between their nearest points [m]."""
+    """Distance between a box and a ring, and the same measured between their nearest points [m].
+
+    They do not touch.
+    """
     # nuPlan rule 154: the gap is the latter, and the nearest point on an edge is rounded to what a
     # coordinate in UTM can hold; hence not `ring_distance`
-    if rings_touch(a, b):
-        return 0.0, 0.0
     reach = distance_bound(a, b)
     low_x, low_y, high_x, high_y = ring_bounds(a)
     low_x, low_y, high_x, high_y = low_x - reach, low_y - reach, high_x + reach, high_y + reach

@@ -72,14 +72,16 @@ def meets_bounds(box: FloatArray, bounds: FloatArray) -> bool:
 
 def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
     """Corners (..., 4, 2) of boxes given by poses (..., 3) and sizes (..., 2) length, width [m]."""
-    heading = poses[..., 2]
-    lon = np.stack([np.cos(heading), np.sin(heading)], -1)
-    lat = np.stack([np.cos(heading + np.pi / 2.0), np.sin(heading + np.pi / 2.0)], -1)
-    half_length = 0.5 * sizes[..., 0, None, None] * np.array([1.0, -1.0, -1.0, 1.0])[:, None]
-    half_width = 0.5 * sizes[..., 1, None, None] * np.array([1.0, 1.0, -1.0, -1.0])[:, None]
-    corners: FloatArray = poses[..., None, :2] + (
-        half_width * lat[..., None, :] + half_length * lon[..., None, :]
-    )
+    # x and y one after the other: NumPy is slow where the last axis is short
+    heading, length, width = poses[..., 2], 0.5 * sizes[..., 0], 0.5 * sizes[..., 1]
+    across = heading + np.pi / 2.0
+    lon = length * np.cos(heading), length * np.sin(heading)
+    lat = width * np.cos(across), width * np.sin(across)
+    corners = np.empty((*lon[0].shape, 4, 2))
+    for axis in range(2):
+        center, a, b = poses[..., axis], lat[axis], lon[axis]
+        for corner, offset in enumerate((a + b, a - b, -a - b, b - a)):
+            np.add(center, offset, out=corners[..., corner, axis])
     return corners
 
 

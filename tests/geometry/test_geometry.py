@@ -183,6 +183,20 @@ def test_corners_run_front_left_rear_left_rear_right_front_right():
     np.testing.assert_allclose(corners, [[9, 22], [9, 18], [11, 18], [11, 22]], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("shape", "sizes_shape"), [((), ()), ((0,), (0,)), ((7,), ()), ((3, 4), (3, 4)), ((3, 4), (4,))]
+)
+def test_corners_of_boxes_in_an_array_of_any_shape_are_those_of_each(rng, shape, sizes_shape):
+    poses = rng.uniform([-9.0, -9.0, -4.0], [9.0, 9.0, 4.0], (*shape, 3))
+    sizes = rng.uniform(0.2, 5.0, (*sizes_shape, 2))
+    found, expected = boxes.boxes_to_corners(poses, sizes), np.empty((*shape, 4, 2))
+    assert found.shape == expected.shape
+    for place in np.ndindex(shape):
+        length, width = np.broadcast_to(sizes, (*shape, 2))[place]
+        boxes.box_corners(*poses[place], length, width, expected[place])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
 @given(angles, rigid_motions())
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])

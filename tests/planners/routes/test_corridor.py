@@ -12,13 +12,14 @@ from shiftsim.geometry.polylines import (
     vertex_headings,
 )
 from shiftsim.planners.routes.corridor import (
+    MET,
     UNKNOWN,
+    Index,
     Objects,
     find_lead,
     find_sides,
     is_tied,
     make_survey,
-    settle_tie,
     start_survey,
 )
 from shiftsim.planners.routes.graph import sub_path
@@ -72,9 +73,12 @@ def test_distances_decide_as_the_buffered_path_does_for_every_stretch_of_it(rng,
             sides = sides_of(path, (begin, stop), footprint, objects, survey)
             corridor = corridor_polygon(shapely.LineString(ahead[:, :2]), HALF_WIDTH)
             corridor = corridor.union(shapely.Polygon(footprint))
-            truth = np.array([corridor.intersects(shapely.Polygon(ring)) for ring in rings])
+            polygons = [shapely.Polygon(ring) for ring in rings]
+            truth = shapely.intersects(polygons, corridor)
             decided = sides != OPEN
-            np.testing.assert_array_equal(sides[decided] == HIT, truth[decided])
+            np.testing.assert_array_equal(sides[decided] != CLEAR, truth[decided])
+            met = shapely.intersects(polygons, shapely.Polygon(footprint))
+            np.testing.assert_array_equal(sides == MET, met)
             num_open, num_hit = num_open + int((~decided).sum()), num_hit + int(truth.sum())
             count += len(rings)
     assert 0 < num_open < 0.05 * count
@@ -91,7 +95,7 @@ def test_a_stretch_without_length_leaves_all_but_the_footprint_open(stretch):
     start_survey(survey, path, objects, 0.0)
     # at an end of the path its last, or first, segment is the stretch
     far = OPEN if stretch[0] == 7.5 else CLEAR
-    assert sides_of(path, stretch, footprint, objects, survey).tolist() == [HIT, far]
+    assert sides_of(path, stretch, footprint, objects, survey).tolist() == [MET, far]
 
 
 def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
@@ -103,7 +107,7 @@ def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
     truth = shapely.distance([*map(shapely.Polygon, rings)], shapely.Polygon(footprint))
     for index in range(500):
         sides = np.full(500, CLEAR)
-        sides[index] = HIT
+        sides[index] = HIT if truth[index] > 0.0 else MET
         found, gap = find_lead(footprint, objects, bounds, sides)
         assert found == index
         assert gap == pytest.approx(truth[index], abs=1e-12)
@@ -116,16 +120,36 @@ def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_orde
     footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
     low, high, far = (footprint + shift for shift in ((1.0, -1.0), (-1.0, 1.0), (30.0, -9.0)))
     for rings, lead in (([high, far, low], 2), ([low, far, high], 0)):
-        objects = objects_of(rings)._replace(speeds=np.array([1.0, 9.0, 3.0]))
-        sides = np.full(3, HIT)
-        assert is_tied(footprint, objects, sides, objects.speeds, 0)
-        settle_tie(footprint, objects, sides)
-        assert sides.tolist() == [HIT if i in (1, lead) else CLEAR for i in range(3)]
-        assert not is_tied(footprint, objects, sides, objects.speeds, lead)
+        sides, answers = np.array([MET, HIT, MET]), np.array([1.0, 9.0, 3.0])
+        assert is_tied(sides, answers, 0)
+        Index(objects_of(rings)).settle(sides, footprint)
+        assert sides.tolist() == [{1: HIT, lead: MET}.get(i, CLEAR) for i in range(3)]
+        assert not is_tied(sides, answers, lead)
+
+
+def test_an_index_that_was_asked_before_answers_as_a_new_one(rng):
+    centers = np.cumsum(rng.uniform(-0.5, 1.0, (12, 2)), axis=0)
+    boxes = [boxes_to_corners(np.r_[xy, 0.1], np.array([5.176, 2.297])) for xy in centers]
+    rings = [*some_boxes(rng, rng.uniform(-2, 6, (60, 2)))]
+    objects, polygons = objects_of(rings), [shapely.Polygon(ring) for ring in rings]
+    index, leads = Index(objects), set()
+    for present in (np.full(60, True), rng.random(60) < 0.3, np.full(60, True)):
+        for footprint in boxes:
+            met = present & shapely.intersects(polygons, shapely.Polygon(footprint))
+            assert met.sum() > 1
+            asked, anew = (np.where(met, MET, np.where(present, HIT, CLEAR)) for _ in range(2))
+            index.settle(asked, footprint)
+            Index(objects).settle(anew, footprint)
+            np.testing.assert_array_equal(asked, anew)
+            np.testing.assert_array_equal(asked == HIT, present & ~met)
+            assert met[asked == MET].tolist() == [True]
+            leads.add(int(np.flatnonzero(asked == MET)[0]))
+    assert len(leads) > 2
 
 
 def test_objects_of_one_answer_are_no_tie():
-    footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
-    objects, sides = objects_of([footprint + 1.0, footprint - 1.0]), np.full(2, HIT)
-    assert not is_tied(footprint, objects, sides, np.zeros(2), 0)
-    assert is_tied(footprint, objects, sides, np.array([0.0, 1.0]), 0)
+    sides = np.array([MET, MET, HIT])
+    assert not is_tied(sides, np.array([0.0, 0.0, 1.0]), 0)
+    assert is_tied(sides, np.array([0.0, 1.0, 0.0]), 0)
+    # a lead without a number for an answer is no tie with itself
+    assert not is_tied(np.array([MET, HIT]), np.full(2, np.nan), 0)
