@@ -1,5 +1,6 @@
 """What a benchmark will cost, against what it did cost."""
 
+from statistics import median
 from time import perf_counter
 
 import pytest
@@ -13,11 +14,17 @@ SETTINGS = {"planners": ["constant-velocity", "log-future"], "noise": ["none", "
 
 
 @pytest.fixture
-def plan(tmp_path):
-    """Four runs' worth of short tasks in one process."""
+def plan_at(tmp_path):
+    """Plans four runs' worth of short tasks in one process."""
     store = write_toy_store(tmp_path / "toy", count=12)
     settings = SETTINGS | {"store": str(store), "seeds": [0, 1, 2], "workers": 1}
-    return plan_bench(load_track("state-drift"), settings, out=str(tmp_path / "bench"))
+    return lambda name: plan_bench(load_track("state-drift"), settings, out=str(tmp_path / name))
+
+
+@pytest.fixture
+def plan(plan_at):
+    """One of them."""
+    return plan_at("bench")
 
 
 def folder_size(folder):
@@ -26,14 +33,17 @@ def folder_size(folder):
 
 @pytest.mark.slow
 @pytest.mark.thorough
-def test_a_small_benchmark_costs_what_was_estimated_within_a_factor_of_two(plan):
-    found = total(estimate(plan))
-    began = perf_counter()
-    run_bench(plan)
-    seconds = perf_counter() - began
-    assert found.tasks == plan.num_tasks == 2 * 2 * 12 * (1 + 3)
-    assert 0.5 < found.hours * 3600.0 / seconds < 2.0
-    assert 0.5 < found.disk / folder_size(plan.folder) < 2.0
+def test_a_small_benchmark_costs_what_was_estimated_within_a_factor_of_two(plan_at):
+    ratios = []
+    for name in ("one", "two", "three"):  # the machine may be busy with others during one of them
+        plan = plan_at(name)
+        found = total(estimate(plan))
+        began = perf_counter()
+        run_bench(plan)
+        ratios.append(found.hours * 3600.0 / (perf_counter() - began))
+        assert found.tasks == plan.num_tasks == 2 * 2 * 12 * (1 + 3)
+        assert 0.5 < found.disk / folder_size(plan.folder) < 2.0
+    assert 0.5 < median(ratios) < 2.0
 
 
 @pytest.mark.slow
