@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from time import process_time
 
@@ -31,6 +32,7 @@ from shiftsim.sim.loop import simulate
 PLANNER, NOISE = "constant-velocity", "ou-high"
 FEW, MANY = 2, 10  # seeds
 ALL = 10_000  # scenarios of the long run
+MOST_EXPONENT = 1.05
 CODE = """
 import json, resource, sys, time
 import shiftsim
@@ -176,6 +178,26 @@ def test_efficiency_of_two_workers(runs):
         f"\nper scenario {one * 1e3:.2f} ms with one worker, {two * 1e3:.2f} ms with two: "
         f"efficiency {100 * efficiency:.0f} %, target 85 % {verdict(efficiency >= 0.85)}"
     )
+
+
+def test_cost_over_the_number_of_scenarios(size, note, tmp_path):
+    """How CPU time above that of a single scenario grows to 1,000: a fitted exponent."""
+    cpu, most = itemgetter("cpu"), size(13, 2)
+    measured_run(tmp_path, num_seeds=1, workers=1, limit=1)  # warm
+
+    def spent_by(**settings):
+        return min((measured_run(tmp_path, workers=1, **settings) for _ in range(size(2))), key=cpu)
+
+    one = spent_by(num_seeds=1, limit=1)
+    runs = [spent_by(num_seeds=count) for count in sorted({1, (most + 2) // 3, most})]
+    counts, costs = [run["tasks"] for run in runs], [cpu(run) - cpu(one) for run in runs]
+    exponent = np.polyfit(np.log(counts), np.log(costs), 1)[0]
+    shown = ", ".join(f"{count}: {cost:.2f}" for count, cost in zip(counts, costs, strict=True))
+    print(
+        f"\none scenario: {cpu(one):.2f} CPU-s with all that a run needs, more for {shown}; "
+        f"exponent {exponent:.2f}, at most {MOST_EXPONENT:g} {verdict(exponent <= MOST_EXPONENT)}"
+    )
+    note(**{f"scenarios_{count}": cost for count, cost in zip(counts, costs, strict=True)})
 
 
 def test_memory_of_ten_thousand_scenarios(store, size, tmp_path):
