@@ -72,7 +72,7 @@ class _Kernel(CPUDispatcher):
             found = self._cache.load_overload(sig, self.targetctx)
             (self._cache_misses if found is None else self._cache_hits)[sig] += 1
             if found is None:
-                with _said(self, args):
+                with _compile_event(self, args):
                     found = self._unpacking(args)
                 self._cache.save_overload(sig, found)
             self.add_overload(found)
@@ -98,7 +98,7 @@ class _Kernel(CPUDispatcher):
         with global_compiler_lock, self._compiling_counter:
             part = self._cache.load_part(args, self.targetctx)
             if part is None:
-                with _said(self, args):
+                with _compile_event(self, args):
                     part = self._make.compile(args, None)
                 assert not part.environment.consts, f"{self.py_func} needs objects of Python"
                 self._cache.save_part(args, part)
@@ -109,6 +109,7 @@ class _Kernel(CPUDispatcher):
             return part
 
     def _unpacking(self, args: Any) -> Any:
+        """The part behind a function that unpacks objects, as machine code."""
         part = self._part(args)
         target: Any = self.targetctx
         target.refresh()  # how objects are unpacked is not known yet where the part was kept
@@ -123,8 +124,8 @@ class _Kernel(CPUDispatcher):
         return part._replace(library=library, entry_point=function, target_context=context)
 
 
-def _said(kernel: _Kernel, args: Any) -> Any:
-    """To whom it may concern: a kernel is being compiled."""
+def _compile_event(kernel: _Kernel, args: Any) -> Any:
+    """Around compiling: what listeners of numba's events hear, `_NoCollection` among them."""
     details = {"dispatcher": kernel, "args": args, "return_type": None}
     return event.trigger_event("numba:compile", data=details)
 
