@@ -69,55 +69,45 @@ def cut_spans(
 ) -> int:
     """Number S of spans: boxes of one track in rows one after the other; -1 if a track is none.
 
-    `spans` (A + 1, 3), of which S + 1 are written, are the box that each begins at, its row counted
-    from `first`, and its track. `place` (N,) becomes 1 for tracks, all of the N, that occur in the
-    rows first … last - 1.
+    All or none of a span is in the rows first … last - 1. `spans` (A + 1, 3), of which S + 1 are
+    written, are the box that each begins at, its row counted from `first`, and its track, or -1
+    where it is in none of the rows. `place` (N,) becomes 1 for tracks, all of the N, that are in
+    some.
     """
-    count, of, gap = 0, -1, 0
+    count, of, gap, stop = 0, -1, 0, 0
     for box in range(np.uint64(len(row))):
-        if track[box] != of or row[box] - np.int64(box) != gap:
+        if track[box] != of or row[box] - np.int64(box) != gap or row[box] == stop:
             of, gap = track[box], row[box] - np.int64(box)
             if not 0 <= of < len(place):
                 return -1
+            stop = first if row[box] < first else last
+            is_inside = first <= row[box] < last
+            if is_inside:
+                place[np.uint64(of)] = 1
             at = np.uint64(count)
-            spans[at, 0], spans[at, 1], spans[at, 2] = box, row[box] - first, of
+            spans[at, 0], spans[at, 1] = box, row[box] - first
+            spans[at, 2] = of if is_inside else -1
             count += 1
     spans[np.uint64(count), 0] = len(row)
-    for span in range(np.uint64(count)):
-        start, end = spans[span, 1], span_end(spans, span)
-        if start < last - first and end > 0:
-            place[np.uint64(spans[span, 2])] = 1
     return count
 
 
 @lean_kernel
-def span_end(spans: IntArray, span: np.uint64) -> int:
-    """One past the last row of a span."""
-    return spans[span, 1] + spans[span + np.uint64(1), 0] - spans[span, 0]
+def place_of(spans: IntArray, span: np.uint64, place: IntArray) -> int:
+    """The place of a span's track in the dense arrays, from 1; 0 if it is in none of their rows."""
+    track = spans[span, 2]
+    return place[np.uint64(track)] if track >= 0 else 0
 
 
 @lean_kernel
 def mark(spans: IntArray, place: IntArray, there: BoolArray) -> None:
     """Note in `there` (N, R) where there are boxes of tracks, by their place, from 1 on."""
     for span in range(np.uint64(len(spans) - 1)):
-        to = place[np.uint64(spans[span, 2])] - 1
-        if to >= 0:
-            end = min(span_end(spans, span), there.shape[1])
-            for row in range(max(spans[span, 1], 0), end):
-                there[np.uint64(to), np.uint64(row)] = True
-
-
-@lean_kernel
-def first_place(
-    spans: IntArray, span: np.uint64, place: IntArray, num: np.uint64, end: np.uint64
-) -> np.uint64:
-    """Which box of the dense arrays a span begins at; `end` or more if that is none of them.
-
-    A span may begin before the first row. Its box is then less than 0, which is a very large number
-    here; counted up row by row it comes to 0 where the arrays begin.
-    """
-    to = place[np.uint64(spans[span, 2])]
-    return np.uint64(spans[span, 1]) * num + np.uint64(to - 1) if to > 0 else end
+        to, row = place_of(spans, span, place), np.uint64(spans[span, 1])
+        if to > 0:
+            for _ in range(spans[span, 0], spans[span + np.uint64(1), 0]):
+                there[np.uint64(to - 1), row] = True
+                row += np.uint64(1)
 
 
 @lean_kernel
@@ -151,11 +141,11 @@ def scatter(
     zero, one, two, three = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
     size = ~(one << np.uint64(63))
     num = np.uint64(shape[1])
-    end = np.uint64(shape[0]) * num
     good, over = True, zero  # the top bit of `over`: a number was beyond its limit
     x_step = y_step = heading_step = x_bits = y_bits = heading_bits = zero
     for span in range(np.uint64(len(spans) - 1)):
-        at = first_place(spans, span, place, num, end)
+        to = place_of(spans, span, place)
+        at = np.uint64(spans[span, 1]) * num + np.uint64(to - 1)
         for box in range(np.uint64(spans[span, 0]), np.uint64(spans[span + one, 0])):
             if is_plain:
                 x_bits, y_bits, heading_bits = x[box], y[box], heading[box]
@@ -168,7 +158,7 @@ def scatter(
                 heading_bits += heading_step
             over |= (x_top - (x_bits & size)) | (y_top - (y_bits & size))
             over |= heading_top - (heading_bits & size)
-            if at < end:
+            if to > 0:
                 poses[three * at] = x_bits
                 poses[three * at + one] = y_bits
                 poses[three * at + two] = heading_bits
@@ -177,7 +167,8 @@ def scatter(
     vx_least = vy_least = ~zero
     vx_step = vy_step = vx_bits = vy_bits = zero
     for span in range(np.uint64(len(spans) - 1)):
-        at = first_place(spans, span, place, num, end)
+        to = place_of(spans, span, place)
+        at = np.uint64(spans[span, 1]) * num + np.uint64(to - 1)
         for box in range(np.uint64(spans[span, 0]), np.uint64(spans[span + one, 0])):
             if is_plain:
                 vx_bits, vy_bits = vx[box], vy[box]
@@ -192,7 +183,7 @@ def scatter(
             long, wide = length[box], width[box]
             good &= (long >= least_length) & (long <= most_length)
             good &= (wide >= least_width) & (wide <= most_width)
-            if at < end:
+            if to > 0:
                 velocities[two * at] = vx_bits
                 velocities[two * at + one] = vy_bits
                 sizes[two * at] = long

@@ -152,6 +152,9 @@ class StoredRecording:
 
     def _frames(self, blocks: list[int]) -> tuple[IntArray, TrafficLights]:
         """Times and lights of the rows of some row groups."""
+        if not self.connectors:
+            times = _view(self.frames.read(blocks, ["time_us"]).column(0))
+            return times, TrafficLights.empty(len(times))
         frames = self.frames.read(blocks)
         shape = (len(frames), len(self.connectors))
         status = _whole(frames["light_status"]).values
