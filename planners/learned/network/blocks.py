@@ -4,21 +4,29 @@ Only inference is meant: no dropout, no drop path. What the official code comput
 away is not computed here: the ego's own history, and all but the last step of an agent's.
 """
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.planners.learned.network.rows import Attention, Linear, Mlp, Scenes, linear
+from shiftsim.planners.learned.network.rows import (
+    Attention,
+    Linear,
+    Mlp,
+    Scenes,
+    by_columns,
+    linear,
+)
 
 DIM = 128
 NUM_AGENT_KINDS = 4
 HISTORY_CHANNELS = 9
 STATE_CHANNELS = 6  # of the ego state that are read
-_WIDTHS, _HEADS, _WINDOWS = (32, 64, 128), (2, 4, 8), (3, 3, 5)
+# by level of the history encoder
+_WIDTHS, _HEADS, _WINDOWS, _LENGTHS = (32, 64, 128), (2, 4, 8), (3, 3, 5), (20, 10, 5)
 _MLP_RATIO = 3  # of the history encoder
 _LINES_AT_ONCE = 64  # on a CPU: what is computed for them stays in its cache
 
@@ -58,6 +66,35 @@ class SceneTensors:
         return torch.cat([now, self.centers], dim=1)
 
 
+class Prepared(nn.Module):
+    """A module that computes with numbers made from its weights, as joined layers are.
+
+    They are made once for inference, and each time in training, where weights change.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept: Any = None
+        self.register_load_state_dict_post_hook(_forget)  # type: ignore[no-untyped-call]
+
+    def prepared(self) -> Any:
+        """What `prepare` gives, kept until other weights are loaded."""
+        if not torch.is_inference_mode_enabled():
+            return self.prepare()
+        if self._kept is None:
+            self._kept = self.prepare()
+        return self._kept
+
+    def prepare(self) -> Any:
+        """What depends on the weights alone."""
+        raise NotImplementedError
+
+
+def _forget(module: Prepared, keys: object) -> None:
+    """Called when a module has got other weights."""
+    module._kept = None
+
+
 class EncoderBlock(nn.Module):
     """Pre-norm transformer block."""
 
@@ -79,48 +116,38 @@ class EncoderBlock(nn.Module):
         return x + self.mlp(self.norm2(x))
 
 
-class NeighborhoodAttention(nn.Module):
+class NeighborhoodAttention(Prepared):
     """Attention along a sequence to the `window` nearest positions; windows shift at the ends."""
 
-    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+    def __init__(self, dim: int, num_heads: int, window: int, length: int) -> None:
         super().__init__()
-        self.num_heads, self.window = num_heads, window
+        self.num_heads, self.window, self.length = num_heads, window, length
         self.rpb = nn.Parameter(torch.zeros(num_heads, 2 * window - 1))
         self.qkv = Linear(dim, 3 * dim)
         self.proj = Linear(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(A, L, D) to (A, L, D)."""
-        count, length, _ = x.shape
-        qkv = self.qkv(x).reshape(count, length, 3, self.num_heads, -1).permute(2, 0, 3, 1, 4)
-        bias = self._bias(length)
-        mixed = functional.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2], attn_mask=bias)
-        return self.proj(mixed.transpose(1, 2).flatten(2))
+        """(A * length, D) to the same."""
+        qkv = self.qkv(x).view(-1, self.length, 3, self.num_heads, x.shape[1] // self.num_heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=self.prepared())
+        return self.proj(mixed.transpose(1, 2).reshape(x.shape))
 
-    def _bias(self, length: int) -> Tensor:
+    def prepare(self) -> Tensor:
         """(1, heads, L, L) logits added to a pair of positions, -inf outside of the window."""
-        offset, outside = _windows(length, self.window, self.rpb.device)
-        return (self.rpb[:, offset] + outside)[None]
-
-
-@lru_cache
-def _windows(length: int, window: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(L, L) column of the bias for a pair of positions, and -inf where it is outside, else 0."""
-    with torch.inference_mode(False):
-        positions = torch.arange(length, device=device)
-        first = (positions - window // 2).clamp(0, length - window)
+        positions = torch.arange(self.length, device=self.rpb.device)
+        first = (positions - self.window // 2).clamp(0, self.length - self.window)
         ahead = positions[None, :] - first[:, None]
-        offset = positions[None, :] - positions[:, None] + window - 1
-        outside = torch.zeros(length, length, device=device)
-        outside[(ahead < 0) | (ahead >= window)] = -torch.inf
-        return offset.clamp(0, 2 * window - 2), outside
+        offset = positions[None, :] - positions[:, None] + self.window - 1
+        bias = self.rpb[:, offset.clamp(0, 2 * self.window - 2)]
+        return bias.masked_fill((ahead < 0) | (ahead >= self.window), -torch.inf)[None]
 
 
 class _HistoryBlock(nn.Module):
-    def __init__(self, dim: int, num_heads: int, window: int) -> None:
+    def __init__(self, dim: int, num_heads: int, window: int, length: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim)
-        self.attn = NeighborhoodAttention(dim, num_heads, window)
+        self.attn = NeighborhoodAttention(dim, num_heads, window, length)
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = Mlp(dim, _MLP_RATIO * dim, dim)
 
@@ -142,14 +169,15 @@ class _Downsample(nn.Module):
 class _Level(nn.Module):
     def __init__(self, index: int) -> None:
         super().__init__()
-        dim, heads, window = _WIDTHS[index], _HEADS[index], _WINDOWS[index]
-        self.blocks = nn.ModuleList(_HistoryBlock(dim, heads, window) for _ in range(2))
+        dim, sizes = _WIDTHS[index], (_HEADS[index], _WINDOWS[index], _LENGTHS[index])
+        self.blocks = nn.ModuleList(_HistoryBlock(dim, *sizes) for _ in range(2))
         self.downsample = _Downsample(dim) if index + 1 < len(_WIDTHS) else None
 
     def forward(self, x: Tensor) -> Tensor:
+        rows = x.flatten(0, 1)
         for block in self.blocks:
-            x = block(x)
-        return x
+            rows = block(rows)
+        return rows.view(x.shape)
 
 
 class _Embed(nn.Module):
@@ -161,8 +189,11 @@ class _Embed(nn.Module):
         return _convolved(self.proj, functional.pad(x, (0, 0, 1, 1)))
 
 
-class HistoryEncoder(nn.Module):
-    """One vector per agent from 20 steps of its history: a feature pyramid, read at the end."""
+class HistoryEncoder(Prepared):
+    """One vector per agent from 20 steps of its history: a feature pyramid, read at the end.
+
+    The vector depends on the last three steps of each level, and on these as one product does.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -175,18 +206,28 @@ class HistoryEncoder(nn.Module):
     def forward(self, steps: Tensor) -> Tensor:
         """(A, 20, 9) to (A, 128)."""
         x = self.embed(steps)
-        norms = (self.norm0, self.norm1, self.norm2)
         ends = []
-        for level, norm, lateral in zip(self.levels, norms, self.lateral_convs, strict=True):
+        for level, norm in zip(self.levels, (self.norm0, self.norm1, self.norm2), strict=True):
             assert isinstance(level, _Level)
             x = level(x)
-            ends.append(_end(lateral, norm(x[:, -3:])))
+            ends.append(norm(x[:, -3:]).flatten(1))
             if level.downsample is not None:
                 x = level.downsample(x)
-        merged = ends[2]
-        for end in (ends[1], ends[0]):
-            merged = end + _upsampled_end(merged)
-        return _end(self.fpn_conv, merged)[:, 0]
+        return linear(torch.cat(ends, dim=1), *self.prepared())
+
+    def prepare(self) -> tuple[Tensor, Tensor]:
+        """Weight (128, 672) and bias (128,) of the product: what unit vectors and zeros give."""
+        weight = self.fpn_conv.weight
+        sizes = [3 * width for width in _WIDTHS]
+        units = torch.eye(sum(sizes) + 1, dtype=torch.float64, device=weight.device)[:, :-1]
+        merged: Tensor | None = None
+        parts = zip(torch.split(units, sizes, dim=1), self.lateral_convs, strict=True)
+        for end, lateral in reversed([*parts]):
+            own = _end(lateral, end.reshape(len(units), 3, -1))
+            merged = own if merged is None else own + _upsampled_end(merged)
+        assert merged is not None
+        out = _end(self.fpn_conv, merged)[:, 0]
+        return by_columns((out[:-1] - out[-1]).t()).to(weight.dtype), out[-1].to(weight.dtype)
 
 
 def _convolved(conv: nn.Module, x: Tensor, stride: int = 1) -> Tensor:
@@ -198,7 +239,10 @@ def _convolved(conv: nn.Module, x: Tensor, stride: int = 1) -> Tensor:
 
 def _end(conv: nn.Module, end: Tensor) -> Tensor:
     """The last k - 1 steps of a padded convolution, of the last k steps before it (A, k, C)."""
-    return _convolved(conv, functional.pad(end, (0, 0, 0, 1)))
+    assert isinstance(conv, nn.Conv1d)
+    assert conv.bias is not None
+    windows = functional.pad(end, (0, 0, 0, 1)).unfold(1, 3, 1).flatten(2)
+    return windows @ conv.weight.to(end.dtype).flatten(1).t() + conv.bias
 
 
 def _upsampled_end(end: Tensor) -> Tensor:
@@ -207,8 +251,11 @@ def _upsampled_end(end: Tensor) -> Tensor:
     return torch.stack([0.25 * before + 0.75 * last, last], dim=1)
 
 
-class EgoStateEncoder(nn.Module):
-    """One vector from the scalars of the ego state: a learned query attends to a token for each."""
+class EgoStateEncoder(Prepared):
+    """One vector from the scalars of the ego state: a learned query attends to a token for each.
+
+    A token is a straight line in its scalar. So are the query's logits, and what is mixed.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -219,12 +266,32 @@ class EgoStateEncoder(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, >= 6) to (B, 128)."""
-        linears = [layer for layer in self.linears if isinstance(layer, Linear)]
-        weight = torch.cat([layer.weight for layer in linears], dim=1).t()
-        place = torch.stack([layer.bias for layer in linears]) + self.pos_embed
-        tokens = torch.addcmul(place, state[:, :STATE_CHANNELS, None], weight)
-        query = self.query.expand(len(state), -1, -1)
-        return self.attn(query, tokens, tokens)[:, 0]
+        start, slope, mixing = self.prepared()
+        scalars = state[:, None, :STATE_CHANNELS]
+        weights = torch.addcmul(start, slope, scalars).softmax(dim=-1)
+        read = torch.cat([weights, weights * scalars], dim=-1).flatten(1)
+        return linear(read, mixing, self.attn.out_proj.bias)
+
+    def prepare(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits (heads, 6) where scalars are zero, their slopes, and what is mixed (128, 48)."""
+        attn, layers = self.attn, [layer for layer in self.linears if isinstance(layer, Linear)]
+        starts = (torch.stack([layer.bias for layer in layers]) + self.pos_embed[0]).double()
+        slopes = torch.cat([layer.weight for layer in layers], dim=1).t().double()
+        by_head = (-1, attn.num_heads, attn.width)
+
+        def read(weight: Tensor, bias: Tensor) -> Tensor:
+            both = [starts @ weight.t() + bias, slopes @ weight.t()]
+            return torch.cat(both).view(by_head)  # (12, heads, width)
+
+        ask, key, value = attn.in_proj_weight.double().chunk(3)
+        ask_bias, key_bias, value_bias = attn.in_proj_bias.double().chunk(3)
+        query = (self.query[0].double() @ ask.t() + ask_bias).view(by_head)
+        logits = (read(key, key_bias) * query).sum(-1).t() / math.sqrt(attn.width)
+        out = attn.out_proj.weight.double().view(by_head)
+        mixing = torch.einsum("ohw,thw->oht", out, read(value, value_bias)).flatten(1)
+        start, slope = logits.chunk(2, dim=1)
+        kind = self.query.dtype
+        return start.to(kind), slope.to(kind), mixing.to(kind)
 
 
 class AgentEncoder(nn.Module):
@@ -259,37 +326,26 @@ def _history_steps(seen: SceneTensors) -> Tensor:
     return torch.cat([*parts, both[..., None].to(moved.dtype)], dim=-1)
 
 
-class PointsEncoder(nn.Module):
+class PointsEncoder(Prepared):
     """One vector per polyline from its valid points; rows of invalid points count as zeros."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.first_mlp = _points_mlp(channels, 128, 256)
         self.second_mlp = _points_mlp(512, 256, DIM)
-        self._kept: _Layers | None = None  # for inference
-        self.register_load_state_dict_post_hook(_forget)  # type: ignore[no-untyped-call]
 
     def forward(self, points: Tensor, keep: Tensor) -> Tensor:
         """(B, M, K, channels) with `keep` (B, M, K) to (B, M, 128)."""
         lines, valid = points.flatten(0, 1), keep.flatten(0, 1)
         size = _LINES_AT_ONCE if points.device.type == "cpu" else max(len(lines), 1)
-        layers = self._folded()
+        layers = self.prepared()
         parts = zip(torch.split(lines, size), torch.split(valid, size), strict=True)
         encoded = torch.cat([_encode_lines(*part, layers) for part in parts])
         return encoded.reshape(*keep.shape[:2], encoded.shape[1])
 
-    def _folded(self) -> "_Layers":
-        if self._kept is not None and torch.is_inference_mode_enabled():
-            return self._kept
-        layers = _joined(self.first_mlp, self.second_mlp)
-        if torch.is_inference_mode_enabled():
-            self._kept = layers
-        return layers
-
-
-def _forget(encoder: PointsEncoder, keys: object) -> None:
-    """Called when an encoder has got other weights."""
-    encoder._kept = None
+    def prepare(self) -> "_Layers":
+        """The layers of both parts."""
+        return _joined(self.first_mlp, self.second_mlp)
 
 
 class _Layers(NamedTuple):
@@ -331,10 +387,10 @@ def _folded(mlp: nn.Sequential) -> tuple[Tensor, Tensor]:
 def _encode_lines(points: Tensor, keep: Tensor, layers: _Layers) -> Tensor:
     """(M, out) from (M, K, channels) with `keep` (M, K)."""
     (row,) = torch.nonzero(keep.flatten(), as_tuple=True)
-    inner = linear(points.flatten(0, 1)[row], *layers.enter).relu_()
+    inner = linear(points.flatten(0, 1).index_select(0, row), *layers.enter).relu_()
     pooled = _pooled(layers.leave(inner), row, keep)
     mixed = linear(inner, layers.own)
-    mixed += linear(pooled, *layers.line)[row // keep.shape[1]]
+    mixed += linear(pooled, *layers.line).index_select(0, row // keep.shape[1])
     return _pooled(layers.last(mixed.relu_()), row, keep)
 
 
@@ -347,7 +403,7 @@ def _points_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 def _pooled(values: Tensor, row: Tensor, keep: Tensor) -> Tensor:
     """(M, C) maximum over the points of each line; points without a value count as zero."""
     dense = values.new_zeros(keep.numel(), values.shape[1])
-    dense.index_copy_(0, row, values)
+    dense.index_add_(0, row, values)  # twice as quick as to copy
     return dense.reshape(*keep.shape, values.shape[1]).amax(dim=1)
 
 

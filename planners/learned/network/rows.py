@@ -138,26 +138,52 @@ def make_scenes(counts: Sequence[int], keep: Tensor) -> Scenes:
     return Scenes(list(counts), masks)
 
 
-def present(counts: Sequence[int], length: int, device: torch.device) -> Tensor:
-    """(B, length) true in the first rows of every scene, as many as it has."""
-    return torch.arange(length, device=device) < torch.tensor(counts, device=device)[:, None]
+class Packing(NamedTuple):
+    """Which of the rows (B, N) of scenes side by side are no padding."""
+
+    shape: tuple[int, int]
+    there: Tensor | None  # (B, N); None where all are
+
+    def pack(self, x: Tensor) -> Tensor:
+        """(T, ...) the rows of x (B, N, ...) that are no padding, scene by scene."""
+        return x.flatten(0, 1) if self.there is None else x[self.there]
+
+    def unpack(self, rows: Tensor, padding: float = 0.0) -> Tensor:
+        """(B, N, ...) of rows (T, ...)."""
+        if self.there is None:
+            return rows.reshape(*self.shape, *rows.shape[1:])
+        x = rows.new_full((*self.shape, *rows.shape[1:]), padding)
+        x[self.there] = rows
+        return x
+
+
+def make_packing(
+    lengths: Sequence[int], counts: Sequence[Sequence[int]], device: torch.device
+) -> Packing:
+    """Of parts side by side, in `lengths` rows, of which scenes have `counts`, by part."""
+    shape = len(counts[0]), sum(lengths)
+    if all(count == length for length, part in zip(lengths, counts, strict=True) for count in part):
+        return Packing(shape, None)
+    there = [
+        torch.arange(length, device=device) < torch.tensor(part, device=device)[:, None]
+        for length, part in zip(lengths, counts, strict=True)
+    ]
+    return Packing(shape, torch.cat(there, dim=1))
 
 
 def without_padding(
     parts: Sequence[Tensor], counts: Sequence[Sequence[int]] | None
-) -> tuple[Tensor, Scenes]:
-    """Rows (B, N of all parts) of parts side by side that are no padding, and the scenes they make.
+) -> tuple[Packing, Scenes]:
+    """How rows (B, N of all parts) of parts side by side lie without padding: the scenes they make.
 
     The parts (B, N) are true for rows that take part; `counts` says by part how many rows each
     scene has, None for all.
     """
-    counts = counts or [[part.shape[1]] * len(part) for part in parts]
-    there = torch.cat(
-        [present(n, part.shape[1], part.device) for n, part in zip(counts, parts, strict=True)],
-        dim=1,
-    )
+    lengths = [part.shape[1] for part in parts]
+    counts = counts or [[length] * len(parts[0]) for length in lengths]
+    packing = make_packing(lengths, counts, parts[0].device)
     totals = list(map(sum, zip(*counts, strict=True)))
-    return there, make_scenes(totals, torch.cat(list(parts), dim=1)[there])
+    return packing, make_scenes(totals, packing.pack(torch.cat(list(parts), dim=1)))
 
 
 class Attention(nn.Module):
@@ -214,6 +240,11 @@ class Attention(nn.Module):
         )
         return q, k, v
 
+    def to_itself(self, x: Tensor) -> Tensor:
+        """(..., D) where every row attends to itself alone, whose weight is then 1."""
+        dim = 2 * self.out_proj.in_features
+        return self.out_proj(linear(x, self.in_proj_weight[dim:], self.in_proj_bias[dim:]))
+
     def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Projected keys and values of a context, each (..., D)."""
         dim = self.out_proj.in_features
@@ -239,6 +270,11 @@ def store_by_columns(network: nn.Module) -> None:
     """
     for module in network.modules():
         if isinstance(module, nn.Linear):
-            module.weight.data = module.weight.data.t().contiguous().t()
+            module.weight.data = by_columns(module.weight.data)
         elif isinstance(module, Attention):
-            module.in_proj_weight.data = module.in_proj_weight.data.t().contiguous().t()
+            module.in_proj_weight.data = by_columns(module.in_proj_weight.data)
+
+
+def by_columns(weight: Tensor) -> Tensor:
+    """The same matrix, laid out by columns."""
+    return weight.t().contiguous().t()

@@ -98,9 +98,9 @@ class PlanTfNetwork(nn.Module):
     def forward(self, seen: Inputs, *, predict: bool = False) -> Outputs:
         """Plan for a batch; the agents' predictions only where asked for, no plan needs them."""
         points = torch.cat(blocks.along_line(seen.points, seen), dim=-1)
-        there, scenes = without_padding(seen.there, seen.counts)
+        packing, scenes = without_padding(seen.there, seen.counts)
         tokens = torch.cat([self.agent_encoder(seen), self.map_encoder(points, seen)], dim=1)
-        x = tokens[there] + self._placed(seen.poses[there])
+        x = packing.pack(tokens) + self._placed(packing.pack(seen.poses))
         egos = scenes.firsts(x.device)
         last = len(self.encoder_blocks) - 1
         for index, block in enumerate(self.encoder_blocks):
@@ -109,9 +109,7 @@ class PlanTfNetwork(nn.Module):
         trajectory, probability = self.trajectory_decoder(x[egos] if predict else x)
         if not predict:
             return Outputs(trajectory, probability, None)
-        tokens = x.new_zeros(*there.shape, blocks.DIM)
-        tokens[there] = x
-        prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
+        prediction = self.agent_predictor(packing.unpack(x)[:, 1 : seen.valid.shape[1]])
         shape = (*prediction.shape[:2], STEPS, 2)
         return Outputs(trajectory, probability, prediction.reshape(shape))
 

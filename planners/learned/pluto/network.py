@@ -9,7 +9,13 @@ from torch import Tensor, nn
 
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network import blocks
-from shiftsim.planners.learned.network.rows import Linear, Scenes, store_by_columns, without_padding
+from shiftsim.planners.learned.network.rows import (
+    Linear,
+    Packing,
+    Scenes,
+    store_by_columns,
+    without_padding,
+)
 from shiftsim.planners.learned.pluto.network_decoder import (
     DEPTH,
     HEADS,
@@ -17,7 +23,10 @@ from shiftsim.planners.learned.pluto.network_decoder import (
     STEPS,
     FourierEmbedding,
     MlpLayer,
+    MotionHeads,
     PlanningDecoder,
+    motion,
+    motion_heads,
 )
 
 PREFIXES = ("model.",)  # of the names in the published checkpoint
@@ -112,7 +121,7 @@ class StaticObjectsEncoder(nn.Module):
         return tokens * valid[..., None]
 
 
-class AgentPredictor(nn.Module):
+class AgentPredictor(blocks.Prepared):
     """Motion of the agents from their tokens."""
 
     def __init__(self) -> None:
@@ -122,9 +131,11 @@ class AgentPredictor(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """(B, A, 128) to (B, A, 80, 6)."""
-        heads = (self.loc_predictor, self.yaw_predictor, self.vel_predictor)
-        shape = (*tokens.shape[:2], STEPS, 2)
-        return torch.cat([head(tokens).reshape(shape) for head in heads], dim=-1)
+        return motion(tokens, self.prepared())
+
+    def prepare(self) -> MotionHeads:
+        """The heads as one."""
+        return motion_heads([self.loc_predictor, self.yaw_predictor, self.vel_predictor])
 
 
 class PlutoNetwork(nn.Module):
@@ -150,23 +161,21 @@ class PlutoNetwork(nn.Module):
     def forward(self, seen: Inputs) -> Outputs:
         """Plan for a batch."""
         *counts, num_lines = seen.counts or _all_counts(seen)
-        x, scenes, there = self._encode(seen, counts)
+        x, scenes, packing = self._encode(seen, counts)
         egos = x[scenes.firsts(x.device)]
-        tokens = x.new_zeros(*there.shape, blocks.DIM)
-        tokens[there] = x
-        prediction = self.agent_predictor(tokens[:, 1 : seen.valid.shape[1]])
+        prediction = self.agent_predictor(packing.unpack(x)[:, 1 : seen.valid.shape[1]])
         free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
         trajectory, probability = self.planning_decoder(seen, num_lines, x, scenes, egos)
         return Outputs(trajectory, probability, prediction, free, egos)
 
     def _encode(
         self, seen: Inputs, counts: Sequence[Sequence[int]]
-    ) -> tuple[Tensor, Scenes, Tensor]:
+    ) -> tuple[Tensor, Scenes, Packing]:
         """Tokens (T, 128) of ego, agents, polygons and static objects, scene by scene.
 
         Also how they lie, and which of all rows (B, A + M + S) they are: those without padding.
         """
-        there, scenes = without_padding((*seen.there, seen.object_valid), counts)
+        packing, scenes = without_padding((*seen.there, seen.object_valid), counts)
         middle = seen.points[:, :, 0]
         sides = [seen.points[:, :, side] - middle for side in (1, 2)]
         points = torch.cat([*blocks.along_line(middle, seen), *sides], dim=-1)
@@ -175,13 +184,13 @@ class PlutoNetwork(nn.Module):
             self.map_encoder(points, seen),
             self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
         )
-        poses = torch.cat([seen.poses, seen.object_pose], dim=1)[there]
+        poses = packing.pack(torch.cat([seen.poses, seen.object_pose], dim=1))
         angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
         where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
-        x = torch.cat(tokens, dim=1)[there] + where
+        x = packing.pack(torch.cat(tokens, dim=1)) + where
         for block in self.encoder_blocks:
             x = block(x, scenes)
-        return self.norm(x), scenes, there
+        return self.norm(x), scenes, packing
 
 
 def _all_counts(seen: Inputs) -> list[list[int]]:

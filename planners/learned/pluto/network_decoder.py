@@ -1,13 +1,25 @@
 """The decoder of PLUTO's network: trajectories along reference lines."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder
-from shiftsim.planners.learned.network.rows import Attention, Linear, Scenes, filled, present
+from shiftsim.planners.learned.network.blocks import DIM, PointsEncoder, Prepared
+from shiftsim.planners.learned.network.rows import (
+    ROWS,
+    Attention,
+    Linear,
+    Packing,
+    Scenes,
+    by_columns,
+    filled,
+    linear,
+    make_packing,
+)
 
 DEPTH, HEADS, MODES, STEPS = 4, 4, 12, 80
 NUM_FREQUENCIES = 64
@@ -40,7 +52,42 @@ class MlpLayer(nn.Module):
         return out.view(*x.shape[:-1], out.shape[1])
 
 
-class FourierEmbedding(nn.Module):
+class MotionHeads(NamedTuple):
+    """Several `MlpLayer` that read the same rows, H of them, as few products."""
+
+    enter: tuple[Tensor, Tensor]  # (H * 256, 128) weight and (H * 256,) bias
+    norm: tuple[Tensor, Tensor]  # (H, 256) scale and shift
+    leave: tuple[Tensor, Tensor]  # (H, 1, 160) bias and (H, 256, 160) weight
+
+
+def motion_heads(layers: Sequence[MlpLayer]) -> MotionHeads:
+    """Of heads, each for two of the channels of a motion."""
+    enter, bias, scale, shift, leave, leave_bias = _stacked([layer.mlp for layer in layers])
+    first = by_columns(enter.flatten(0, 1)), bias.flatten()
+    last = leave_bias[:, None], leave.transpose(1, 2).contiguous()
+    return MotionHeads(first, (scale, shift), last)
+
+
+def motion(x: Tensor, heads: MotionHeads) -> Tensor:
+    """(..., steps, 2 H) from x (..., 128)."""
+    rows = filled(x.reshape(-1, x.shape[-1]))
+    scale, shift = heads.norm
+    hidden = linear(rows, *heads.enter).view(len(rows), *scale.shape)
+    hidden = torch.addcmul(shift, functional.layer_norm(hidden, scale.shape[1:]), scale).relu_()
+    bias, weight = heads.leave
+    out = torch.baddbmm(bias, hidden.transpose(0, 1), weight)  # (H, rows, 2 * steps)
+    count = math.prod(x.shape[:-1])
+    by_step = out[:, :count].view(len(scale), count, STEPS, 2).permute(1, 2, 0, 3)
+    return by_step.reshape(*x.shape[:-1], STEPS, 2 * len(scale))
+
+
+def _stacked(mlps: Iterable[nn.Module]) -> list[Tensor]:
+    """Weights of several alike: Linear, LayerNorm, ReLU, Linear."""
+    each = zip(*(mlp.parameters() for mlp in mlps), strict=True)
+    return [torch.stack(part) for part in each]
+
+
+class FourierEmbedding(Prepared):
     """A vector from a few scalars, each by its own frequencies and layers; the sum counts."""
 
     def __init__(self, inputs: int) -> None:
@@ -58,12 +105,20 @@ class FourierEmbedding(nn.Module):
         """(..., inputs) to (..., 128)."""
         rows = x.reshape(-1, x.shape[-1])
         few = filled(rows)[..., None]
-        turns = few * self.freqs.weight * (2.0 * torch.pi)
+        turns = (few * self.freqs.weight).mul_(2.0 * torch.pi)
         waves = torch.cat([turns.cos(), turns.sin(), few], dim=-1)
-        total = self.mlps[0](waves[:, 0])
-        for index in range(1, len(self.mlps)):
-            total = total + self.mlps[index](waves[:, index])
+        (bias, weight), (scale, shift), leave = self.prepared()
+        hidden = torch.baddbmm(bias, waves.transpose(0, 1), weight)  # (inputs, rows, 128)
+        hidden = torch.addcmul(shift, functional.layer_norm(hidden, (DIM,)), scale).relu_()
+        total = linear(hidden.transpose(0, 1).flatten(1), *leave)
         return self.to_out(total)[: len(rows)].view(*x.shape[:-1], DIM)
+
+    def prepare(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        """The layers of all scalars, of which the last add up: one product reads them all."""
+        weight, bias, scale, shift, leave, leave_bias = _stacked(self.mlps)
+        first = bias[:, None], weight.transpose(1, 2).contiguous()
+        last = by_columns(leave.transpose(0, 1).flatten(1)), leave_bias.sum(dim=0)
+        return first, (scale[:, None], shift[:, None]), last
 
 
 class DecoderBlock(nn.Module):
@@ -78,32 +133,43 @@ class DecoderBlock(nn.Module):
         self.norm1, self.norm2, self.norm3, self.norm4 = (nn.LayerNorm(DIM) for _ in range(4))
 
     def forward(
-        self, x: Tensor, lines: "Lines", mode_position: Tensor, tokens: Tensor, scenes: Scenes
+        self, x: Tensor, lines: "Lines", place: Tensor, tokens: Tensor, scenes: Scenes
     ) -> Tensor:
-        """Refine queries (L, modes, 128) of reference lines by tokens (T, 128) of the scenes."""
-        x = x + self._among_lines(self.norm1(x), lines)
-        normed = self.norm2(x)
-        placed = normed + mode_position
-        x = x + self.m2m_attn(placed, placed, normed)
-        x = x * lines.valid[:, None, None]
+        """Refine queries (L * rows, 128) of reference lines by tokens (T, 128) of the scenes.
 
-        modes = x.shape[1]
-        asking = [count * modes for count in lines.counts]
-        flat = x.flatten(0, 1)
-        flat = flat + self.cross_attn.among(self.norm3(flat), tokens, asking, scenes)
-        flat = flat + self.ffn(self.norm4(flat))
-        return flat.view(x.shape)
+        `place` (rows, 384) is what the modes add to their queries, keys and values.
+        """
+        x = x + self._among_lines(self.norm1(x), lines)
+        x = x + self._among_modes(self.norm2(x), lines, place)
+        x = (x.view(len(lines.valid), -1) * lines.valid[:, None]).view(x.shape)
+        asking = [count * lines.rows for count in lines.counts]
+        x = x + self.cross_attn.among(self.norm3(x), tokens, asking, scenes)
+        return x + self.ffn(self.norm4(x))
 
     def _among_lines(self, x: Tensor, lines: "Lines") -> Tensor:
-        """(L, modes, 128): every mode of a line attends to the same mode of the scene's others."""
-        parts = [torch.split(part, lines.counts) for part in self.r2r_attn.projected(x, x, x)]
+        """Every mode of a line attends to the same mode of the scene's others."""
+        if lines.masks is None:
+            return self.r2r_attn.to_itself(x)
+        by_line = (len(lines.valid), lines.rows, DIM)
+        parts = [
+            torch.split(part.view(by_line), lines.counts)
+            for part in self.r2r_attn.projected(x, x, x)
+        ]
         mixed = []
         for q, k, v, mask in zip(*parts, lines.masks, strict=True):
             by_mode = self.r2r_attn.mixed(
                 q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1), mask
             )
             mixed.append(by_mode.transpose(0, 1))
-        return self.r2r_attn.out_proj(torch.cat(mixed))
+        return self.r2r_attn.out_proj(torch.cat(mixed).flatten(0, 1))
+
+    def _among_modes(self, x: Tensor, lines: "Lines", place: Tensor) -> Tensor:
+        """Every mode of a line attends to the line's others."""
+        attn = self.m2m_attn
+        asked = linear(x, attn.in_proj_weight, attn.in_proj_bias)
+        q, k, v = (asked.view(len(lines.valid), *place.shape) + place).chunk(3, dim=-1)
+        mixed = attn.mixed(q, k[:, :MODES], v[:, :MODES])
+        return attn.out_proj(mixed.flatten(0, 1))
 
 
 class Lines(NamedTuple):
@@ -111,11 +177,19 @@ class Lines(NamedTuple):
 
     counts: list[int]  # how many each scene has
     valid: Tensor  # (L,) those that have points
-    masks: list[Tensor]  # by scene (1 or modes, 1, 1, count) logits added to the lines attended to
+    # by scene (1 or modes, 1, 1, count) logits added to the lines attended to; None where each
+    # scene has one, which attends to itself
+    masks: list[Tensor] | None
+    rows: int  # of a line: the modes, and the last one again where products would have too few rows
 
 
-def make_lines(valid: Tensor, counts: Sequence[int], *, misordered_masks: bool) -> Lines:
+def make_lines(
+    valid: Tensor, counts: Sequence[int], packing: Packing, *, misordered_masks: bool
+) -> Lines:
     """From lines (B, R) that have points, of which `counts` are no padding."""
+    if set(counts) == {1} and not misordered_masks:
+        rows = ROWS if len(counts) == 1 and not valid.is_cuda else MODES
+        return Lines(list(counts), packing.pack(valid), None, rows)
     # a scene without any line that has points attends to all of them, and nothing reads it
     attended = valid | ~valid.any(dim=1, keepdim=True)
     logits = torch.zeros(valid.shape, device=valid.device).masked_fill(~attended, -torch.inf)
@@ -124,11 +198,10 @@ def make_lines(valid: Tensor, counts: Sequence[int], *, misordered_masks: bool) 
     else:
         logits = logits[:, None]
     masks = [row[:, None, None, :count] for row, count in zip(logits, counts, strict=True)]
-    there = present(counts, valid.shape[1], valid.device)
-    return Lines(list(counts), valid[there], masks)
+    return Lines(list(counts), packing.pack(valid), masks, MODES)
 
 
-class PlanningDecoder(nn.Module):
+class PlanningDecoder(Prepared):
     """Twelve trajectories and their logits for every reference line."""
 
     def __init__(self) -> None:
@@ -153,28 +226,38 @@ class PlanningDecoder(nn.Module):
         `counts` says how many lines of each scene are no padding; `tokens` (T, 128) are those of
         the scenes, `egos` (B, 128) of the egos.
         """
-        valid = seen.line_valid
-        shape = (*valid.shape[:2], MODES)
-        trajectory = tokens.new_zeros(*shape, STEPS, 6)
-        logits = tokens.new_full(shape, NEVER)
+        valid = seen.line_valid.any(dim=-1)
         if not any(counts):
-            return trajectory, logits
-        lines = make_lines(valid.any(dim=-1), counts, misordered_masks=self.misordered_masks)
-        there = present(counts, valid.shape[1], valid.device)
-        embedded = self._embed_lines(seen)[there]
-        wide = (len(embedded), MODES, DIM)
-        x = self.q_proj(
-            torch.cat([embedded[:, None].expand(wide), self.m_emb[0].expand(wide)], dim=-1)
-        )
+            shape = (*valid.shape, MODES)
+            return tokens.new_zeros(*shape, STEPS, 6), tokens.new_full(shape, NEVER)
+        packing = make_packing([valid.shape[1]], [counts], valid.device)
+        lines = make_lines(valid, counts, packing, misordered_masks=self.misordered_masks)
+        modes, places, heads = self.prepared()
+        wide = (len(lines.valid), lines.rows, DIM)
+        embedded = packing.pack(self._embed_lines(seen))
+        pairs = [embedded[:, None].expand(wide), modes[: lines.rows].expand(wide)]
+        x = self.q_proj(torch.cat(pairs, dim=-1).flatten(0, 1))
+        for block, place in zip(self.decoder_blocks, places, strict=True):
+            x = block(x, lines, place[: lines.rows], tokens, scenes)
+        if len(egos) > 1:
+            egos = egos.repeat_interleave(torch.tensor(counts, device=egos.device), dim=0)
+        x = self.cat_x_proj(torch.cat([x, egos[:, None].expand(wide).flatten(0, 1)], dim=-1))
+        plans = motion(x.view(wide), heads)[:, :MODES]
+        logits = self.pi_head(x).view(wide[:2])[:, :MODES]
+        logits = logits.masked_fill(~lines.valid[:, None], NEVER)
+        return packing.unpack(plans), packing.unpack(logits, NEVER)
+
+    def prepare(self) -> tuple[Tensor, list[Tensor], MotionHeads]:
+        """Modes (rows, 128), what they add in each block (rows, 384), and the heads as one."""
+        again = torch.arange(ROWS, device=self.m_pos.device).clamp(max=MODES - 1)
+        modes, position = self.m_emb[0, 0][again], self.m_pos[0][again]
+        places = []
         for block in self.decoder_blocks:
-            x = block(x, lines, self.m_pos, tokens, scenes)
-        own = egos.repeat_interleave(torch.tensor(counts, device=egos.device), dim=0)
-        x = self.cat_x_proj(torch.cat([x, own[:, None].expand(wide)], dim=-1))
-        heads = (self.loc_head, self.yaw_head, self.vel_head)
-        steps = (len(x), MODES, STEPS, 2)
-        trajectory[there] = torch.cat([head(x).reshape(steps) for head in heads], dim=-1)
-        logits[there] = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
-        return trajectory, logits
+            assert isinstance(block, DecoderBlock)
+            place = position @ block.m2m_attn.in_proj_weight[: 2 * DIM].t()
+            places.append(functional.pad(place, (0, DIM)))  # values have no place
+        heads = motion_heads([self.loc_head, self.yaw_head, self.vel_head])
+        return modes, places, heads
 
     def _embed_lines(self, seen: SeenLines) -> Tensor:
         """(B, R, 128)."""
