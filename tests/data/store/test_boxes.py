@@ -71,3 +71,35 @@ def test_a_track_that_is_none_is_noticed(wrong, rng):
     place, spans = np.zeros(TRACKS, np.int64), np.empty((4, 3), np.int64)
     rows = read_only(np.arange(3, dtype=np.int32))
     assert boxes.cut_spans(rows, read_only(track), 0, 3, place, spans) == -1
+
+
+def walk(row, track, first, last):
+    """Spans as `cut_spans` gives them, told box by box, and the tracks in the rows."""
+    spans = []
+    for box in range(len(row)):
+        goes_on = box > 0 and track[box] == track[box - 1] and row[box] == row[box - 1] + 1
+        if not goes_on or row[box] == (first if row[box - 1] < first else last):
+            is_inside = first <= row[box] < last
+            spans.append([box, row[box] - first, track[box] if is_inside else -1])
+    return spans, {track for _, _, track in spans} - {-1}
+
+
+def test_spans_longer_than_what_is_looked_at_together_end_where_a_walk_says(rng):
+    for _ in range(300):
+        pieces = [
+            np.arange(rng.integers(1, 4 * boxes._RUN)) + rng.integers(0, 60) for _ in range(6)
+        ]
+        row = np.concatenate(pieces)
+        track = np.repeat(rng.integers(0, TRACKS, 6), [len(piece) for piece in pieces])
+        for column in (row, track):  # one box that is not where its neighbours are
+            if rng.random() < 0.5:
+                column[rng.integers(0, len(row))] = rng.integers(0, TRACKS)
+        first = rng.integers(0, 100)
+        last = first + rng.integers(1, 100)
+        indices = (read_only(column.astype(np.int32)) for column in (row, track))
+        place, out = np.zeros(TRACKS, np.int64), np.empty((len(row) + 1, 3), np.int64)
+        count = boxes.cut_spans(*indices, first, last, place, out)
+        spans, seen = walk(row.tolist(), track.tolist(), first, last)
+        assert out[:count].tolist() == spans
+        assert out[count, 0] == len(row)
+        assert set(place.nonzero()[0].tolist()) == seen
