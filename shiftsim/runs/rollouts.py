@@ -76,7 +76,7 @@ _WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
     "compression_level": 1,
     "use_dictionary": ["planner", "noise", "token"],
-    "use_byte_stream_split": [*EGO_COLUMNS, *_COMMAND_COLUMNS],
+    "use_byte_stream_split": [*EGO_COLUMNS, *_COMMAND_COLUMNS, "plan_steps.list.element"],
     "write_statistics": False,
 }
 _NAME = pa.dictionary(pa.int32(), pa.string())
