@@ -16,7 +16,7 @@ BitArray: TypeAlias = NDArray[np.uint64]
 # bits of the largest numbers that are in `BOX_LIMITS`, which are as wide to both sides; of infinity
 HIGHEST = tuple(np.array([*BOX_LIMITS[:5, 1], np.inf]).view(np.uint64))
 SIZE_LIMITS = tuple(BOX_LIMITS[5:].reshape(-1).tolist())
-_RUN = 32  # boxes that are looked at together
+_AT_ONCE = 32  # boxes that are looked at together
 
 
 class BoxBlock(NamedTuple):
@@ -76,7 +76,7 @@ def cut_spans(
     some.
     """
     count, of, gap, stop = 0, -1, 0, 0
-    box, total, run = np.uint64(0), np.uint64(len(row)), np.uint64(_RUN)
+    box, total, many = np.uint64(0), np.uint64(len(row)), np.uint64(_AT_ONCE)
     while box < total:
         if track[box] != of or row[box] - np.int64(box) != gap or row[box] == stop:
             of, gap = track[box], row[box] - np.int64(box)
@@ -91,14 +91,14 @@ def cut_spans(
             spans[at, 2] = of if is_inside else -1
             count += 1
         box += np.uint64(1)
-        while box + run <= total and not box <= np.uint64(stop - gap) < box + run:
+        while box + many <= total and not box <= np.uint64(stop - gap) < box + many:
             other = 0  # looked at together: nearly always all of them go on with the span
-            for i in range(run):
+            for i in range(many):
                 there = np.int64(box + i)
                 other |= (track[box + i] - of) | (row[box + i] - there - gap)
             if other:
                 break
-            box += run
+            box += many
     spans[np.uint64(count), 0] = len(row)
     return count
 

@@ -87,7 +87,7 @@ def walk(row, track, first, last):
 def test_spans_longer_than_what_is_looked_at_together_end_where_a_walk_says(rng):
     for _ in range(300):
         pieces = [
-            np.arange(rng.integers(1, 4 * boxes._RUN)) + rng.integers(0, 60) for _ in range(6)
+            np.arange(rng.integers(1, 4 * boxes._AT_ONCE)) + rng.integers(0, 60) for _ in range(6)
         ]
         row = np.concatenate(pieces)
         track = np.repeat(rng.integers(0, TRACKS, 6), [len(piece) for piece in pieces])
