@@ -1,19 +1,21 @@
 """What a benchmark will cost on this machine: tasks, time, memory and disk, before it is run.
 
 A few tasks of every planner and run are done and timed, after one of each noise that loads and
-compiles; nothing is written.
+compiles; nothing is kept.
 """
 
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
-import pyarrow as pa
-
 from shiftsim.benchmarks.bench import Plan
+from shiftsim.runs.columns import decode_rows
 from shiftsim.runs.prepare import Prepared
+from shiftsim.runs.rollouts import PartWriter
 from shiftsim.runs.task import Batch, TaskRunner
 
 _SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time
@@ -72,17 +74,22 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
     for batch in {batch.tasks[0].noise: batch for batch in batches}.values():
         do(batch)  # loads, and compiles
     step = max(1, len(batches) // _MOST)
-    spent, done, stored = 0.0, 0, 0.0
-    for number, batch in enumerate(batches[::step][:_MOST]):
-        if number >= _FEWEST and spent > _SECONDS:
-            break
-        began = perf_counter()
-        results = do(batch)
-        spent += perf_counter() - began
-        done += len(results)
-        for result in results:
-            stored += _ROW_BYTES + len(pa.compress(result.rollout, codec="zstd", asbytes=True))
-    return spent / done, stored / done
+    spent, done = 0.0, 0
+    with TemporaryDirectory() as folder:
+        writer = PartWriter(Path(folder))
+        for number, batch in enumerate(batches[::step][:_MOST]):
+            if number >= _FEWEST and spent > _SECONDS:
+                break
+            began = perf_counter()
+            results = do(batch)
+            spent += perf_counter() - began
+            done += len(results)
+            for result in results:
+                if result.rollout:
+                    writer.add(result.task, decode_rows(result.rollout))
+        writer.close()
+        stored = sum(file.stat().st_size for file in writer.folder.iterdir())
+    return spent / done, _ROW_BYTES + stored / done
 
 
 def _peak() -> int:

@@ -4,6 +4,7 @@ Rollouts are compared as they were stored, bit by bit. Within one step the order
 and effect: the world as the planner saw it, its plan, the command, the noise.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,11 +12,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
+from shiftsim.runs.columns import stored_plans, stored_tracks
 from shiftsim.runs.results import Run
-from shiftsim.runs.rollouts import Task, stored_plans
-from shiftsim.sim.log import NUM_KEPT
+from shiftsim.runs.rollouts import Task
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
@@ -191,7 +192,12 @@ def _change(
     if first.rollout_places.get(task) is None or second.rollout_places.get(theirs_of) is None:
         note = "rollouts are not stored"
     else:
-        departure = find_departure(first.rollout_rows(task), second.rollout_rows(theirs_of))
+        tables = first.rollout_rows(task), second.rollout_rows(theirs_of)
+        try:
+            departure = find_departure(*tables)
+        except ValueError as error:
+            where = f"a rollout of scenario {task.token!r} in {first.path} or {second.path}"
+            raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
         note = "" if departure else _why_only_scored(first, second)
     return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
 
@@ -205,13 +211,16 @@ def _why_only_scored(first: Run, second: Run) -> str:
 
 
 def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
-    """The first step at which two stored rollouts differ; None where they never do."""
+    """The first step at which two stored rollouts differ; None where they never do.
+
+    Raises:
+        ValueError: One is damaged.
+    """
     rows = min(len(first), len(second))
+    ours, theirs = (_quantities(table, rows) for table in (first, second))
     best: tuple[int, str] | None = None
-    for name in _ordered(set(first.schema.names) & set(second.schema.names)):
-        if first[name].null_count or second[name].null_count:
-            continue  # noise that a key makes, which is the same
-        row = _first_difference(_values(first, name, rows), _values(second, name, rows))
+    for name in _ordered(ours.keys() & theirs.keys()):
+        row = _first_difference(ours[name], theirs[name])
         if row is not None and (best is None or row < best[0]):
             best = (row, name)
     if best is None and len(first) == len(second):
@@ -221,9 +230,9 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     seconds = float((times[row].as_py() - times[0].as_py()) * 1e-6)
     if not name:
         return Departure(row, seconds, "length of the rollout", len(first), len(second))
-    ours, theirs = (np.ravel(_values(table, name, rows)[row]) for table in (first, second))
-    index = _first_difference(ours, theirs) or 0
-    return Departure(row, seconds, _quantity(name, index), float(ours[index]), float(theirs[index]))
+    one, other = ours[name][row], theirs[name][row]
+    index = _first_difference(one, other) or 0
+    return Departure(row, seconds, _quantity(name, index), float(one[index]), float(other[index]))
 
 
 def _ordered(names: Iterable[str]) -> list[str]:
@@ -231,18 +240,23 @@ def _ordered(names: Iterable[str]) -> list[str]:
         later = (i for i, start in enumerate(_LATER, 1) if name.startswith(start))
         return (next(later, 0), name)
 
-    return sorted((name for name in names if name not in _KEYS), key=rank)
+    return sorted(names, key=rank)
 
 
-def _values(table: pa.RecordBatch, name: str, rows: int) -> np.ndarray:
-    """(rows, …) numbers of a column of numbers, or of lists of numbers; poses of plans."""
-    if name == "plan_steps":
-        return stored_plans(table.slice(0, rows)).reshape(rows, 3 * NUM_KEPT)
-    array = table[name].slice(0, rows)
-    if pa.types.is_list(array.type):
-        flat = array.flatten().to_numpy(zero_copy_only=False).astype(np.float64)
-        return flat.reshape(rows, -1) if rows else flat
-    return array.to_numpy(zero_copy_only=False).astype(np.float64)
+def _quantities(table: pa.RecordBatch, rows: int) -> dict[str, np.ndarray]:
+    """(rows, n) numbers of each quantity that a rollout stores, but of noise that its key makes."""
+    found = {
+        name: column.to_numpy(zero_copy_only=False)
+        for name, column in zip(table.schema.names, table.columns, strict=True)
+        if name not in _KEYS and not pa.types.is_list(column.type) and not column.null_count
+    }
+    found["plan_steps"] = stored_plans(table)
+    if "track_valid" in table.schema.names:
+        found |= {f"track_{name}": values for name, values in stored_tracks(table).items()}
+    return {
+        name: values[:rows].reshape(rows, math.prod(values.shape[1:])).astype(np.float64)
+        for name, values in found.items()
+    }
 
 
 def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:

@@ -19,6 +19,7 @@ import pyarrow as pa
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import below, draft, whole_file, write_text
+from shiftsim.runs.columns import decode_rows
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import (
     JOURNAL,
@@ -39,7 +40,6 @@ from shiftsim.runs.rollouts import (
     Place,
     RolloutReader,
     Task,
-    decode_rows,
     next_number,
     num_rows,
     part_file,

@@ -1,8 +1,4 @@
-"""Rollouts: a row per sample on the way from a worker to a file, and Parquet files of many of them.
-
-What the scenario holds already is not kept again: recorded tracks (unless the traffic reacts),
-lights, route and expert come back from the store when a rollout is read, and noise from its key.
-Plans, which no score depends on, are rounded (`pack_plans`).
+"""Rollouts: rows of many of them in Parquet files.
 
 A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
 into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers, and
@@ -10,12 +6,9 @@ clusters dislike many small files: so rollouts share row groups, and a `Place` s
 whose. The first columns name the task, for readers that know nothing of places.
 """
 
-import math
 import re
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,45 +20,21 @@ from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import DataError
 from shiftsim.files import draft
-from shiftsim.sim.log import SimulationLog, pack_plans, unpack_plans
+from shiftsim.runs.columns import (
+    COMMAND_COLUMNS,
+    IN_PLANES,
+    NOISE_COLUMNS,
+    as_today,
+    check_columns,
+    stack,
+    stored_plans,
+    stored_tracks,
+)
+from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import sample_noise
 from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
-_COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
-_NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
-
-
-def _list_of(kind: pa.DataType) -> pa.DataType:
-    return pa.list_(pa.field("item", kind, nullable=False))
-
-
-def _schema(columns: dict[str, pa.DataType]) -> pa.Schema:
-    return pa.schema(
-        [pa.field(name, kind, nullable=name in _NOISE_COLUMNS) for name, kind in columns.items()]
-    )
-
-
-STATES = _schema(
-    {
-        "time_us": pa.int64(),
-        **dict.fromkeys((*EGO_COLUMNS, *_COMMAND_COLUMNS, *_NOISE_COLUMNS), pa.float64()),
-        "planning_seconds": pa.float32(),
-        "degraded": pa.bool_(),
-        "plan_steps": _list_of(pa.int32()),
-    }
-)
-_BEFORE = {  # columns of older versions that were another type, or had another name
-    "planning_seconds": ("planning_seconds", pa.float64()),
-    "plan_steps": ("plan_poses", _list_of(pa.float64())),
-}
-TRACKS = _schema(
-    {
-        "track_valid": _list_of(pa.bool_()),
-        **dict.fromkeys(("track_poses", "track_velocities", "track_sizes"), _list_of(pa.float64())),
-    }
-)
-_FIELDS = {field.name: field for field in STATES}
 FOLDER = "rollouts"
 _PART = re.compile(r"part-\d+\.parquet")
 _MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
@@ -76,12 +45,18 @@ _WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
     "compression_level": 1,
     "use_dictionary": ["planner", "noise", "token"],
-    "use_byte_stream_split": [*EGO_COLUMNS, *_COMMAND_COLUMNS, "plan_steps.list.element"],
+    "use_byte_stream_split": IN_PLANES,
     "write_statistics": False,
 }
 _NAME = pa.dictionary(pa.int32(), pa.string())
-_KEY = _schema(
-    {"planner": _NAME, "noise": _NAME, "seed": pa.int64(), "token": _NAME, "iteration": pa.int64()}
+_KEY = pa.schema(
+    [
+        pa.field(name, kind, nullable=False)
+        for name, kind in (
+            *(("planner", _NAME), ("noise", _NAME), ("seed", pa.int64()), ("token", _NAME)),
+            ("iteration", pa.int64()),
+        )
+    ]
 )
 
 
@@ -108,84 +83,6 @@ class Place(NamedTuple):
     rows: int  # number of its rows
 
 
-def rollout_rows(
-    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True
-) -> pa.RecordBatch:
-    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones.
-
-    Noise that `complete_rollout` can make again from the task is left out: null.
-    """
-    columns = [pa.array(log.time_us)]
-    for values in (log.ego, log.commands):
-        columns += map(pa.array, np.ascontiguousarray(values.T))
-    empty = [pa.nulls(len(log.time_us), pa.float64())] * len(_NOISE_COLUMNS)
-    columns += map(pa.array, np.ascontiguousarray(log.noise.T)) if with_noise else empty
-    columns += [pa.array(log.planning_seconds.astype(np.float32)), pa.array(log.degraded)]
-    columns.append(_packed(log.plans, log.ego))
-    if not with_tracks:
-        return pa.RecordBatch.from_arrays(columns, schema=STATES)
-    tracks = log.tracks
-    columns += map(_lists, (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes))
-    return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
-
-
-def _packed(plans: np.ndarray, ego: np.ndarray) -> pa.Array:
-    """(K, P, 3) poses as a column `plan_steps`."""
-    lengths, steps = pack_plans(plans, ego)
-    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-    kind = STATES.field("plan_steps").type
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(steps), type=kind)
-
-
-def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
-    """(K, P, 3) poses of the plans of a stored rollout, rounded.
-
-    Raises:
-        ValueError: They are damaged.
-    """
-    column = rows["plan_steps"]
-    lengths = np.diff(column.offsets.to_numpy()).astype(np.int64)
-    return unpack_plans(lengths, column.flatten().to_numpy(), _stack(rows, EGO_COLUMNS))
-
-
-def encode_rows(rows: pa.RecordBatch) -> bytes:
-    """The rows of a rollout as bytes; tracks are compressed, what is small without them is not."""
-    sink = pa.BufferOutputStream()
-    compression = "lz4" if "track_valid" in rows.schema.names else None
-    options = pa.ipc.IpcWriteOptions(compression=compression)
-    with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
-        stream.write_batch(rows)
-    encoded: bytes = sink.getvalue().to_pybytes()
-    return encoded
-
-
-def decode_rows(data: bytes) -> pa.RecordBatch:
-    """What `encode_rows` was given."""
-    return pa.ipc.open_stream(data).read_next_batch()
-
-
-def _lists(values: np.ndarray) -> pa.Array:
-    """(K, …) as K lists of equal length."""
-    kind = TRACKS.field("track_valid" if values.dtype == np.bool_ else "track_poses").type
-    offsets = _offsets(len(values), math.prod(values.shape[1:]))
-    return pa.ListArray.from_arrays(offsets, pa.array(values.ravel()), type=kind)
-
-
-@lru_cache(16)
-def _offsets(count: int, size: int) -> pa.Array:
-    # rollouts have the same length again and again
-    return pa.array(np.arange(count + 1, dtype=np.int32) * size)
-
-
-def _from_lists(column: pa.Array, shape: tuple[int, ...], where: str) -> np.ndarray:
-    flat = column.flatten().to_numpy(zero_copy_only=False)
-    try:
-        return np.array(flat.reshape(len(column), *shape))
-    except ValueError as error:
-        what = f"{where}: {len(flat)} numbers in {len(column)} rows of shape {shape}"
-        raise DataError(what, hint="make the run again") from error
-
-
 def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> SimulationLog:
     """The stored rollout of a task, completed by its noise and what its scenario holds already.
 
@@ -203,25 +100,25 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
             f"scenario {scenario.token!r} in the store is not the one that was driven",
             hint="use the store that the manifest names",
         )
-    ego = _stack(rows, EGO_COLUMNS)
+    ego = stack(rows, EGO_COLUMNS)
     where = f"the rollout of scenario {scenario.token!r}"
     require(RUN, "state", ego, f"{where}: an ego")
+    tracks = scenario.tracks.rows(samples)
     try:
         plans = stored_plans(rows)
+        if "track_valid" in rows.schema.names:
+            stored: dict[str, Any] = stored_tracks(rows)
+            if stored["valid"].shape != tracks.valid.shape:
+                raise ValueError(
+                    f"tracks of shape {stored['valid'].shape}, not {tracks.valid.shape}"
+                )
+            tracks = replace(tracks, **stored)
     except ValueError as error:
-        raise DataError(f"{where}: damaged plans: {error}", hint="make the run again") from error
-    if rows[_NOISE_COLUMNS[0]].null_count:
+        raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
+    if rows[NOISE_COLUMNS[0]].null_count:
         noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
     else:
-        noise = _stack(rows, _NOISE_COLUMNS)
-    tracks = scenario.tracks.rows(samples)
-    if "track_valid" in rows.schema.names:
-        shapes = {"valid": (), "poses": (3,), "velocities": (2,), "sizes": (2,)}
-        stored: dict[str, Any] = {
-            name: _from_lists(rows[f"track_{name}"], (tracks.num_tracks, *shape), where)
-            for name, shape in shapes.items()
-        }
-        tracks = replace(tracks, **stored)
+        noise = stack(rows, NOISE_COLUMNS)
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
@@ -231,16 +128,12 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
         expert_time_us=scenario.iteration_times,
         expert_ego=scenario.expert,
         route=scenario.route,
-        commands=_stack(rows, _COMMAND_COLUMNS),
+        commands=stack(rows, COMMAND_COLUMNS),
         noise=noise,
         plans=plans,
         planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
         degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
     )
-
-
-def _stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
-    return np.stack([rows[name].to_numpy() for name in names], axis=1)
 
 
 def num_rows(file: Path) -> int:
@@ -281,13 +174,10 @@ class RolloutReader:
         """
         if self._file is None or self._path != place.file:
             self._file, self._path, self._group = _opened(place.file), place.file, -1
-            columns = {column.name: column.type for column in self._file.schema_arrow}
-            for column in [*STATES, *(c for c in TRACKS if c.name in columns)]:
-                name, kind = _BEFORE.get(column.name, ("", None))
-                is_old = name in columns and columns[name] == kind
-                if not is_old and columns.get(column.name) != column.type:
-                    what = f"column {column.name!r} is missing or not {column.type}"
-                    raise _unreadable(place.file, TypeError(what))
+            try:
+                check_columns({field.name: field.type for field in self._file.schema_arrow})
+            except TypeError as error:
+                raise _unreadable(place.file, error) from error
             found = self._file.metadata
             lengths = [found.row_group(i).num_rows for i in range(found.num_row_groups)]
             self._starts = np.cumsum([0, *lengths])
@@ -305,23 +195,9 @@ class RolloutReader:
         if len(rows) != place.rows:
             raise _unreadable(place.file, IndexError(f"rows {place.row} and after are cut off"))
         try:
-            return _as_today(rows.to_batches()[0])
+            return as_today(rows.to_batches()[0])
         except ValueError as error:
             raise _unreadable(place.file, error) from error
-
-
-def _as_today(rows: pa.RecordBatch) -> pa.RecordBatch:
-    """A rollout as this version stores it, whichever has written it."""
-    if "plan_poses" in rows.schema.names:
-        plans = rows["plan_poses"].flatten().to_numpy().reshape(len(rows), -1, 3)
-        seconds = rows["planning_seconds"].cast(pa.float32())
-        steps = _packed(plans, _stack(rows, EGO_COLUMNS))
-        for name, column in zip(_BEFORE, (seconds, steps), strict=True):
-            place = rows.schema.get_field_index(_BEFORE[name][0])
-            rows = rows.set_column(place, STATES.field(name), column)
-        schema = pa.schema([_FIELDS.get(field.name, field) for field in rows.schema])
-        rows = pa.RecordBatch.from_arrays(rows.columns, schema=schema)
-    return rows
 
 
 class PartWriter:

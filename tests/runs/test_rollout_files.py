@@ -14,21 +14,21 @@ from hypothesis import strategies as st
 
 from shiftsim.errors import DataError
 from shiftsim.runs import rollouts
-from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.results import TaskResult
-from shiftsim.runs.rollouts import (
+from shiftsim.runs.columns import (
     STATES,
     TRACKS,
-    PartWriter,
-    Place,
-    RolloutReader,
-    Task,
     encode_rows,
     stored_plans,
-    without_key,
+    stored_tracks,
+    track_columns,
 )
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.results import TaskResult
+from shiftsim.runs.rollouts import PartWriter, Place, RolloutReader, Task, without_key
 from shiftsim.sim.log import pack_plans, unpack_plans
 
+TRACK_WIDTHS = {"track_poses": 3, "track_velocities": 2, "track_sizes": 2}
+FLOATS = pa.list_(pa.field("item", pa.float64(), nullable=False))
 MANIFEST = {
     "format": 4,
     "state": "finished",
@@ -44,32 +44,36 @@ MANIFEST = {
 def made_up(length, *, value=0.0, tracks=None):
     """A rollout of so many samples, with so many tracks."""
     columns = []
-    for field in STATES if tracks is None else [*STATES, *TRACKS]:
+    for field in STATES:
         if pa.types.is_list(field.type):
-            width = {"plan_steps": 54, "track_valid": 1, "track_poses": 3}.get(field.name, 2)
-            size = width if field.name == "plan_steps" else width * tracks
-            items = pa.array([value] * size).cast(field.type.value_type)
+            items = pa.array([value] * 54).cast(field.type.value_type)
             columns.append(pa.array([items] * length, field.type))
         else:
             columns.append(pa.array([value] * length).cast(field.type))
-    schema = STATES if tracks is None else pa.schema([*STATES, *TRACKS])
-    return pa.RecordBatch.from_arrays(columns, schema=schema)
+    if tracks is None:
+        return pa.RecordBatch.from_arrays(columns, schema=STATES)
+    rng = np.random.default_rng(length)
+    valid = rng.random((length, tracks)) < 0.7
+    numbers = (rng.normal(value, 1.0, (*valid.shape, width)) for width in TRACK_WIDTHS.values())
+    columns += track_columns(valid, numbers)
+    return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
 
 
 def as_before(rows, plans):
-    """A rollout as versions before this one stored it."""
-    kind = pa.list_(pa.field("item", pa.float64(), nullable=False))
-    columns = {name: rows[name] for name in rows.schema.names}
-    seconds = columns["planning_seconds"].cast(pa.float64())
-    columns["planning_seconds"] = seconds
-    columns.pop("plan_steps")
-    poses = pa.array(list(plans.reshape(len(rows), -1)), kind)
-    names, values = list(columns), list(columns.values())
-    place = names.index("degraded") + 1
-    names.insert(place, "plan_poses")
-    values.insert(place, poses)
-    fields = [pa.field(n, v.type, nullable=False) for n, v in zip(names, values, strict=True)]
-    return pa.RecordBatch.from_arrays(values, schema=pa.schema(fields))
+    """A rollout as older versions stored it: with plans (K, P, 3), or as the last one if None."""
+    columns = {name: rows[name] for name in STATES.names}
+    if plans is not None:
+        columns["planning_seconds"] = columns["planning_seconds"].cast(pa.float64())
+        columns.pop("plan_steps")
+        columns["plan_poses"] = pa.array(list(plans.reshape(len(rows), -1)), FLOATS)
+    if "track_valid" in rows.schema.names:
+        columns["track_valid"] = rows["track_valid"]
+        tracks = stored_tracks(rows)
+        for name in TRACK_WIDTHS:
+            values = tracks[name.removeprefix("track_")].reshape(len(rows), -1)
+            columns[name] = pa.array(list(values), FLOATS)
+    fields = [pa.field(name, column.type, nullable=False) for name, column in columns.items()]
+    return pa.RecordBatch.from_arrays(list(columns.values()), schema=pa.schema(fields))
 
 
 def key(number):
@@ -226,7 +230,7 @@ def test_the_rollouts_of_a_scenario_lie_together(tmp_path):
 
 
 @pytest.mark.parametrize("poses", [11, 18])
-@pytest.mark.parametrize("tracks", [None, 2])
+@pytest.mark.parametrize("tracks", [None, 0, 2])
 def test_rollouts_of_versions_before_are_read_and_kept_beside_new_ones(tmp_path, poses, tracks):
     rows = made_up(5, tracks=tracks)
     plans = np.linspace(0.0, 30.0, 5 * poses * 3).reshape(5, poses, 3)
@@ -246,6 +250,39 @@ def test_rollouts_of_versions_before_are_read_and_kept_beside_new_ones(tmp_path,
     reader = RolloutReader()
     assert without_key(reader.read(both[0])).equals(found)
     assert without_key(reader.read(both[1])).equals(rows)
+
+
+def test_tracks_of_the_version_before_are_read(tmp_path):
+    rows = made_up(5, tracks=3)
+    writer = PartWriter(tmp_path)
+    old = writer.add(key(0), as_before(rows, None))
+    writer.close()
+    assert {*TRACK_WIDTHS, "plan_steps"} <= {*pq.read_schema(old.file).names}
+    assert without_key(RolloutReader().read(old)).equals(rows)
+
+
+@given(st.integers(1, 6), st.integers(0, 5), st.integers(0, 2**32))
+def test_tracks_come_back_bit_by_bit(length, tracks, seed):
+    rng = np.random.default_rng(seed)
+    valid = rng.random((length, tracks)) < rng.choice([0.0, 0.5, 1.0])
+    bits = [rng.integers(0, 2**64, (*valid.shape, w), np.uint64) for w in TRACK_WIDTHS.values()]
+    columns = track_columns(valid, (values.view(np.float64) for values in bits))
+    found = stored_tracks(pa.RecordBatch.from_arrays(columns, schema=TRACKS))
+    assert np.array_equal(found["valid"], valid)
+    for name, values in zip(TRACK_WIDTHS, bits, strict=True):
+        stored = found[name.removeprefix("track_")]
+        assert stored.shape == values.shape
+        assert np.array_equal(stored[valid].view(np.uint64), values[valid])
+        assert np.isnan(stored[~valid]).all()
+
+
+@pytest.mark.parametrize("name", [name for name in TRACKS.names if name != "track_valid"])
+def test_a_rollout_that_lacks_boxes_is_refused(name):
+    rows = made_up(5, tracks=2)
+    at = rows.schema.get_field_index(name)
+    lacking = pa.array([rows[name][0].as_py()[:1], *[[]] * 4], rows[name].type)
+    with pytest.raises(ValueError, match=f"'{name}' has 1 of"):
+        stored_tracks(rows.set_column(at, rows.schema.field(at), lacking))
 
 
 @given(
