@@ -19,6 +19,7 @@ from time import process_time
 import numpy as np
 import pytest
 
+import shiftsim
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.columns import encode_rows, rollout_rows
 from shiftsim.runs.config import make_config
@@ -209,4 +210,24 @@ def test_memory_of_ten_thousand_scenarios(store, size, tmp_path):
     print(
         f"\nmain process: {text} scenarios in {long['wall']:.0f} s, "
         f"target 500 MB {verdict(long['memory'] <= 500e6)}"
+    )
+
+
+@pytest.mark.parametrize(("traffic", "target"), [("nonreactive", 20.0), ("reactive", 30.0)])
+@pytest.mark.parametrize("planner", ["idm", "pdm-closed"])
+def test_room_of_rollouts_on_disk(planner, traffic, target, size, tmp_path):
+    run = shiftsim.run(
+        planner,
+        noise=NOISE,
+        split="demo-mini",
+        limit=size(16, 2),
+        traffic=traffic,
+        workers=1,
+        out=str(tmp_path / "run"),
+    )
+    files = (run.path / "rollouts").iterdir()
+    each = sum(file.stat().st_size for file in files) / len(run.tasks) / 1e3
+    print(
+        f"\nrollout of {planner} in {traffic} traffic: {each:.1f} kB, target {target:.0f} kB "
+        f"{verdict(each <= target)}"
     )
