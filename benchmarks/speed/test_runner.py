@@ -36,7 +36,7 @@ FEW, MANY = 2, 10  # seeds
 ALL = 10_000  # scenarios of the long run
 MOST_EXPONENT = 1.05
 CODE = """
-import json, resource, sys, time
+import json, re, resource, sys, time
 import shiftsim
 values = json.loads(sys.argv[1])
 seeds = range(values.pop("num_seeds"))
@@ -44,11 +44,12 @@ began = time.perf_counter()
 run = shiftsim.run("constant-velocity", noise="ou-high", seeds=seeds, **values)
 wall = time.perf_counter() - began
 own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+status = open("/proc/self/status").read()  # ru_maxrss would be inherited
 assert run.is_complete
 print(json.dumps({
     "wall": wall,
     "cpu": own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime,
-    "memory": own.ru_maxrss * 1024,
+    "memory": int(re.search(r"VmHWM:\\s*(\\d+)", status)[1]) * 1024,
     "tasks": len(run.tasks),
 }))
 """
