@@ -13,9 +13,9 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from shiftsim.benchmarks.bench import Plan
-from shiftsim.runs.columns import decode_rows
 from shiftsim.runs.prepare import Prepared
-from shiftsim.runs.rollouts import PartWriter
+from shiftsim.runs.rollouts.columns import decode_rows
+from shiftsim.runs.rollouts.files import PartWriter
 from shiftsim.runs.task import Batch, TaskRunner
 
 _SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time

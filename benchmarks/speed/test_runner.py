@@ -21,11 +21,11 @@ import pytest
 
 import shiftsim
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.columns import encode_rows, rollout_rows
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION, TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered

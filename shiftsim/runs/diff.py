@@ -14,9 +14,9 @@ import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.columns import stored_plans, stored_tracks
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import stored_plans, stored_tracks
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step

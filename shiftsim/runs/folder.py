@@ -19,7 +19,6 @@ import pyarrow as pa
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import below, draft, whole_file, write_text
-from shiftsim.runs.columns import decode_rows
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import (
     JOURNAL,
@@ -34,12 +33,13 @@ from shiftsim.runs.results import (
     open_run,
     stored_results,
 )
-from shiftsim.runs.rollouts import (
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import decode_rows
+from shiftsim.runs.rollouts.files import (
     FOLDER,
     PartWriter,
     Place,
     RolloutReader,
-    Task,
     next_number,
     num_rows,
     part_file,

@@ -20,15 +20,8 @@ import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import (
-    FOLDER,
-    Place,
-    RolloutReader,
-    Task,
-    complete_rollout,
-    describe,
-    part_file,
-)
+from shiftsim.runs.rollouts import Task, complete_rollout, describe
+from shiftsim.runs.rollouts.files import FOLDER, Place, RolloutReader, part_file
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario

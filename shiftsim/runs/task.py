@@ -23,10 +23,10 @@ from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_met
 from shiftsim.metrics.interplan import add_interplan
 from shiftsim.planners.original import Original
 from shiftsim.planners.registry import RunPlanner
-from shiftsim.runs.columns import encode_rows, rollout_rows
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
 from shiftsim.sim.noise import NoiseModel, is_standard

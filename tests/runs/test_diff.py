@@ -8,10 +8,10 @@ from made_runs import write_run
 
 import shiftsim
 from shiftsim.errors import ConfigError
-from shiftsim.runs.columns import rollout_rows
 from shiftsim.runs.diff import diff_lines, diff_runs, find_departure
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import rollout_rows
 
 
 class Coast:

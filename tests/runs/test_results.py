@@ -11,11 +11,11 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.columns import STATES, decode_rows, encode_rows, rollout_rows
 from shiftsim.runs.config import make_config
 from shiftsim.runs.derive import rescore
 from shiftsim.runs.results import open_run
 from shiftsim.runs.rollouts import Task, complete_rollout
+from shiftsim.runs.rollouts.columns import STATES, decode_rows, encode_rows, rollout_rows
 from shiftsim.runs.task import score_rollout
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import NoiseModel, parse_noise

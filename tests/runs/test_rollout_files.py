@@ -13,8 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shiftsim.errors import DataError
-from shiftsim.runs import rollouts
-from shiftsim.runs.columns import (
+from shiftsim.runs.folder import RunWriter
+from shiftsim.runs.results import TaskResult
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts import files as rollout_files
+from shiftsim.runs.rollouts.columns import (
     STATES,
     TRACKS,
     encode_rows,
@@ -22,9 +25,7 @@ from shiftsim.runs.columns import (
     stored_tracks,
     track_columns,
 )
-from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.results import TaskResult
-from shiftsim.runs.rollouts import PartWriter, Place, RolloutReader, Task, without_key
+from shiftsim.runs.rollouts.files import PartWriter, Place, RolloutReader, without_key
 from shiftsim.sim.log import pack_plans, unpack_plans
 
 TRACK_WIDTHS = {"track_poses": 3, "track_velocities": 2, "track_sizes": 2}
@@ -93,8 +94,8 @@ def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_gro
         key(i): made_up(length, value=float(i), tracks=tracks) for i, length in enumerate(lengths)
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollouts, "_MAX_GROUP", (per_group, 1 << 30))
-        patch.setattr(rollouts, "_MAX_FILE", (per_file, 1 << 30))
+        patch.setattr(rollout_files, "_MAX_GROUP", (per_group, 1 << 30))
+        patch.setattr(rollout_files, "_MAX_FILE", (per_file, 1 << 30))
         writer = PartWriter(folder)
         places = {task: writer.add(task, rows) for task, rows in made.items()}
         writer.close()
@@ -112,7 +113,7 @@ def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_gro
 
 
 def test_a_row_group_is_cut_where_it_gets_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(rollouts, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
+    monkeypatch.setattr(rollout_files, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
     writer = PartWriter(tmp_path)
     for number in range(7):
         place = writer.add(key(number), made_up(5))
