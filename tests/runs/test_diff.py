@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from made_runs import write_run
 
 import shiftsim
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.diff import diff_lines, diff_runs, find_departure
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -64,6 +65,22 @@ def test_scores_that_differ_without_another_step_are_explained(runs, traffic, no
     other.__dict__["scores"] = worse
     changes = diff_runs(runs[0], other).changes
     assert {(change.departure, change.note) for change in changes} == {(None, note)}
+
+
+def test_a_damaged_rollout_is_named(runs, monkeypatch):
+    def damaged(run, task):
+        rows = whole(run, task)
+        at = rows.schema.get_field_index("plan_steps")
+        long = pa.array([[7] * 100] * len(rows), rows["plan_steps"].type)
+        return rows.set_column(at, rows.schema.field(at), long)
+
+    whole = Run.rollout_rows
+    monkeypatch.setattr(Run, "rollout_rows", damaged)
+    with pytest.raises(
+        DataError, match=r"rollout of scenario '\w+' in .*never.* is damaged: "
+    ) as found:
+        diff_runs(*runs)
+    assert found.value.hint == "make the run again"
 
 
 def test_changes_are_ranked_and_counted(runs):
