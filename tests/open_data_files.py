@@ -17,6 +17,9 @@ import shapely
 from shiftsim.data.demo.agents import SIZES
 from shiftsim.data.demo.scenes import demo_sites, traffic_of
 from shiftsim.data.demo.traffic import DT
+from shiftsim.data.open_data.av2 import Av2Reader
+from shiftsim.data.open_data.commonroad import CommonRoadReader
+from shiftsim.data.open_data.py123d import Py123dReader
 from shiftsim.data.opendrive.map import build_road_map
 from shiftsim.data.opendrive.reading import parse_opendrive
 
@@ -396,3 +399,12 @@ def _packed(line):
         b"shape": array.shape,
         b"data": array.tobytes(),
     }
+
+
+WRITERS = {
+    "av2": (Av2Reader, write_av2),
+    "commonroad": (CommonRoadReader, write_commonroad),
+    "commonroad-2018b": (CommonRoadReader, lambda folder: write_commonroad(folder, "2018b")),
+    "py123d": (Py123dReader, write_py123d),
+}
+COMMANDS = ("av2", "commonroad", "py123d")
