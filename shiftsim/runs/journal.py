@@ -20,7 +20,6 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import below, locked
 
 _SETTINGS = (
-    "page_size = 16384",
     "locking_mode = exclusive",  # no third file, whose memory is shared between processes
     "journal_mode = wal",
     "synchronous = normal",  # a power failure takes the last entries, and nothing else

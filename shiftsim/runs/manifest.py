@@ -33,8 +33,8 @@ _DIGEST = re.compile("[0-9a-f]{16,64}")
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
 _DIGESTS = ("store", "tokens", "filter", "review", "code")
 # on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
-_BYTES_PER_TASK = 6e3
-_BYTES_PER_ROLLOUT = 70e3
+_BYTES_PER_TASK = 15e3
+_BYTES_PER_ROLLOUT = 73e3
 
 
 def make_manifest(
