@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
@@ -195,7 +195,7 @@ def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray) -> None:
             last[kind] = track
 
 
-@lean_kernel
+@kernel
 def _is_same(valid: BoolArray, frame: int) -> bool:
     """Whether a frame has the tracks of the one before."""
     same = True
@@ -241,7 +241,7 @@ def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray
     return out
 
 
-@lean_kernel
+@kernel
 def _insert(order: IntArray, gap: int, place: int, track: int) -> None:
     """Move what stands from `place` on by one, up to the gap, and put a track there."""
     for other in range(gap, place, -1):

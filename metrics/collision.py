@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, front_touches
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     Collision,
     MetricPart,
@@ -178,14 +178,14 @@ def _energies(group: str, values: list[float]) -> list[Statistic]:
     ]
 
 
-@lean_kernel
+@kernel
 def _footprints(centers: FloatArray, size: FloatArray, out: FloatArray) -> None:
     """Write the corners (K, 4, 2) of boxes of one size at poses (K, 3) [m]."""
     for i in range(len(centers)):
         box_corners(centers[i, 0], centers[i, 1], centers[i, 2], size[0], size[1], out[i])
 
 
-@lean_kernel
+@kernel
 def set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> None:
     """Write a box (8,) from its pose (3,) and size [m]."""
     box[0], box[1], box[4] = pose[0], pose[1], pose[2]
@@ -193,19 +193,19 @@ def set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> N
     set_size(box, length, width)
 
 
-@lean_kernel
+@kernel
 def set_size(box: FloatArray, length: float, width: float) -> None:
     """Write the size of a box (8,) [m]."""
     box[5], box[6] = 0.5 * length, 0.5 * width
     box[7] = 0.5 * np.sqrt(length * length + width * width)
 
 
-@lean_kernel
+@kernel
 def _set_corners(box: FloatArray, out: FloatArray) -> None:
     box_corners(box[0], box[1], box[4], 2.0 * box[5], 2.0 * box[6], out)
 
 
-@lean_kernel
+@kernel
 def _gap(a: FloatArray, b: FloatArray) -> float:
     """Largest gap between two boxes along the axes of `a`; negative where they overlap [m]."""
     dx, dy = b[0] - a[0], b[1] - a[1]
@@ -215,7 +215,7 @@ def _gap(a: FloatArray, b: FloatArray) -> float:
     return max(lon, lat)
 
 
-@lean_kernel
+@kernel
 def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
     """Whether two boxes (8,) touch; `corners` (2, 4, 2) is scratch."""
     dx, dy = b[0] - a[0], b[1] - a[1]
@@ -230,7 +230,7 @@ def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
     return convex_intersect(corners[0], corners[1])
 
 
-@lean_kernel
+@kernel
 def _contact_type(
     state: FloatArray,
     speed: float,

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import DataError
 from shiftsim.geometry.fits import fit_weights
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -229,7 +229,7 @@ def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
     return out
 
 
-@lean_kernel
+@kernel
 def filter_signal(values: FloatArray, how: Filter, scale: float, out: FloatArray) -> None:
     """Filter a signal (K,), divide it by `scale`, round it to 8 decimals; `out` (K,) is written.
 

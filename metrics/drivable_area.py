@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.rings import boundary_distance_below
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -92,7 +92,7 @@ def _corner_violations(
                     distances[i, corner] = _scan_near(drivable, x, y, best, found, corner)
 
 
-@lean_kernel
+@kernel
 def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) -> float:
     """Distance of a point from the nearest polygon, whose index goes to `found[corner]` [m]."""
     best = np.inf
@@ -103,7 +103,7 @@ def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) 
     return best
 
 
-@lean_kernel
+@kernel
 def _scan_near(
     polygons: Polygons, x: float, y: float, limit: float, found: IntArray, corner: int
 ) -> float:
@@ -125,7 +125,7 @@ def _scan_near(
     return best
 
 
-@lean_kernel
+@kernel
 def _distance_below(polygons: Polygons, poly: int, x: float, y: float, limit: float) -> float:
     """Distance of a point outside polygon `poly` from it, or `limit` where it is not below [m]."""
     dx = max(polygons.bounds[poly, 0] - x, 0.0, x - polygons.bounds[poly, 2])

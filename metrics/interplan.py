@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import DataError
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics.progress import NAME as PROGRESS
 from shiftsim.metrics.result import MetricRow, Statistic
 from shiftsim.metrics.route import EdgeLists, driven_route

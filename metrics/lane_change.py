@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, IntArray, kernel, lean_kernel
+from shiftsim.kernels import BoolArray, IntArray, kernel
 from shiftsim.metrics.result import MetricPart, MetricRow, Statistic, Thresholds
 from shiftsim.metrics.route import EdgeLists, has
 from shiftsim.world.layers import Lists
@@ -62,7 +62,7 @@ def judge(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> Metr
     return MetricPart(MetricRow(NAME, None, ratio, "ratio", bound, None), tuple(statistics))
 
 
-@lean_kernel
+@kernel
 def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> bool:
     """Whether an edge is among the first `count` items or the neighbours of one of them."""
     if has(items, count, value):
@@ -75,7 +75,7 @@ def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> 
     return False
 
 
-@lean_kernel
+@kernel
 def _linked(
     fl: IntArray,
     rl: IntArray,
@@ -110,7 +110,7 @@ def _linked(
     return found if found > 0 else -1
 
 
-@lean_kernel
+@kernel
 def _common(
     lists: IntArray, size: IntArray, incoming: Lists, outgoing: Lists, out: IntArray
 ) -> int:

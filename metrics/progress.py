@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -151,14 +151,14 @@ def judge_direction(progress: FloatArray, time_us: IntArray, thresholds: Thresho
     )
 
 
-@lean_kernel
+@kernel
 def _project_end(lines: Polylines, line: int, other: int) -> float:
     """Arc length on a line of the end of another one [m]."""
     last = lines.ptr[other + 1] - 1
     return project_on_line(lines, line, lines.xy[last, 0], lines.xy[last, 1])
 
 
-@lean_kernel
+@kernel
 def _progress_along(
     blocks: Polygons,  # areas of the roadblocks and roadblock connectors
     lines: Polylines,  # baselines of the edges
@@ -197,7 +197,7 @@ def _progress_along(
         at, previous = ahead, along
 
 
-@lean_kernel
+@kernel
 def _progress_in_lane(
     lines: Polylines, route: EdgeLists, poses: FloatArray, out: FloatArray
 ) -> None:

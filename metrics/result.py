@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import one_of
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

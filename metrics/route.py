@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import MapError
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
 from shiftsim.world.map import VectorMap
 
@@ -92,7 +92,7 @@ def _raise_overlap(map: VectorMap, *points: FloatArray) -> None:
             )
 
 
-@lean_kernel
+@kernel
 def has(items: IntArray, count: int, value: int) -> bool:
     """Whether `value` is among the first `count` items."""
     for index in range(count):
@@ -101,7 +101,7 @@ def has(items: IntArray, count: int, value: int) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     """Write the lane that holds a point, else the connectors; how many, or _OVERLAP."""
     found = containing(lanes.polygons, x, y, out)
@@ -112,7 +112,7 @@ def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
     return found
 
 
-@lean_kernel
+@kernel
 def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: IntArray) -> int:
     """Write which of the first `count` known edges, or the successors of one, hold a point."""
     polygons, outgoing = lanes.polygons, lanes.outgoing
@@ -131,7 +131,7 @@ def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: 
     return found
 
 
-@lean_kernel
+@kernel
 def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out: EdgeLists) -> int:
     """Write the edges that hold each point (K, 3); -1, or the first sample in several lanes."""
     lists, counts = out.edges, out.counts
@@ -214,7 +214,7 @@ def _corner_routes(lanes: Lanes, corners: FloatArray, out: EdgeLists) -> int:
     return -1
 
 
-@lean_kernel
+@kernel
 def _add(items: IntArray, size: int, more: IntArray, count: int) -> int:
     """Append what is not among the first `size` items yet; returns how many there are then."""
     for index in range(count):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics import (
     collision,
     comfort,
@@ -226,7 +226,7 @@ def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
         )
 
 
-@lean_kernel
+@kernel
 def find_broken(tracks: collision.FlatTracks) -> tuple[int, int]:
     """Sample and track of the first pose or size that is not finite; -1, -1 where all are."""
     poses, sizes = tracks.poses, tracks.sizes

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import MapError
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -80,7 +80,7 @@ def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
     ]
 
 
-@lean_kernel
+@kernel
 def _speed_limits(lanes: Lanes, limits: FloatArray, route: EdgeLists, out: FloatArray) -> int:
     """Write the speed limit (K,) that holds at each sample, NaN where there is none [m/s].
 

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing_cosine
 from shiftsim.geometry.rings import SLACK
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.collision import (
     BOX_SIZE,
     Contacts,
@@ -151,7 +151,7 @@ def _time_to_collision(
             ttc[i], partners[i] = STEP * hit[0], kept[hit[1]]
 
 
-@lean_kernel
+@kernel
 def _place(cosine: float) -> int:
     """Where a track is whose bearing from the ego has this cosine; beside where it has none."""
     # most often without an arc cosine
@@ -165,14 +165,14 @@ def _place(cosine: float) -> int:
     return _BEHIND if angle > BEHIND else _BESIDE
 
 
-@lean_kernel
+@kernel
 def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
     # nuPlan rule 66: along the heading, whatever the direction of the velocity
     step[0] = box[2] * speed * STEP
     step[1] = box[3] * speed * STEP
 
 
-@lean_kernel
+@kernel
 def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
     """Write the box (8,) that holds another one while it moves through the horizon."""
     distance = speed * HORIZON
@@ -183,7 +183,7 @@ def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
     set_size(out, 2.0 * box[5] + distance, 2.0 * box[6])
 
 
-@lean_kernel
+@kernel
 def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tuple[int, int]:
     """First step at which box 0 meets another, and which; 0 when none does. Moves the boxes."""
     if len(boxes) < 2:

@@ -14,9 +14,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.files import place_of
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.original import Original
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.plan_check import FAR, SHORT, find_fault, is_short

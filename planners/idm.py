@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners, wrap_angle
 from shiftsim.geometry.polylines import CLEAR, HIT, OPEN, Path, corridor_polygon, pose_at
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.routes.corridor import (
     MET,
     UNKNOWN,
@@ -287,7 +287,7 @@ def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
     return stretch
 
 
-@lean_kernel
+@kernel
 def _reach(path: Path, progress: float, target: float) -> tuple[float, float]:
     """Progress at the start and at the end of the stretch that would be covered [m]."""
     end = path.progress[-1]
@@ -300,7 +300,7 @@ def _pose(path: Path, progress: float) -> tuple[float, float, float]:
     return x, y, wrap_angle(heading)
 
 
-@lean_kernel
+@kernel
 def _accelerate(policy: Policy, speed: float, gap: float, speed_ahead: float) -> float:
     """Acceleration behind a lead, within the limits [m/s^2]."""
     _, _, target, min_gap, headway, accel_max, decel_max = policy

@@ -56,16 +56,6 @@ def user_cache(part: str) -> Path:
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 
 
-def kernel_folders() -> list[Path]:
-    """Where compiled kernels are looked for, and kept in the first one that can be written.
-
-    `NUMBA_CACHE_DIR`, else that of the checkout or of the installed package; that of the user.
-    """
-    is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
-    own = PACKAGE.parent / ".numba-cache" if is_checkout else PACKAGE / "__pycache__" / "kernels"
-    return [Path(os.environ.get("NUMBA_CACHE_DIR") or own).expanduser(), user_cache("kernels")]
-
-
 def below(folder: Path, name: str) -> Path:
     """The place of something in a folder by its relative path.
 
@@ -273,26 +263,26 @@ def sources(paths: Iterable[Path]) -> dict[str, bytes]:
     while waiting:
         name = waiting.pop()
         if name not in found:
-            found[name], imported = _read_source(name)
+            found[name], imported = read_module(name)
             waiting += imported
     return found
 
 
 @cache
-def _read_source(name: str) -> tuple[bytes, list[str]]:
-    """The text of a module, and the modules that its import statements name."""
+def read_module(name: str) -> tuple[bytes, list[str]]:
+    """The text of a module of ours, and the modules of ours that its import statements name."""
     text = (PACKAGE / name).read_bytes()
     imported = []
     for module, block, line, plain in _IMPORT.findall("\n" + text.decode()):
         place = (module or plain).replace(".", "/")
         for at in (place, *(f"{place}/{word}" for word in re.findall(r"\w+", block + line))):
             imported += [f"{at}.py", f"{at}/__init__.py"]
-    return text, [path for path in imported if path in _modules()]
+    return text, [path for path in imported if path in module_names()]
 
 
 @cache
-def _modules() -> frozenset[str]:
-    """All modules of ours: asking for each name that an import may mean takes ten times as long."""
+def module_names() -> frozenset[str]:
+    """Paths of all modules of ours, below `PACKAGE`."""
     found = set[str]()
     for folder, _, names in os.walk(PACKAGE, followlinks=True):
         place = os.path.relpath(folder, PACKAGE).replace(os.sep, "/").removeprefix(".")

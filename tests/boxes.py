@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from shiftsim.arrays import kernel
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import kernel
 
 
 def boxes_intersect(poses_a, sizes_a, poses_b, sizes_b):

@@ -1,31 +1,32 @@
 """Compile the kernels that many tests need, once, before two workers would both compile them."""
 
-import hashlib
 import importlib.util
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
+from worlds import cruise_scenario, standing_tracks
 
-from shiftsim.files import PACKAGE, kernel_folders, sources
+from shiftsim.kernels import CACHE_FOLDER, kernel_hash
+from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.warmup import SHARES, scene
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind
 
 GROUPS = (
-    ("routes", "contacts", "pdm-closed", "plantf", "pluto"),
-    ("planners", "reactive", "environment", "diffusion-planner", "carl"),
+    ("pdm-closed", "plantf", "pluto"),
+    ("metrics", "reactive", "environment", "diffusion-planner", "carl"),
 )
 LEARNED = ("carl", "diffusion-planner", "plantf", "pluto")
 
 
 def compile_all() -> None:
     """Do nothing where it has been done; a process for each of `GROUPS` otherwise."""
-    everything = sources(path for path in PACKAGE.rglob("*.py"))
-    digest = hashlib.sha256(repr(sorted(everything.items())).encode()).hexdigest()
-    marker = kernel_folders()[0] / f"compiled-for-tests-{digest[:16]}"
+    marker = Path(CACHE_FOLDER, f"compiled-for-tests-{kernel_hash()}")
     if marker.exists():
         return
     processes = [subprocess.Popen([sys.executable, __file__, *group]) for group in GROUPS]
@@ -35,9 +36,10 @@ def compile_all() -> None:
 
 
 def compile_share(name: str) -> None:
-    """Compile one of `SHARES`, or what a planner or reactive traffic needs."""
-    if name in SHARES:
-        SHARES[name]()
+    """Compile the metrics, or what a planner, reactive traffic or the environment needs."""
+    if name == "metrics":
+        log = simulate(scene(), load_planner("constant-velocity"))
+        compute_metrics(log, scene().map)
     elif name == "reactive":
         simulate(scene(), load_planner("constant-velocity"), traffic=name)
     elif name == "environment":
@@ -48,7 +50,13 @@ def compile_share(name: str) -> None:
         simulate(scene(), load_planner(name, {"checkpoint": "deterministic:drive"}))
 
 
-_scene = cache(scene)  # layouts of the last maps are kept
+@cache
+def scene() -> Scenario:
+    """A slow ego close behind a car, a cone on the lane, another car, in time for every model."""
+    scenario = cruise_scenario(speed=4.0, iterations=6, start=(205.0, 0.0, 0.0))
+    poses = np.array([[217.0, 0.0, 0.0], [240.0, 0.2, 0.0], [225.0, 3.5, 0.1]])
+    kinds = [AgentKind.VEHICLE, AgentKind.TRAFFIC_CONE, AgentKind.VEHICLE]
+    return replace(scenario, tracks=standing_tracks(len(scenario.time_us), poses, kinds))
 
 
 def compile_environment() -> None:
@@ -61,7 +69,7 @@ def compile_environment() -> None:
         tokens = ("it",)
 
         def read(self, token: str) -> Scenario:
-            return _scene()
+            return scene()
 
     for observation in ("vector", "raster"):
         env = DrivingEnv(store=One(), observation=observation, terminate=False)

@@ -12,12 +12,12 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 # Who may import whom: a package may use those of lower layers, and itself.
 LAYERS = (
-    {"_moved", "arrays", "errors", "files", "geometry"},
+    {"_moved", "errors", "files", "geometry", "kernels"},
     {"world"},
     {"sim", "metrics", "data", "planners"},
     {"runs"},
     {"report", "view", "verify", "env", "train", "compat"},
-    {"api", "cli", "benchmarks", "warmup", "__main__", "__init__"},
+    {"api", "cli", "benchmarks", "__main__", "__init__"},
 )
 LAYER = {package: number for number, layer in enumerate(LAYERS) for package in layer}
 # what may be used of a neighbour in the same layer

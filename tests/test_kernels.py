@@ -1,13 +1,15 @@
 """Rules for kernels that cannot be seen when they run."""
 
+import ast
 import gc
 import importlib
 import inspect
+import os
 import re
 import shutil
-import typing
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,11 +17,11 @@ from pathlib import Path
 import dsc3d_writer
 import numpy as np
 import pytest
-from kernels import compile_environment
+from kernels import compile_environment, scene
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import _nrt_python, rtsys
 from track_files import export_town, write_tracks
-from worlds import cruise_scenario, standing_tracks
+from worlds import cruise_scenario
 
 from shiftsim.data.deepplan.convert import convert_dsc3d
 from shiftsim.data.recording import visible_columns
@@ -36,13 +38,11 @@ from shiftsim.sim.traffic import _MODELS
 from shiftsim.train.pictures import blocks_of
 from shiftsim.train.traffic.labels import labels_of
 from shiftsim.train.traffic.realism import compare
-from shiftsim.warmup import SHARES
 from shiftsim.world.layers import nearest
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind
 
 PARTS = ("", "planners", "metrics", "data", "benchmarks")  # linked into the package
-DECORATED = re.compile(r"^@(lean_|part_)?kernel$", re.MULTILINE)
+DECORATED = re.compile(r"^@kernel$", re.MULTILINE)
 RAISES = re.compile(r"^\s*(raise|assert)\b", re.MULTILINE)
 
 
@@ -61,28 +61,6 @@ def kernels() -> dict[str, Dispatcher]:
     return out
 
 
-def is_lean(kernel: Dispatcher) -> bool:
-    return not kernel.targetoptions["_nrt"]
-
-
-def holds_array(hint: typing.Any) -> bool:
-    """Whether values of an annotation are arrays or (named) tuples with arrays in them."""
-    if hasattr(hint, "_fields"):
-        return any(map(holds_array, typing.get_type_hints(hint).values()))
-    return np.ndarray in (hint, typing.get_origin(hint)) or any(
-        map(holds_array, typing.get_args(hint))
-    )
-
-
-def returns_array(kernel: Dispatcher) -> bool:
-    hints = typing.get_type_hints(kernel.py_func)
-    if "return" not in hints:
-        assert not re.search(r"^\s*return .", inspect.getsource(kernel.py_func), re.MULTILINE), (
-            kernel
-        )
-    return holds_array(hints.get("return"))
-
-
 def called_by(kernel: Dispatcher) -> Iterator[Dispatcher]:
     code, names = kernel.py_func.__code__, kernel.py_func.__globals__
     assert not any(inspect.iscode(constant) for constant in code.co_consts), kernel  # a closure
@@ -93,33 +71,11 @@ def called_by(kernel: Dispatcher) -> Iterator[Dispatcher]:
             yield value
 
 
-def test_lean_kernels_neither_return_nor_receive_arrays(kernels: dict[str, Dispatcher]) -> None:
-    # what they receive they never give back; what they return is given back once too often. That
-    # they make none themselves the compiler checks
-    lean = {name: kernel for name, kernel in kernels.items() if is_lean(kernel)}
-    assert len(lean) > 100
-    assert not [name for name, kernel in lean.items() if returns_array(kernel)]
-    assert not [
-        f"{name} calls {callee.py_func.__name__}"
-        for name, kernel in lean.items()
-        for callee in called_by(kernel)
-        if returns_array(callee)
-    ]
-
-
 def test_no_kernel_raises(kernels: dict[str, Dispatcher]) -> None:
     # its arrays would never be given back
     assert not [
         name for name, kernel in kernels.items() if RAISES.search(inspect.getsource(kernel.py_func))
     ]
-
-
-def scene() -> Scenario:
-    """A slow ego close behind a car, a cone on the lane, another car, in time for every model."""
-    scenario = cruise_scenario(speed=4.0, iterations=6, start=(205.0, 0.0, 0.0))
-    poses = np.array([[217.0, 0.0, 0.0], [240.0, 0.2, 0.0], [225.0, 3.5, 0.1]])
-    kinds = [AgentKind.VEHICLE, AgentKind.TRAFFIC_CONE, AgentKind.VEHICLE]
-    return replace(scenario, tracks=standing_tracks(len(scenario.time_us), poses, kinds))
 
 
 def works(folder: Path) -> dict[str, Callable[[], object]]:
@@ -161,7 +117,6 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     drives = {f"{name}, {mode}": partial(drive, name, mode) for name in names for mode in _MODELS}
     return {
         **drives,
-        **SHARES,
         "environment": compile_environment,
         "edited": drive_edited,
         "conversion": convert,
@@ -227,3 +182,63 @@ def test_no_kernel_loses_an_array(kernels: dict[str, Dispatcher], tmp_path: Path
         for name, kernel in kernels.items()
         if kernel not in called and ".benchmarks." not in name
     ]
+
+
+CHILD_AND_PARENT = """
+import numpy as np
+from shiftsim.kernels import kernel
+
+@kernel
+def child(n):
+    return np.arange(n)
+
+@kernel
+def parent(n):
+    return child(n).sum()
+"""
+
+
+def test_a_kernel_cached_as_a_part_of_another_can_be_called_itself(tmp_path: Path) -> None:
+    (tmp_path / "family.py").write_text(CHILD_AND_PARENT)
+    search = os.pathsep.join([str(tmp_path), str(PACKAGE.parent)])
+    environment = os.environ | {"PYTHONPATH": search, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    for calls in ("child(4)", "parent(4); child(4)", "child(4); parent(4)"):
+        code = f"from family import *; {calls}; assert parent(4) == 6"
+        subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+@pytest.mark.slow
+def test_runs_of_several_planners_in_turn_share_a_cache(toy: Path, tmp_path: Path) -> None:
+    environment = os.environ | {
+        "PYTHONPATH": str(PACKAGE.parent),
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+    }
+    for number, (planner, traffic) in enumerate(
+        [
+            ("constant-velocity", "nonreactive"),
+            ("idm", "reactive"),
+            ("constant-velocity", "reactive"),
+            ("pdm-closed", "nonreactive"),
+            ("idm", "nonreactive"),
+        ]
+    ):
+        words = ["run", "-p", planner, "--traffic", traffic, "--store", str(toy), "--limit", "1"]
+        words += ["--workers", "1", "--out", str(tmp_path / f"run-{number}")]
+        command = [sys.executable, "-m", "shiftsim", *words]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        is_first = number == 0
+        assert ("compiling kernels, once per version" in done.stderr) == is_first or number
+
+
+def test_nothing_private_of_another_package_is_used() -> None:
+    paths = [path for part in PARTS for path in (PACKAGE / part).rglob("*.py")]
+    assert len(paths) > 200
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names = [alias.name for alias in getattr(node, "names", []) if hasattr(alias, "name")]
+            module = getattr(node, "module", None) or ""
+            for name in [module, *(f"{module}.{name}".lstrip(".") for name in names)]:
+                is_ours = name.startswith(("shiftsim", "__future__")) or not name
+                assert not name.startswith(("numba.core", "llvmlite", "numba.extending")), path
+                assert is_ours or not re.search(r"(^|\.)_[a-z]", name), f"{path}: {name}"

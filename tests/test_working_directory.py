@@ -8,8 +8,6 @@ import pytest
 from commands import call
 from stores import write_toy_store
 
-from shiftsim.warmup import SHARES, warm_up
-
 STRAY = "open('stray-was-executed', 'a').write(__name__ + ' ')\nraise SystemExit('stray')\n"
 # modules of the standard library that workers import, and packages that may be missing
 NAMES = (
@@ -81,12 +79,6 @@ def test_workers_of_a_script_elsewhere_execute_nothing_that_lies_about(folder, t
     script.write_text(SCRIPT)
     done = subprocess.run([sys.executable, script], cwd=folder, check=False, capture_output=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_compiling_kernels_executes_nothing_that_lies_about(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    with warm_up([next(iter(SHARES))]):
-        pass
 
 
 @pytest.mark.slow

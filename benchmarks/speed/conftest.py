@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from shiftsim.arrays import kernel
+from shiftsim.kernels import kernel
 
 CALIBRATION_STEPS = 10_000  # dependent multiply-adds: about 8 cycles each, whatever the machine
 ROUNDS = 200

@@ -6,7 +6,7 @@ Run with `pytest benchmarks/speed/test_dynamics.py -s`.
 import numpy as np
 import pytest
 
-from shiftsim.arrays import lean_kernel
+from shiftsim.kernels import kernel
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bicycle
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import interpolate
@@ -53,7 +53,7 @@ def test_command_and_bicycle(measure):
     measure(command_and_step, NOW, NOW + STEP_US, state, command, 0.1, 0.01, out)
 
 
-@lean_kernel
+@kernel
 def step_bicycles(states, commands, wheel_base, dt, out):
     for row in range(len(states)):
         step_bicycle(states[row], commands[row, 0], commands[row, 1], wheel_base, dt, out[row])

@@ -46,7 +46,7 @@ def test_idm_at_red_lights(measure, scenario):
     """All lanes and connectors of the city are red."""
     scene, observations = recorded_inputs(scenario)
     ids = scene.map.edges.ids
-    lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8)).sealed()
+    lights = TrafficLights(ids, np.full((1, len(ids)), 2, np.int8)).readonly()
     planner = load_planner("idm")
     planner.reset(scene)
     measure(planner.plan, replace(observations[0], lights=lights), calls=2, target=LIGHTS_TARGET)

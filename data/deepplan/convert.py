@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyproj
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.parts import (
     MAP_FILE,
     Broken,
@@ -40,6 +39,7 @@ from shiftsim.data.store.tables import PARTIAL, digest, file_name
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError
 from shiftsim.files import below
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 

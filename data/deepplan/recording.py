@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.route import find_route, nearest_lane
 from shiftsim.data.deepplan.states import ROW_US, ego_trace, resample, sample_runs
 from shiftsim.data.deepplan.windows import (
@@ -27,6 +26,7 @@ from shiftsim.data.deepplan.windows import (
 )
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.tracks.samples import TrackSamples
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import FULL_DURATION, duration_class
 from shiftsim.world.state import rear_poses

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.data.deepplan.windows import ConversionConfig
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.layers import Polygons, Polylines, containing, distance_to, in_any
 from shiftsim.world.map import VectorMap
 

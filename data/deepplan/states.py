@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.data.deepplan.windows import ROW_S, Runs, rows_of
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.ranges import SETTINGS
 
 ROW_S = 0.05  # s between rows of a converted recording

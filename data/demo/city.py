@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.states import ego_states
 from shiftsim.data.deepplan.windows import ROW_S
+from shiftsim.kernels import FloatArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario

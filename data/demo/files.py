@@ -9,12 +9,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES
 from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.scenes import DemoSite, Scene, demo_sites, traffic_of
 from shiftsim.data.demo.traffic import DT, Box, Traffic
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray
 
 _FRAME_RATE, _FRAME_DISTANCE = 25.0, 2
 _GROUND = 512.0  # m, altitude of everything

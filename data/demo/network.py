@@ -11,9 +11,9 @@ from itertools import permutations, product
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo import paths
 from shiftsim.data.demo.roads import CrosswalkSpec, LaneSpec, Piece, RoadNetwork, RoadSpec, connect
+from shiftsim.kernels import FloatArray
 
 _CLOSE = 2.9  # m between the centres of connecting roads that conflict
 _LANE_CHANGE = 45.0  # m

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 STEP = 0.5  # m between the points of a path
 _SMOOTHING = 2.5  # m, how far a driver rounds off the corners of the lane centres

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 

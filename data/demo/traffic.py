@@ -12,11 +12,11 @@ from math import cos, inf, sin, sqrt
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
 from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.network import Town
 from shiftsim.data.demo.paths import STEP, Zone, arc_at
+from shiftsim.kernels import FloatArray
 
 DT = 0.08  # s, 12.5 Hz
 _MAX_ACCEL, _BRAKING, _HARDEST = 1.3, 1.6, 3.2  # m/s^2

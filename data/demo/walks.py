@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.network import BAY_ANGLE, Street, Town
 from shiftsim.data.demo.paths import STEP, Walk, arc_at, resample
+from shiftsim.kernels import FloatArray
 
 _PARKING_STEP, _BAY_STEP = 6.6, 3.1  # m along the street between parked cars, diagonal ones
 _UNMARKED = 4.0  # m from a place to cross without a crosswalk to the middle of a parked car

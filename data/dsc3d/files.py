@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.ranges import DSC3D, require
 
 POSITION = ("translation_x", "translation_y", "translation_z")

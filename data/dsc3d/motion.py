@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, IntArray, kernel
 
 _MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
 _MAX_SPEED = 200.0  # m/s along an axis

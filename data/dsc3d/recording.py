@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.dsc3d.files import (
     DIMENSION,
     POSITION,
@@ -32,6 +31,7 @@ from shiftsim.data.dsc3d.motion import (
 )
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import DSC3D, require
 from shiftsim.world.state import AgentKind
 

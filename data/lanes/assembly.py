@@ -13,11 +13,11 @@ from typing import Protocol, TypeVar
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive.areas import merge_closed
 from shiftsim.data.opendrive.overlaps import subtract_overlaps
 from shiftsim.data.opendrive.shapes import lane_polygon
 from shiftsim.data.polygons import largest_part
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections

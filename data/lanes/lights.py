@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
+from shiftsim.kernels import IntArray
 from shiftsim.world.state import LightStatus, TrafficLights
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.assembly import (
     LIGHT_KIND,
     PASS_THROUGH,
@@ -23,6 +22,7 @@ from shiftsim.data.opendrive.overlaps import subtract_overlaps
 from shiftsim.data.opendrive.shapes import BASELINE_STEP, bend_ends, lane_polygon
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import MapError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import build_map
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import MAP_EXTENT, require

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.opendrive.shapes import BASELINE_STEP, divide, join_lines, lane_polygon
+from shiftsim.kernels import FloatArray
 
 _APART = 1e-3  # m, closer vertices of a source are one
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.nuplan.log import Log, as_numbers, note_implausible, read_rows, token_text
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import STORE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, tracks_of_boxes
 

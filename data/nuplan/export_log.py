@@ -10,11 +10,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.nuplan.log import LIDAR_CHANNEL, yaw_of
 from shiftsim.data.nuplan.mapping import Mapping, ends_early
 from shiftsim.data.nuplan.sqlite import Value, write_database
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, LightStatus
 

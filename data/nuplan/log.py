@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.nuplan.sqlite import Database, open_database
 from shiftsim.errors import ConversionError, DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.ranges import NUPLAN_LOG, STORE, require
 from shiftsim.world.state import NUM_STATE, LightStatus, TrafficLights
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
 from shiftsim.data.nuplan.sqlite import open_database
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import NUPLAN_MAP, require

@@ -1,7 +1,7 @@
 """How a scenario is cut from a log: duration, offset and subsample ratio by scenario type."""
 
-from shiftsim.arrays import IntArray
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import IntArray
 
 Mapping = tuple[float, float, float]
 

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.nuplan.filter import ScenarioFilter
 from shiftsim.data.nuplan.log import UNTAGGED, Log, read_ego
 from shiftsim.data.nuplan.mapping import ROW_SECONDS
 from shiftsim.data.nuplan.scenarios import ScenarioEntry
 from shiftsim.data.recording import Window
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import VX, VY, center_poses
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
 from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
 from shiftsim.data.nuplan.log import (
     Log,
@@ -27,6 +26,7 @@ from shiftsim.data.nuplan.mapping import Mapping, ends_early, mapping_of
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.errors import ConversionError, DataError
+from shiftsim.kernels import IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.lanes.lights import Cycle, LightStates, states_of_cycles
 from shiftsim.data.lanes.map import build_lane_map
 from shiftsim.data.lanes.pieces import LanePiece, MapSource, StopArea, stop_area
@@ -23,6 +22,7 @@ from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.motion import unit_vectors
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.data.xml_elements import xml_elements
+from shiftsim.kernels import FloatArray
 from shiftsim.world.state import AgentKind, LightStatus
 
 _MAX_BYTES = 500_000_000

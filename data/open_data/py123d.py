@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.lights import LightStates, states_of_lists
 from shiftsim.data.lanes.map import PieceMap, build_lane_map
 from shiftsim.data.lanes.pieces import MapSource, StopArea
@@ -22,6 +21,7 @@ from shiftsim.data.open_data.source import Source, find_below, items, vectors
 from shiftsim.data.tracks.build import make_samples
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import import_extra
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 EGO = "ego"

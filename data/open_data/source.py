@@ -16,10 +16,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.pieces import clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.errors import ConversionError, DataError, readable
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import OPEN_DATA, require
 
 _MAX_BYTES = 2_000_000_000

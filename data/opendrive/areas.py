@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive import records
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.graph import ConnectorRun
 from shiftsim.data.opendrive.records import OpenDrive, Outline, Repeat, Road, RoadObject, Signal
 from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
 from shiftsim.data.polygons import largest_part, touching
+from shiftsim.kernels import FloatArray, IntArray
 
 _SEAM_WIDTH = 0.5  # m
 _MIN_OVERLAP = 1.0  # m²

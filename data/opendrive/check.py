@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.areas import linked_groups
 from shiftsim.data.polygons import shared_areas
+from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer
 from shiftsim.world.map import VectorMap
 

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.areas import is_stop_line, rings_of
 from shiftsim.data.opendrive.graph import LaneGraph, Piece
 from shiftsim.data.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal
 from shiftsim.data.opendrive.shapes import Shapes
 from shiftsim.data.polygons import largest_part
+from shiftsim.kernels import FloatArray
 
 LIGHT, STOP, YIELD = "light", "stop", "yield"
 STOP_LINE_DEPTH = 1.0  # m

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.opendrive.records import ARC, PARAM_POLY3, POLY3, SPIRAL, Geometry
+from shiftsim.kernels import FloatArray, IntArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # on [0, 1]

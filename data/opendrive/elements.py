@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.records import Outline, Repeat, RoadObject, Signal
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.ranges import CHECK, OPENDRIVE
 
 CUBIC = ("a", "b", "c", "d")

@@ -15,10 +15,10 @@ from typing import TypeAlias
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.lanes import LaneKey, lane_links, runs_forward, section_borders
 from shiftsim.data.opendrive.records import DRIVABLE, Lane, OpenDrive
+from shiftsim.kernels import FloatArray
 
 MIN_LENGTH = 0.1  # m, shorter lanes are linked through
 MIN_WIDTH = 0.5  # m, lanes never wider are linked through

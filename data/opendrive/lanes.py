@@ -10,9 +10,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.records import Connection, Lane, OpenDrive, Road, RoadLink
+from shiftsim.kernels import FloatArray
 
 BEFORE_END = 1e-9  # m: the end of a section still belongs to it
 _MAX_OFFSET = 500.0  # m from the reference line, so that absurd polynomials stay harmless

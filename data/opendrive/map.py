@@ -9,7 +9,6 @@ from typing import TypeVar
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.lanes.assembly import (
     LIGHT_KIND,
     PASS_THROUGH,
@@ -28,6 +27,7 @@ from shiftsim.data.opendrive.overlaps import Levels, cut_crossings, overlapping,
 from shiftsim.data.opendrive.preparation import prepare
 from shiftsim.data.opendrive.records import OpenDrive
 from shiftsim.data.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
 

@@ -13,12 +13,12 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.graph import ConnectorRun, LaneGraph, LaneRun, Piece, split_pieces
 from shiftsim.data.opendrive.lanes import evaluate_cubics
 from shiftsim.data.opendrive.records import OpenDrive
 from shiftsim.data.opendrive.shapes import Shapes, lane_polygon
 from shiftsim.data.polygons import largest_part, shared_areas
+from shiftsim.kernels import FloatArray
 
 OVERLAP = 1e-6  # m², less is a shared border
 LEVEL = 3.0  # m of height between lanes that do not meet, nuPlan rule 512

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 SHAPES = LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s

@@ -13,12 +13,12 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.opendrive.curves import ReferenceLine
 from shiftsim.data.opendrive.graph import Piece
 from shiftsim.data.opendrive.lanes import BEFORE_END, LaneKey, section_borders
 from shiftsim.data.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
+from shiftsim.kernels import FloatArray
 
 CHORD_ERROR = 0.05  # m
 BASELINE_STEP = 0.25  # m, nuPlan rule 510: PLUTO takes every fourth vertex as 1 m

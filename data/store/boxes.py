@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.data.store.plausible import BOX_LIMITS
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 
 BitArray: TypeAlias = NDArray[np.uint64]
 # bits of the largest numbers that are in `BOX_LIMITS`, which are as wide to both sides; of infinity
@@ -40,7 +40,7 @@ def second_differences(values: FloatArray) -> BitArray:
     return ((bend << 1) ^ (bend >> 63)).view(np.uint64)
 
 
-@lean_kernel
+@kernel
 def difference_of(code: np.uint64) -> np.uint64:
     """The second difference, modulo 2^64, that a code stands for."""
     one = np.uint64(1)
@@ -54,7 +54,7 @@ def restored(codes: BitArray) -> FloatArray:
     return out
 
 
-@lean_kernel
+@kernel
 def restore(codes: BitArray, out: BitArray) -> None:
     """Write the bits (n,) of which these are the codes (n,)."""
     step = bits = np.uint64(0)
@@ -64,7 +64,7 @@ def restore(codes: BitArray, out: BitArray) -> None:
         out[at] = bits
 
 
-@lean_kernel
+@kernel
 def cut_spans(
     row: IntArray, track: IntArray, first: int, last: int, place: IntArray, spans: IntArray
 ) -> int:
@@ -103,14 +103,14 @@ def cut_spans(
     return count
 
 
-@lean_kernel
+@kernel
 def place_of(spans: IntArray, span: np.uint64, place: IntArray) -> int:
     """The place of a span's track in the dense arrays, from 1; 0 if it is in none of their rows."""
     track = spans[span, 2]
     return place[np.uint64(track)] if track >= 0 else 0
 
 
-@lean_kernel
+@kernel
 def mark(spans: IntArray, place: IntArray, there: BoolArray) -> None:
     """Note in `there` (N, R) where there are boxes of tracks, by their place, from 1 on."""
     for span in range(np.uint64(len(spans) - 1)):
@@ -121,7 +121,7 @@ def mark(spans: IntArray, place: IntArray, there: BoolArray) -> None:
                 row += np.uint64(1)
 
 
-@lean_kernel
+@kernel
 def scatter(
     motion: tuple[BitArray, ...],
     extent: tuple[FloatArray, FloatArray],

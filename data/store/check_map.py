@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.data.store.check_motion import Finding
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.layers import Polygons, containing, nearest
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario

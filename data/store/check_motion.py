@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.store.tracks import StoredRecording
 from shiftsim.data.tracks.motion import (
     MAX_SHARE,
@@ -13,6 +12,7 @@ from shiftsim.data.tracks.motion import (
     fitted_velocities,
 )
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, VX, VY, AgentKind
 
 _US = 1e-6  # s

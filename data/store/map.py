@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import sealed
 from shiftsim.data.store.plausible import require_sound, require_vertices
 from shiftsim.data.store.tables import REPAIR, Table, write_blocks
 from shiftsim.errors import DataError
+from shiftsim.kernels import readonly
 from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
 from shiftsim.world.map import LAYERS, VectorMap
 
@@ -124,7 +124,7 @@ def _assemble(footer: dict[str, Any], items: dict[str, Any], where: str) -> Vect
         require_vertices(f"{where}: {name}", *given)
         parts[name] = index_polygons(*given) if name in LAYERS else index_polylines(*given)
     for name in LISTS:
-        parts[name] = Lists(*(sealed(items[f"{name}_{part}"]) for part in Lists._fields))
+        parts[name] = Lists(*(readonly(items[f"{name}_{part}"]) for part in Lists._fields))
     for name in LAYERS:
         ids = items[f"{name}_ids"]
         if len(ids) != len(parts[name].poly_ptr) - 1:

@@ -7,12 +7,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, read_only
 from shiftsim.data.recording import Window
 from shiftsim.data.store.schema import EGO_COLUMNS, MOTION, SCENARIOS
 from shiftsim.data.store.tables import FRAMES, REPAIR, ego_file
 from shiftsim.data.store.tables import TRACKS as TRACKS_FILE
 from shiftsim.errors import DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel, readonly
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.ranges import MAP_EXTENT, STORE, require
@@ -73,11 +73,11 @@ def _is_plausible(scene: Scenario) -> bool:
     if scene.ego.shape[1:] != _EGO_LIMITS.shape[:1]:
         return False
     arrays = scene.time_us, scene.iteration_times, scene.ego
-    plain = [read_only(np.ascontiguousarray(array)) for array in arrays]
+    plain = [readonly(np.ascontiguousarray(array)) for array in arrays]
     return bool(_increase_within(*plain, _TIMES, _EGO_LIMITS))
 
 
-@lean_kernel
+@kernel
 def _increase_within(
     time_us: IntArray,
     steps: IntArray,
@@ -153,7 +153,7 @@ def require_boxes(tracks: Tracks, num_rows: int, boxes: Path) -> None:
 
 def _plain(array: Any, kind: Any) -> Any:
     """As the kernel takes it."""
-    return read_only(np.ascontiguousarray(array, kind))
+    return readonly(np.ascontiguousarray(array, kind))
 
 
 @kernel

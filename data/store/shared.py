@@ -21,10 +21,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from shiftsim.arrays import sealed
 from shiftsim.data.store.map import LINES, LISTS, read_map_file
 from shiftsim.data.store.tables import digest
 from shiftsim.files import PACKAGE, sources, user_cache
+from shiftsim.kernels import readonly
 from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
 from shiftsim.world.map import LAYERS, VectorMap
 
@@ -140,7 +140,7 @@ def _open(path: Path) -> VectorMap:
     start = _SUM + _LENGTH + int(whole[_SUM : _SUM + _LENGTH], 16)
     about = json.loads(whole[_SUM + _LENGTH : start])
     arrays = {
-        name: sealed(np.frombuffer(whole, kind, int(np.prod(shape)), start + at).reshape(shape))
+        name: readonly(np.frombuffer(whole, kind, int(np.prod(shape)), start + at).reshape(shape))
         for name, (kind, shape, at) in about["arrays"].items()
     }
     parts: dict[str, Any] = {name: array for name, array in arrays.items() if "." not in name}

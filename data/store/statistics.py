@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, center_poses, speeds

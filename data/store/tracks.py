@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema
 from shiftsim.data.store.boxes import (
@@ -29,6 +28,7 @@ from shiftsim.data.store.plausible import (
 )
 from shiftsim.data.store.tables import FRAMES, REPAIR, TRACKS, Table, ego_file, write_blocks
 from shiftsim.errors import DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.ranges import STORE, require
 from shiftsim.world.state import NUM_STATE, Tracks, TrafficLights
 

@@ -3,10 +3,10 @@
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.agents import SIZES, Driver
 from shiftsim.data.demo.traffic import Box
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray
 
 _MARGIN = 0.1  # m, added to length and width, so that nobody brushes anybody
 _EVERY = 3  # frames

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.convert import convert_dsc3d
 from shiftsim.data.deepplan.windows import ROW_S, ConversionConfig
 from shiftsim.data.demo.files import write_site
@@ -27,6 +26,7 @@ from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.towns.layouts import KINDS, Place, random_place
 from shiftsim.data.towns.people import random_traffic
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import TrafficLights
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.demo.network import Street
 from shiftsim.data.demo.roads import Piece, bend, line
+from shiftsim.kernels import FloatArray
 
 AT_JUNCTION = ((3.0, 7.0),)  # m along a street, crosswalk at a junction
 WIDE = 0.3  # m, how far drivers swing out to turn right

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.dsc3d.motion import track_medians
 from shiftsim.data.tracks.columns import UNITS
 from shiftsim.data.tracks.evidence import (
@@ -15,6 +14,7 @@ from shiftsim.data.tracks.evidence import (
 from shiftsim.data.tracks.fit import Fit
 from shiftsim.data.tracks.motion import contradiction, fitted_velocities
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
 
 _MAX_HEADING = 0.2  # rad, median angle between heading and motion
 _MAX_BACKWARDS = 0.1  # share of the rows

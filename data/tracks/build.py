@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.deepplan.states import ROW_US, rows_between, sample_runs
 from shiftsim.data.deepplan.windows import ROW_S, find_runs
 from shiftsim.data.dsc3d.motion import held_headings, track_medians
@@ -20,6 +19,7 @@ from shiftsim.data.dsc3d.recording import CATEGORIES
 from shiftsim.data.tracks.motion import believed, fitted_velocities, headings_of_motion
 from shiftsim.data.tracks.samples import TrackSamples
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled

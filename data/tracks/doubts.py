@@ -6,7 +6,6 @@ on the map. Every explanation that is known is tried; the one that makes the num
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.data.tracks.axes import check_headings, check_reference, check_velocities
 from shiftsim.data.tracks.build import MAX_PAUSE_S, MAX_SPAN_S, numbered
 from shiftsim.data.tracks.columns import KINDS, UNITS, Columns
@@ -14,6 +13,7 @@ from shiftsim.data.tracks.evidence import FAST, LEAST_CONTRADICTING, Doubts, Mot
 from shiftsim.data.tracks.fit import Fit, fit_map
 from shiftsim.data.tracks.motion import contradiction
 from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 

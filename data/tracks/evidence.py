@@ -5,10 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.data.dsc3d.motion import track_medians
 from shiftsim.data.tracks.motion import fitted_velocities
 from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 
 FAST = 2.0  # m/s, above which a direction of motion is sure
 # share of the moving vehicles whose velocities contradict their positions; more than the first is

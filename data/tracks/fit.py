@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
 from shiftsim.data.deepplan.route import place_on_map
 from shiftsim.geometry.polylines import project_on_polyline
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.world.layers import Polygons, Polylines, contains, in_any
 from shiftsim.world.map import VectorMap
 

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.data.dsc3d.motion import median
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 
 _HALF_WINDOW = 0.25  # s on each side of a fit
 _EPS = 1e-6  # s

@@ -12,12 +12,12 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.data.dsc3d.recording import normalise_category
 from shiftsim.data.tracks.build import numbered, order_of_rows
 from shiftsim.data.tracks.columns import Columns, recognise
 from shiftsim.data.tracks.motion import unit_vectors
 from shiftsim.errors import ConfigError, ConversionError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import OPEN_DATA, require
 
 _REPAIR = "repair the file, or name other columns with --columns"

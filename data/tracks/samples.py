@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.lqr import TRACKED
 from shiftsim.sim.execute import Course, execute
 from shiftsim.sim.plan_check import GOOD
@@ -32,7 +32,7 @@ class ConstantVelocity:
         return int(_drive_on(course, _TIMES, np.zeros((len(_TIMES), NUM_STATE))))
 
 
-@lean_kernel
+@kernel
 def _go_straight(x: float, y: float, heading: float, speed: float, out: FloatArray) -> None:
     """Write poses and speeds of states (H, 11) from a pose straight on."""
     cos, sin = np.cos(heading), np.sin(heading)
@@ -42,7 +42,7 @@ def _go_straight(x: float, y: float, heading: float, speed: float, out: FloatArr
         out[step, VX] = speed
 
 
-@lean_kernel
+@kernel
 def _drive_on(course: Course, plan_us: IntArray, states: FloatArray) -> int:
     """Plan and execute until the end, or until a plan cannot be executed, at that iteration."""
     ego, time_us = course.ego, course.time_us

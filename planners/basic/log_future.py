@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import PlannerError
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.lqr import TRACKED
 from shiftsim.sim.execute import Course, execute
 from shiftsim.sim.plan_check import GOOD, plain
@@ -78,7 +78,7 @@ class LogFuture:
         return self._previous
 
 
-@lean_kernel
+@kernel
 def _drive_on(
     course: Course,
     time_us: IntArray,  # (R,) time stamps of the recording [us]

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import sealed
 from shiftsim.errors import ConfigError, DataError, PlannerError
+from shiftsim.kernels import readonly
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import AX, AY, NUM_STATE, STEERING, VX, VY, YAW_RATE, Trajectory
 
@@ -99,7 +99,9 @@ def _read(path: Path) -> dict[str, dict[str, Trajectory]]:
         rows = rows[np.argsort(times[rows], kind="stable")]
         if (np.diff(times[rows]) <= 0).any():
             raise DataError(f"{path}: scene {scene!r}, script {script!r}: a time occurs twice")
-        out.setdefault(scene, {})[script] = Trajectory(sealed(times[rows]), sealed(states[rows]))
+        out.setdefault(scene, {})[script] = Trajectory(
+            readonly(times[rows]), readonly(states[rows])
+        )
     return out
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import (

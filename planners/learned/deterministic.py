@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 State = dict[str, NDArray[Any]]
 

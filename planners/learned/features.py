@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.device import on_device
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.sim.planner import History, SceneInfo

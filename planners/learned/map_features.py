@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap

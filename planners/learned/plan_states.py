@@ -5,7 +5,7 @@ The LQR tracker reads the poses only; perfect tracking reads the rest too.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.planner import History
 from shiftsim.world.state import AY, HEADING, NUM_STATE, VX, Trajectory
 

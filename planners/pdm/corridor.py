@@ -6,7 +6,6 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.polylines import (
     BAND,
     CLEAR,
@@ -24,6 +23,7 @@ from shiftsim.geometry.polylines import (
     without_repeats,
 )
 from shiftsim.geometry.rings import SLACK, centroid
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
 
 
@@ -90,7 +90,7 @@ def corridor_shape(path: Path, low: float, high: float, half_width: float) -> sh
     return corridor_polygon(line, half_width)
 
 
-@lean_kernel
+@kernel
 def fill_corridor(
     path: Path, corridors: Corridors, forecast: Forecast, number: int, first: int, last: int
 ) -> None:
@@ -161,7 +161,7 @@ def fill_corridor(
                 )
 
 
-@part_kernel
+@kernel
 def _side_of_frame(
     path: Path,
     stretch: Stretch,
@@ -197,7 +197,7 @@ def _side_of_frame(
     return side
 
 
-@lean_kernel
+@kernel
 def _square_from(frame: BoxFrame, dx: float, dy: float) -> float:
     """Square of the distance of a box from a point, given from its centre [m^2]."""
     along = max(abs(frame.cos * dx + frame.sin * dy) - frame.half_length, 0.0)
@@ -205,7 +205,7 @@ def _square_from(frame: BoxFrame, dx: float, dy: float) -> float:
     return along * along + across * across
 
 
-@lean_kernel
+@kernel
 def _runs_near(
     stretch: Stretch, bounds: tuple[float, float, float, float], reach: float
 ) -> tuple[int, int]:

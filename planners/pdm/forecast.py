@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
 from shiftsim.geometry.rings import centroid, ring_bounds
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks
 from shiftsim.planners.proposals.contacts import Others, touches_box
@@ -62,7 +62,7 @@ def select_tracks(
     )
 
 
-@lean_kernel
+@kernel
 def _select(
     seen: BoolArray,
     poses: FloatArray,
@@ -127,7 +127,7 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
     return made
 
 
-@lean_kernel
+@kernel
 def _forecast(
     chosen: IntArray,
     kinds: IntArray,
@@ -190,7 +190,7 @@ def touched(forecast: Forecast, ego: FloatArray, size: EgoBox) -> list[int]:
     return chosen
 
 
-@lean_kernel
+@kernel
 def _touched(
     ego: FloatArray,
     size: EgoBox,

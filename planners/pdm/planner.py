@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.geometry.polylines import make_path
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.pdm.corridor import Paths
 from shiftsim.planners.pdm.forecast import (
     LIGHT_TOKEN,

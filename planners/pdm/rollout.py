@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
 from shiftsim.geometry.polylines import (
     CLEAR,
@@ -26,6 +25,7 @@ from shiftsim.geometry.rings import (
     ring_distance,
     rings_touch,
 )
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.corridor import (
     Corridors,
     Paths,
@@ -120,7 +120,7 @@ def _roll_on(proposals: Proposals, scene: Scene, ego: FloatArray, part: Part) ->
         decide(shape, corridors, forecast, at, step // 2, wanted)
 
 
-@lean_kernel
+@kernel
 def read_pose(path: Path, progress: float, last: FloatArray, out: FloatArray) -> None:
     """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN.
 
@@ -145,7 +145,7 @@ def read_pose(path: Path, progress: float, last: FloatArray, out: FloatArray) ->
     last[0], out[2] = upper, last[2]
 
 
-@lean_kernel
+@kernel
 def _roll(
     first_path: int,  # where to go on
     first_step: int,  # likewise; 0 where the path is new
@@ -204,7 +204,7 @@ def _roll(
     return part.paths[1], 0, _DONE
 
 
-@lean_kernel
+@kernel
 def _start(path: Path, made: Proposals, number: int, ego: FloatArray) -> None:
     """Fill time index 0 of a path's proposals: on the path, beside the ego."""
     progress = project(path, ego[0], ego[1], 0)[0]
@@ -222,7 +222,7 @@ def _start(path: Path, made: Proposals, number: int, ego: FloatArray) -> None:
     made.corridors.spans[number, 1] = progress + STEPS * DT * abs(fastest)
 
 
-@part_kernel
+@kernel
 def _follow_leads(
     step: int,
     path: Path,
@@ -282,7 +282,7 @@ def _follow_leads(
     return _DONE
 
 
-@part_kernel
+@kernel
 def _nearest(
     hits: IntArray,
     num_hits: int,
@@ -328,7 +328,7 @@ def _nearest(
     return found, best
 
 
-@lean_kernel
+@kernel
 def _light_distance(
     footprint: FloatArray, ring: FloatArray, bounds: FloatArray, runs: FloatArray, limit: float
 ) -> float:
@@ -371,7 +371,7 @@ def _light_distance(
     return best
 
 
-@lean_kernel
+@kernel
 def follow(
     before: FloatArray, lead: FloatArray, target: float, model: FollowingModel, out: FloatArray
 ) -> None:

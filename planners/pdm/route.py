@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import PlannerError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.areas import Areas, Slabs, covering, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
@@ -83,7 +83,7 @@ def lanes_at(
     return under[:count].tolist(), errors[:count].tolist()
 
 
-@lean_kernel
+@kernel
 def _lanes_at(
     slabs: Slabs,
     on_route: BoolArray,

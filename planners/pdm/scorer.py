@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
 from shiftsim.geometry.polylines import Path, project
 from shiftsim.geometry.rings import SLACK, convex_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import Areas, Slabs
 from shiftsim.planners.proposals.comfort import (
@@ -201,7 +201,7 @@ def _judge(
         collision_index[proposal], ttc_index[proposal] = fault, violation
 
 
-@part_kernel
+@kernel
 def _meet(
     states: FloatArray,  # (T, 11) of a proposal
     corners: FloatArray,  # (T, 4, 2)
@@ -273,7 +273,7 @@ def _meet(
     return fault, violation
 
 
-@lean_kernel
+@kernel
 def _follow_route(
     centers: FloatArray,
     flags: BoolArray,

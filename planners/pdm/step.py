@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.pdm.rollout import Proposals, Scene, extend, roll_out
 from shiftsim.planners.pdm.scorer import Place, Scores, score

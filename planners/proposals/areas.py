@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel, part_kernel
 from shiftsim.geometry.rings import SLACK, ray_crossings
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Lists, Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
@@ -82,7 +82,7 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     return Areas(polygons, slabs, on_route, lane)
 
 
-@lean_kernel
+@kernel
 def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray) -> None:
     """Add the edges of every slab to `fill`; write their ends and the spans, unless there are none.
 
@@ -110,7 +110,7 @@ def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray
         _span(slabs, scratch[0], scratch[1])
 
 
-@part_kernel
+@kernel
 def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
     """Fill in the spans; `lows` and `highs` are scratch for the edges of a slab."""
     bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
@@ -180,7 +180,7 @@ def _select(
     return out
 
 
-@part_kernel
+@kernel
 def held_points(
     slabs: Slabs, area: int, points: FloatArray, first: int, stop: int
 ) -> tuple[int, int]:
@@ -220,7 +220,7 @@ def held_points(
     return inside & ~on_boundary, on_boundary
 
 
-@lean_kernel
+@kernel
 def covering(slabs: Slabs, selected: IntArray, points: FloatArray, out: IntArray) -> int:
     """Write the selected areas that hold a point (1, 2), or have it on their boundary, into `out`.
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, part_kernel
 from shiftsim.geometry.fits import fit_weights
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.tracker import DT, SCORED
 from shiftsim.world.state import AX, AY, HEADING
 
@@ -141,7 +141,7 @@ def feel(states: FloatArray, filters: Filters, bounds: ComfortBounds, made: Comf
                 made.score[row] = 0.0
 
 
-@part_kernel
+@kernel
 def _filter(
     samples: FloatArray, filters: Filters, number: int, sums: FloatArray, out: FloatArray
 ) -> None:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import BEHIND, bearing, circle_around, front_touches
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.places import Places
 from shiftsim.world.state import HEADING, VX, VY
 
@@ -30,7 +30,7 @@ class Others(NamedTuple):
     ignored: BoolArray  # (N,) whether contacts with it do not count
 
 
-@lean_kernel
+@kernel
 def project_box(corners: FloatArray, state: FloatArray, travel: float, out: FloatArray) -> None:
     """Write a box (4, 2) of the ego, moved `travel` [m] along the heading of its state (11,)."""
     cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
@@ -49,7 +49,7 @@ def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
     return out
 
 
-@lean_kernel
+@kernel
 def touches_box(footprint: FloatArray, circle: tuple[float, float, float], box: FloatArray) -> bool:
     """Whether a box (4, 2), with the circle around it, touches another one."""
     x, y, radius = circle_around(box)
@@ -88,7 +88,7 @@ def near_others(places: Places, others: Others, rows: int, horizon: float) -> In
     return out[:count]
 
 
-@lean_kernel
+@kernel
 def hits(
     others: Others, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
 ) -> bool:
@@ -101,7 +101,7 @@ def hits(
     return convex_intersect(box, others.boxes[row, index])
 
 
-@lean_kernel
+@kernel
 def is_at_fault(
     state: FloatArray,
     box: FloatArray,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.areas import Areas, Slabs, held_points
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
 
@@ -146,7 +146,7 @@ def find(
             at.speed_limits[row, step] = limit
 
 
-@lean_kernel
+@kernel
 def _place_ego(
     at: Places, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
 ) -> int:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.dynamics.bicycle import turn_and_step
 from shiftsim.sim.dynamics.lqr import (
     NUPLAN,
@@ -34,7 +34,7 @@ STEPS = 80  # of a plan
 SCORED = 40  # of a proposal, as far as proposals are compared
 
 
-@lean_kernel
+@kernel
 def factor_speed_fit(dt: float, penalty: float, factors: FloatArray) -> None:
     """Write what `fit_speed` needs of its matrix, the same for all poses, into `factors` (3, M).
 
@@ -73,7 +73,7 @@ def factor_speed_fit(dt: float, penalty: float, factors: FloatArray) -> None:
         side1[row] = factor1
 
 
-@lean_kernel
+@kernel
 def fit_speed(
     poses: FloatArray, courses: FloatArray, dt: float, factors: FloatArray, out: FloatArray
 ) -> None:
@@ -120,7 +120,7 @@ def fit_profiles(poses: FloatArray, dt: float, params: LqrParameters, profiles: 
     fit_curvature(poses, profiles.speeds, dt, rate_penalty, profiles.curvatures)
 
 
-@lean_kernel
+@kernel
 def look_ahead(
     state: FloatArray, pose: FloatArray, step: int, profiles: Profiles
 ) -> tuple[float, float]:
@@ -171,7 +171,7 @@ def _drive(
         _follow(poses[row], ego, params, dt, profiles, out.states[row])
 
 
-@lean_kernel
+@kernel
 def _follow(
     poses: FloatArray,
     ego: FloatArray,

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.errors import PlannerError
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.routes.graph import HINT, deviation, search_levels
 from shiftsim.world.layers import Lists, Polygons, Polylines, meeting, nearest_of, square_around
 from shiftsim.world.map import VectorMap

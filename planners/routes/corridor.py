@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import (
     BAND,
@@ -31,6 +30,7 @@ from shiftsim.geometry.rings import (
     ring_segment_distance,
     rings_touch,
 )
+from shiftsim.kernels import FloatArray, IntArray, kernel
 
 # beside CLEAR, HIT and OPEN: not looked at yet, and touched by the ego's footprint itself
 UNKNOWN, MET = -1, 3
@@ -63,7 +63,7 @@ def make_survey(path: Path, half_width: float, count: int) -> Survey:
     return Survey(half_width, sides, hits, np.empty((count, 4)), runs)
 
 
-@lean_kernel
+@kernel
 def start_survey(survey: Survey, path: Path, objects: Objects, progress: float) -> None:
     """Find out which runs of the path, from a progress on, come near each object."""
     first = max(int(np.searchsorted(path.progress, progress)) - 1, 0) // RUN
@@ -80,7 +80,7 @@ def start_survey(survey: Survey, path: Path, objects: Objects, progress: float) 
                 survey.runs[index, 1] = run
 
 
-@lean_kernel
+@kernel
 def find_sides(
     path: Path,
     low: float,  # progress at which the stretch begins, within the path [m]
@@ -116,7 +116,7 @@ def find_sides(
             out[index] = _side(path, first, stop, has_ends, ends, ring, survey, index)
 
 
-@lean_kernel
+@kernel
 def _write_ends(
     path: Path, low: float, high: float, first: int, stop: int, has_ends: bool, ends: FloatArray
 ) -> bool:
@@ -146,7 +146,7 @@ def _write_ends(
     return True
 
 
-@lean_kernel
+@kernel
 def _side(
     path: Path,
     first: int,
@@ -192,7 +192,7 @@ def _side(
     return answer if first_cap == last_cap == CLEAR else OPEN
 
 
-@lean_kernel
+@kernel
 def _segment_side(path: Path, segment: int, ring: FloatArray, survey: Survey, index: int) -> int:
     """CLEAR, HIT or OPEN: whether a ring touches the corridor of a segment, without its ends."""
     known = survey.sides[index, segment]
@@ -209,7 +209,7 @@ def _segment_side(path: Path, segment: int, ring: FloatArray, survey: Survey, in
     return known
 
 
-@lean_kernel
+@kernel
 def find_lead(
     footprint: FloatArray, objects: Objects, bounds: FloatArray, sides: IntArray
 ) -> tuple[int, float]:
@@ -234,13 +234,13 @@ def find_lead(
     return found, best_gap
 
 
-@lean_kernel
+@kernel
 def lead_speed(objects: Objects, index: int, heading: float) -> float:
     """Speed of an object along a heading [m/s]."""
     return objects.speeds[index] * np.cos(wrap_angle(objects.headings[index] - heading))
 
 
-@lean_kernel
+@kernel
 def is_tied(sides: IntArray, answers: FloatArray, lead: int) -> bool:
     """Whether another object than the lead is MET, and has another answer.
 
@@ -285,7 +285,7 @@ class Index:
         return polygons
 
 
-@lean_kernel
+@kernel
 def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     """Distance between a box and a ring, and the same measured between their nearest points [m].
 
@@ -324,7 +324,7 @@ def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     return best, gap
 
 
-@lean_kernel
+@kernel
 def _gap_to_edge(p: FloatArray, a: FloatArray, b: FloatArray) -> float:
     dx, dy = b[0] - a[0], b[1] - a[1]
     square = dx * dx + dy * dy

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import (
     Path,
@@ -18,6 +17,7 @@ from shiftsim.geometry.polylines import (
     vertex_headings,
 )
 from shiftsim.geometry.rings import ring_distance
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.layers import Polylines, contains
 from shiftsim.world.map import NONE, VectorMap
 
@@ -112,7 +112,7 @@ def lanes_of(road: VectorMap, blocks: Iterable[int]) -> list[int]:
     return [e for block in blocks if block != NONE for e in road.block_edges.at(block).tolist()]
 
 
-@lean_kernel
+@kernel
 def deviation(
     baselines: Polylines, lane: int, stride: int, x: float, y: float, heading: float
 ) -> tuple[float, float]:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.geometry.polylines import RUN
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
 

@@ -163,18 +163,23 @@ def _bar() -> Iterator[Advance]:
         task = bar.add_task("", total=None)
 
         def advance(done: int, total: int, note: str) -> None:
-            bar.update(task, completed=done, total=total, description=note)
+            bar.update(task, completed=done, total=total or None, description=note)
 
         yield advance
 
 
 def _lines() -> Advance:
     began = time.monotonic()
-    last = [0]
+    last = [-1]
 
     def advance(done: int, total: int, note: str) -> None:
-        tenth = 10 * done // total if total else 10
-        if tenth > last[0]:
+        if not total:  # not known yet: what happens before
+            if last[0] < 0:
+                typer.echo(f" {note}", err=True)
+                last[0] = 0
+            return
+        tenth = 10 * done // total
+        if tenth > max(last[0], 0):
             last[0] = tenth
             elapsed = time.monotonic() - began
             left = elapsed / done * (total - done) if done else 0.0

@@ -42,13 +42,11 @@ def demo(
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
     from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
     from shiftsim.runs.config import DEFAULT_STORE, make_config
-    from shiftsim.warmup import warm_up
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
         say(f"generating and converting recordings, compiling kernels → {folder}")
-        with warm_up(["routes"], ["contacts"], ["planners"]):
-            demo_store(folder)
+        demo_store(folder)
     values: dict[str, Any] = {
         "planners": list(_PLANNERS),
         "noise": list(_NOISE),

@@ -15,7 +15,7 @@ from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
 
 if TYPE_CHECKING:
-    from shiftsim.warmup import Filled
+    from shiftsim.cli.compiling import Compiled
 
 REFERENCE = PACKAGE / "verify" / "reference"
 _DATA = 2
@@ -66,10 +66,10 @@ def doctor(
     """Versions, cores and memory, and whether the kernels compute what they should."""
     kernels = None
     if fills:
-        from shiftsim.warmup import fill
+        from shiftsim.cli.compiling import compile_kernels
 
         with progress_bar(quiet=quiet or as_json) as advance:
-            kernels = fill(advance)
+            kernels = compile_kernels(advance)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = replace(examine(advance), kernels=kernels)
     show(asdict(found), found.lines(), as_json=as_json)
@@ -90,7 +90,7 @@ class Diagnosis:
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: "Filled | None" = None  # what was compiled before, where it was asked for
+    kernels: "Compiled | None" = None  # what was compiled before, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -115,21 +115,18 @@ class Diagnosis:
 
 def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
-    from shiftsim.files import kernel_folders
+    from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
     from shiftsim.verify import verify
-    from shiftsim.warmup import warm_up
 
     began = perf_counter()
     reports = []
-    # the metrics take longest to compile; their processes have the time of everything before them
-    with warm_up(["routes"], ["contacts"]):
-        advance(0, 3, "torch")
-        torch = _torch()
-        advance(1, 3, "dynamics")
-        reports.append(verify(REFERENCE / "dynamics"))
-        advance(2, 3, "metrics")
+    advance(0, 3, "torch")
+    torch = _torch()
+    advance(1, 3, "dynamics")
+    reports.append(verify(REFERENCE / "dynamics"))
+    advance(2, 3, "metrics")
     reports.append(verify(REFERENCE / "metric_worlds"))
     advance(3, 3, "")
     return Diagnosis(
@@ -138,7 +135,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         cores=default_workers(memory_each=1.0),
         memory=_memory(),
         workers=default_workers(),
-        kernel_cache=str(kernel_folders()[0]),
+        kernel_cache=CACHE_FOLDER or "none can be written",
         seconds=perf_counter() - began,
         cases=sum(report.num_cases for report in reports),
         mismatches=tuple(line for report in reports for line in report.mismatches),

@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -81,10 +82,6 @@ def run_config(
         around.enter_context(output_kept())
         show = around.enter_context(kept)
         tell = around.enter_context(watched([prepared], prepared.folder, live, show))
-        if prepared.workers > 1:  # a core is idle during the first task
-            from shiftsim.warmup import beside_run
-
-            around.enter_context(beside_run(prepared.config.traffic))
         finished = execute(prepared, on_progress=tell, argv=sys.argv)
     leave_with(finished, allow_partial=prepared.config.allow_partial, as_json=as_json)
 
@@ -101,7 +98,9 @@ def interruptible(folder: Path, again: list[str], *, quiet: bool) -> "Iterator[W
 
     before = signal.signal(signal.SIGTERM, interrupt)
     try:
-        with progress_bar(quiet=quiet) as advance:
+        from shiftsim.cli.compiling import compiling_shown
+
+        with progress_bar(quiet=quiet) as advance, compiling_shown(partial(advance, 0, 0)):
             yield lambda progress: advance(progress.done, progress.total, progress_note(progress))
     except KeyboardInterrupt:
         command = shlex.join(["shiftsim", *again])

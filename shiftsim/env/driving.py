@@ -15,13 +15,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray
 from shiftsim.env.episode import Episode, Reward, reward_of
 from shiftsim.env.observations import Nothing, Observer
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.geometry.boxes import from_frame
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.sim.loop import Setting

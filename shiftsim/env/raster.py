@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from gymnasium import Space, spaces
 
-from shiftsim.arrays import BoolArray
 from shiftsim.env.episode import Episode
+from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.planner import draw, measure
 from shiftsim.planners.learned.carl.raster import Raster

@@ -12,10 +12,10 @@ import numpy as np
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector.utils import create_shared_memory, read_from_shared_memory
 
-from shiftsim.arrays import FloatArray
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.env.terms import Terms
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray
 
 SETS = 3  # of arrays for observations
 SPAWN: Any = multiprocessing.get_context("spawn")  # forking is unsafe beside the threads of torch

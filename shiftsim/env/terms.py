@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.polylines import project_on_polyline
 from shiftsim.geometry.rings import point_segment_distance
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.collision import BOX_SIZE, STOPPED_SPEED, collide, flat_tracks, set_box
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, MIN_SAMPLES, Filters, bounds_of, filter_signal
 from shiftsim.metrics.result import NUPLAN
@@ -145,7 +145,7 @@ def make_terms(out: list[float]) -> Terms:
     return Terms._make([*out[:_OFF_ROAD], out[_OFF_ROAD] > 0.0, out[_COLLISION] > 0.0, out[_DONE]])
 
 
-@lean_kernel
+@kernel
 def _begin(course: Course) -> None:
     """Note where the recording is on the route, and what the ego touches before it moves."""
     for index in range(len(course.expert)):
@@ -158,7 +158,7 @@ def _begin(course: Course) -> None:
     course.out[_RC] = 0.0
 
 
-@lean_kernel
+@kernel
 def look_back(course: Course, row: int, filters: Filters, step: float, square: float) -> None:
     """Write the terms of the step that led to a row into `course.out`.
 
@@ -193,7 +193,7 @@ def look_back(course: Course, row: int, filters: Filters, step: float, square: f
         out[_COMFORT] = count_comfortable(course, row + 1, filters, step, square) / NUM_CHECKS
 
 
-@lean_kernel
+@kernel
 def _measure_progress(course: Course, x: float, y: float) -> None:
     arc, out = course.expert_arc, course.out
     length, share = arc[-1], 0.0
@@ -203,7 +203,7 @@ def _measure_progress(course: Course, x: float, y: float) -> None:
     out[_DONE] = max(share, out[_DONE])
 
 
-@lean_kernel
+@kernel
 def _is_on_road(course: Course, x: float, y: float) -> bool:
     # nuPlan rule 365: other drivable areas of the map do not count
     found = containing(course.blocks, x, y, course.found[:1])  # roadblocks come first
@@ -214,7 +214,7 @@ def _is_on_road(course: Course, x: float, y: float) -> bool:
     return containing(course.car_parks, x, y, course.found[:0]) > 0
 
 
-@lean_kernel
+@kernel
 def _is_on_route(course: Course, x: float, y: float) -> bool:
     for index in range(containing(course.edges, x, y, course.found)):
         if course.edge_on_route[course.found[index]]:
@@ -222,7 +222,7 @@ def _is_on_route(course: Course, x: float, y: float) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _current_lane(course: Course, x: float, y: float, heading: float) -> int:
     """The lane or connector that holds a point: on the route, and along the heading; else -1."""
     best, lane = np.inf, -1
@@ -235,7 +235,7 @@ def _current_lane(course: Course, x: float, y: float, heading: float) -> int:
     return lane
 
 
-@lean_kernel
+@kernel
 def _lane_term(course: Course, lane: int, x: float, y: float) -> float:
     left = _line_distance(course.left, lane, x, y)
     right = _line_distance(course.right, lane, x, y)
@@ -246,7 +246,7 @@ def _lane_term(course: Course, lane: int, x: float, y: float) -> float:
     return 1.0 - 0.5 * min(max((center - FREE_OFFSET) / room, 0.0), 1.0)
 
 
-@lean_kernel
+@kernel
 def _line_distance(lines: Polylines, line: int, x: float, y: float) -> float:
     """Distance of a point from a line, inf where the line is missing [m]."""
     best, xy = np.inf, lines.xy
@@ -256,7 +256,7 @@ def _line_distance(lines: Polylines, line: int, x: float, y: float) -> float:
     return best
 
 
-@lean_kernel
+@kernel
 def _set_ego(course: Course, row: int) -> None:
     state, box = course.ego[row], course.boxes[0]
     set_box(box, state, _LENGTH, _WIDTH)
@@ -264,7 +264,7 @@ def _set_ego(course: Course, row: int) -> None:
     box[1] = state[1] + _TO_CENTER * box[3]
 
 
-@lean_kernel
+@kernel
 def _find_contacts(course: Course, row: int) -> bool:
     """Whether the ego touches tracks that it did not touch before; they are noted."""
     _set_ego(course, row)
@@ -283,7 +283,7 @@ def _find_contacts(course: Course, row: int) -> bool:
     return is_hit
 
 
-@lean_kernel
+@kernel
 def _is_contact_ahead(course: Course, row: int, speed: float) -> bool:
     """Whether the ego meets a track within the horizon when everybody goes straight on."""
     ego, other = course.boxes[0], course.boxes[1]
@@ -311,7 +311,7 @@ def _is_contact_ahead(course: Course, row: int, speed: float) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _note_signals(course: Course, row: int) -> None:
     """Write what the comfort checks filter: accelerations and the unwrapped heading."""
     state, signals = course.ego[row], course.signals
@@ -327,7 +327,7 @@ def _note_signals(course: Course, row: int) -> None:
     signals[3, row] = state[HEADING] - 2.0 * np.pi * turns
 
 
-@lean_kernel
+@kernel
 def count_comfortable(
     course: Course, count: int, filters: Filters, step: float, square: float
 ) -> int:
@@ -349,7 +349,7 @@ def count_comfortable(
     return held
 
 
-@lean_kernel
+@kernel
 def _holds(values: FloatArray, bounds: FloatArray) -> bool:
     for value in values:
         if not bounds[0] < value < bounds[1]:

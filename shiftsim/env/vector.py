@@ -11,10 +11,10 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.env.episode import Episode
 from shiftsim.env.terms import Course
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.graph import lane_at, lanes_of
@@ -117,7 +117,7 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
     return np.concatenate([road.baselines.at(lane) for lane in chain])
 
 
-@lean_kernel
+@kernel
 def _look(course: Course, route: Route, row: int, status: IntArray, seen: Seen) -> None:
     """Write one observation into zeros."""
     ego = course.ego[row]
@@ -136,7 +136,7 @@ def _look(course: Course, route: Route, row: int, status: IntArray, seen: Seen) 
     _look_at_lanes(course, route, status, x, y, cos, sin, seen.lanes)
 
 
-@lean_kernel
+@kernel
 def _look_at_tracks(
     course: Course, route: Route, row: int, x: float, y: float, cos: float, sin: float, out: Values
 ) -> None:
@@ -160,7 +160,7 @@ def _look_at_tracks(
         line[7], line[8] = _cut(size[0] / METRES), _cut(size[1] / METRES)
 
 
-@lean_kernel
+@kernel
 def _look_at_lanes(
     course: Course,
     route: Route,
@@ -198,7 +198,7 @@ def _look_at_lanes(
             _place(px - x, py - y, cos, sin, METRES, line[4 + 2 * point : 6 + 2 * point])
 
 
-@lean_kernel
+@kernel
 def _keep(route: Route, count: int, most: int, distance: float, index: int) -> int:
     """Sort something into the nearest ones; how many there are then."""
     nearest, indices = route.nearest, route.indices
@@ -214,13 +214,13 @@ def _keep(route: Route, count: int, most: int, distance: float, index: int) -> i
     return count + 1
 
 
-@lean_kernel
+@kernel
 def _place(dx: float, dy: float, cos: float, sin: float, unit: float, out: Values) -> None:
     """Write a vector of the map frame in that of the ego, in a unit."""
     out[0] = _cut((cos * dx + sin * dy) / unit)
     out[1] = _cut((cos * dy - sin * dx) / unit)
 
 
-@lean_kernel
+@kernel
 def _cut(value: float) -> float:
     return min(max(value, -LARGEST), LARGEST)

@@ -7,14 +7,14 @@ rear-right, front-right.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.rings import EXTERIOR, locate_in_ring, segments_intersect
+from shiftsim.kernels import FloatArray, kernel
 
 # rad, bearings from the rear axle that at-fault tests compare with
 BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)
 
 
-@lean_kernel
+@kernel
 def box_corners(x: float, y: float, heading: float, length: float, width: float, out: FloatArray):  # type: ignore[no-untyped-def]
     """Write the corners of a box into `out` (4, 2), in the order named above [m]."""
     lon_x, lon_y = np.cos(heading), np.sin(heading)
@@ -27,20 +27,20 @@ def box_corners(x: float, y: float, heading: float, length: float, width: float,
         out[index, 1] = y + (lat * lat_y + lon * lon_y)
 
 
-@lean_kernel
+@kernel
 def circle_around(box: FloatArray) -> tuple[float, float, float]:
     """Centre and radius of a circle around a box (4, 2), a little larger than it [m]."""
     x, y = 0.5 * (box[0, 0] + box[2, 0]), 0.5 * (box[0, 1] + box[2, 1])
     return x, y, np.hypot(box[0, 0] - x, box[0, 1] - y) + 1e-6
 
 
-@lean_kernel
+@kernel
 def bearing(pose: FloatArray, x: float, y: float) -> float:
     """Angle between the heading of a pose (3,) and the direction to a point, in [0, pi] [rad]."""
     return np.arccos(bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1]))
 
 
-@lean_kernel
+@kernel
 def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
     """Cosine of a bearing, from that of the heading, its sine, and the way to the point [m]."""
     # nuPlan rule 3: the cosine is not clamped, so the angle may be NaN
@@ -48,7 +48,7 @@ def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
     return cos * (dx / distance) + sin * (dy / distance)
 
 
-@lean_kernel
+@kernel
 def front_touches(box: FloatArray, ring: FloatArray) -> bool:
     """Whether the front edge of a box (4, 2) touches the area of a convex ring (V, 2)."""
     if locate_in_ring(ring, box[0, 0], box[0, 1]) != EXTERIOR:
@@ -59,7 +59,7 @@ def front_touches(box: FloatArray, ring: FloatArray) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def meets_bounds(box: FloatArray, bounds: FloatArray) -> bool:
     """Whether the bounds of a box (4, 2) overlap `bounds` (4,) min x, min y, max x, max y."""
     return (
@@ -85,7 +85,7 @@ def boxes_to_corners(poses: FloatArray, sizes: FloatArray) -> FloatArray:
     return corners
 
 
-@lean_kernel
+@kernel
 def wrap_angle(angle: float) -> float:
     """An angle wrapped to [-pi, pi) as nuPlan does: ((angle + pi) mod 2 pi) - pi [rad]."""
     turned = angle + np.pi

@@ -4,7 +4,7 @@ from math import factorial
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 
 def fit_weights(window: int, degree: int, order: int, at: FloatArray | None = None) -> FloatArray:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.rings import (
     SLACK,
     point_segment_distance,
@@ -22,6 +21,7 @@ from shiftsim.geometry.rings import (
     ring_segment_distance,
     rings_touch,
 )
+from shiftsim.kernels import FloatArray, IntArray, kernel
 
 RUN = 8  # segments per bounding box
 CLEAR, HIT, OPEN = 0, 1, 2
@@ -32,7 +32,7 @@ _QUARTER_SEGMENTS = 16  # of the round joins
 _STRIDE = 4  # vertices between those that are looked at for a first bound
 
 
-@lean_kernel
+@kernel
 def project_on_polyline(
     xy: FloatArray, arc: FloatArray, start: int, stop: int, x: float, y: float
 ) -> float:
@@ -68,7 +68,7 @@ def project_on_polyline(
     return found
 
 
-@lean_kernel
+@kernel
 def point_on_polyline(
     xy: FloatArray, arc: FloatArray, start: int, stop: int, distance: float
 ) -> tuple[float, float]:
@@ -87,14 +87,14 @@ def point_on_polyline(
     )
 
 
-@lean_kernel
+@kernel
 def interpolate(start: float, end: float, span: float, ahead: float) -> float:
     """Value `ahead` of the start on the way from `start` to `end`, which is `span` long."""
     # nuPlan rule 4: the slope comes first, so that the end may be missed by the last bit
     return (end - start) / span * ahead + start
 
 
-@lean_kernel
+@kernel
 def vertex_heading(xy: FloatArray, index: int, stop: int) -> float:
     """Direction from a vertex to the next one; the last, `stop` - 1, repeats that before [rad]."""
     at = min(index, stop - 2)
@@ -108,7 +108,7 @@ def vertex_headings(xy: FloatArray) -> FloatArray:
     return np.append(heading, heading[-1])
 
 
-@lean_kernel
+@kernel
 def nearest_vertex(
     xy: FloatArray, start: int, stop: int, stride: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -136,7 +136,7 @@ def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
     return out
 
 
-@lean_kernel
+@kernel
 def _sum_up(steps: FloatArray, ptr: IntArray) -> None:
     """Make lengths (V,) of the segments that end at the vertices of lines arc lengths of these."""
     for line in range(len(ptr) - 1):
@@ -165,13 +165,13 @@ def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:
     return Path(xy, np.unwrap(poses[:, 2]), progress, runs)
 
 
-@lean_kernel
+@kernel
 def runs_of(num_points: int) -> int:
     """How many runs a polyline of so many vertices has."""
     return (num_points - 2) // RUN + 1
 
 
-@lean_kernel
+@kernel
 def bound_runs(xy: FloatArray, runs: FloatArray) -> None:
     """Write the bounds of the runs of a polyline (K, 2) into `runs` (R, 4)."""
     for run in range(len(runs)):
@@ -183,7 +183,7 @@ def bound_runs(xy: FloatArray, runs: FloatArray) -> None:
         runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3] = low_x, low_y, high_x, high_y
 
 
-@lean_kernel
+@kernel
 def is_run_within(runs: FloatArray, run: int, x: float, y: float, limit: float) -> bool:
     """Whether the bounds of a run come within `limit` [m] of a point."""
     dx = max(runs[run, 0] - x, 0.0, x - runs[run, 2])
@@ -191,7 +191,7 @@ def is_run_within(runs: FloatArray, run: int, x: float, y: float, limit: float) 
     return not dx * dx + dy * dy > limit * limit
 
 
-@lean_kernel
+@kernel
 def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
@@ -199,7 +199,7 @@ def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     return pose_before(path, min(max(int(np.searchsorted(path.progress, s)), 1), last), s)
 
 
-@lean_kernel
+@kernel
 def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, float]:
     """As `pose_at`, between a vertex and the one before, which have the progress between them."""
     lower = upper - 1
@@ -212,7 +212,7 @@ def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, 
     )
 
 
-@lean_kernel
+@kernel
 def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, int]:
     """The point of the path nearest to (x, y), the first one on ties: progress, distance [m], run.
 
@@ -235,7 +235,7 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     return found, best, run_found
 
 
-@lean_kernel
+@kernel
 def _project_on_run(path: Path, run: int, x: float, y: float) -> tuple[float, float]:
     best, found = np.inf, 0.0
     for index in range(run * RUN, min((run + 1) * RUN, len(path.xy) - 1)):
@@ -252,7 +252,7 @@ def _project_on_run(path: Path, run: int, x: float, y: float) -> tuple[float, fl
     return best, found
 
 
-@lean_kernel
+@kernel
 def window(path: Path, low: float, high: float) -> tuple[int, int]:
     """First vertex, and one past the last one, with a progress in [low, high], both clamped."""
     end = path.progress[-1]
@@ -271,7 +271,7 @@ class Stretch(NamedTuple):
     half_width: float  # radius of the buffer around it [m]
 
 
-@lean_kernel
+@kernel
 def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
     """Vertices `begin` … `end` - 1 without repeats at their ends; one if all are the same."""
     while end - begin > 1 and xy[begin, 0] == xy[begin + 1, 0] and xy[begin, 1] == xy[begin + 1, 1]:
@@ -281,7 +281,7 @@ def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
     return begin, end
 
 
-@lean_kernel
+@kernel
 def side_of(stretch: Stretch, ring: FloatArray) -> int:
     """CLEAR, HIT or OPEN: whether a ring (V, 2) touches the corridor of a stretch.
 
@@ -309,7 +309,7 @@ def side_of(stretch: Stretch, ring: FloatArray) -> int:
     return CLEAR if first == last == CLEAR and nearest > outer else OPEN
 
 
-@lean_kernel
+@kernel
 def is_run_near(
     runs: FloatArray, run: int, bounds: tuple[float, float, float, float], reach: float
 ) -> bool:
@@ -322,7 +322,7 @@ def is_run_near(
     )
 
 
-@lean_kernel
+@kernel
 def side_of_cap(
     a: FloatArray,
     b: FloatArray,

@@ -11,7 +11,7 @@ Predicates", 1997). Decisions are therefore exact at any distance from the origi
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
+from shiftsim.kernels import FloatArray, IntArray, kernel
 
 INTERIOR, BOUNDARY, EXTERIOR = 1, 0, -1
 SLACK = 1e-6  # m, more than rounding can change a distance by
@@ -19,7 +19,7 @@ _SPLITTER = 134217729.0  # 2**27 + 1
 _ERROR_BOUND = 3.3306690738754716e-16  # (3 + 16 eps) eps, eps = 2**-53
 
 
-@lean_kernel
+@kernel
 def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
     """Side of the directed line a -> b on which c lies: 1 left, -1 right, 0 exactly on it."""
     left = (ax - cx) * (by - cy)
@@ -53,7 +53,7 @@ def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy
     return 0
 
 
-@lean_kernel
+@kernel
 def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
     high = a * b
     a_big = _SPLITTER * a
@@ -67,7 +67,7 @@ def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
     return _grow(expansion, size, high)
 
 
-@lean_kernel
+@kernel
 def _grow(expansion: FloatArray, size: int, value: float) -> int:
     carry = value
     for index in range(size):
@@ -80,7 +80,7 @@ def _grow(expansion: FloatArray, size: int, value: float) -> int:
     return size + 1
 
 
-@lean_kernel
+@kernel
 def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
     count = len(a)
     for index in range(count):
@@ -99,7 +99,7 @@ def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
     """Whether two convex rings (V, 2), counter-clockwise, share a point; touching counts.
 
@@ -109,7 +109,7 @@ def convex_intersect(a: FloatArray, b: FloatArray) -> bool:
     return not (_separated_by_edges(a, b) or _separated_by_edges(b, a))
 
 
-@lean_kernel
+@kernel
 def segments_meet(
     ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
 ) -> bool:
@@ -126,13 +126,13 @@ def segments_meet(
     return orientation(cx, cy, dx, dy, ax, ay) * orientation(cx, cy, dx, dy, bx, by) <= 0
 
 
-@lean_kernel
+@kernel
 def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
     """As `segments_meet`, for points (2,)."""
     return segments_meet(a[0], a[1], b[0], b[1], c[0], c[1], d[0], d[1])
 
 
-@lean_kernel
+@kernel
 def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     """Where a point lies relative to one ring (V, 2): INTERIOR, BOUNDARY or EXTERIOR."""
     parity, on_edge = ray_crossings(ring, len(ring) - 1, 0, len(ring), x, y)
@@ -141,7 +141,7 @@ def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     return INTERIOR if parity else EXTERIOR
 
 
-@lean_kernel
+@kernel
 def ray_crossings(
     xy: FloatArray, before: int, start: int, stop: int, x: float, y: float
 ) -> tuple[bool, bool]:
@@ -171,7 +171,7 @@ def ray_crossings(
     return parity, False
 
 
-@lean_kernel
+@kernel
 def locate_in_polygon(
     xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
 ) -> int:
@@ -190,7 +190,7 @@ def locate_in_polygon(
     return INTERIOR if inside else EXTERIOR
 
 
-@lean_kernel
+@kernel
 def point_segment_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """Distance from a point to the closed segment a-b [m]."""
     dx, dy = bx - ax, by - ay
@@ -205,7 +205,7 @@ def point_segment_distance(x: float, y: float, ax: float, ay: float, bx: float, 
     return abs((ay - y) * dx - (ax - x) * dy) / np.sqrt(square)
 
 
-@lean_kernel
+@kernel
 def polygon_distance(
     xy: FloatArray, ring_ptr: IntArray, first: int, last: int, x: float, y: float
 ) -> float:
@@ -227,7 +227,7 @@ def polygon_distance(
     return best
 
 
-@lean_kernel
+@kernel
 def _geos_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """As `point_segment_distance`, rounded as the library under shapely does it."""
     dx, dy = bx - ax, by - ay
@@ -240,7 +240,7 @@ def _geos_distance(x: float, y: float, ax: float, ay: float, bx: float, by: floa
     return np.sqrt((x - ax) * (x - ax) + (y - ay) * (y - ay))
 
 
-@lean_kernel
+@kernel
 def boundary_distance_below(
     xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
 ) -> float:
@@ -268,7 +268,7 @@ def boundary_distance_below(
     return best
 
 
-@lean_kernel
+@kernel
 def rings_touch(a: FloatArray, b: FloatArray) -> bool:
     """Whether the areas of two simple rings (V, 2) share a point; touching counts."""
     ax, ay, bx, by = ring_bounds(a)
@@ -296,7 +296,7 @@ def rings_touch(a: FloatArray, b: FloatArray) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def ring_bounds(ring: FloatArray) -> tuple[float, float, float, float]:
     """Bounds of a ring (V, 2): min x, min y, max x, max y [m]."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
@@ -307,7 +307,7 @@ def ring_bounds(ring: FloatArray) -> tuple[float, float, float, float]:
     return low_x, low_y, high_x, high_y
 
 
-@lean_kernel
+@kernel
 def ring_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between the areas of two simple rings (V, 2); 0 when they share a point [m]."""
     if rings_touch(a, b):
@@ -333,7 +333,7 @@ def ring_distance(a: FloatArray, b: FloatArray) -> float:
     return best
 
 
-@lean_kernel
+@kernel
 def distance_bound(a: FloatArray, b: FloatArray) -> float:
     """More than the distance between two rings (V, 2): that between two of their vertices [m]."""
     square = np.inf
@@ -343,7 +343,7 @@ def distance_bound(a: FloatArray, b: FloatArray) -> float:
     return np.sqrt(square) + SLACK
 
 
-@lean_kernel
+@kernel
 def ring_segment_distance(
     ring: FloatArray, a: FloatArray, b: FloatArray, limit: float, starts_outside: bool
 ) -> float:
@@ -375,7 +375,7 @@ def ring_segment_distance(
     return best if best <= limit else np.inf
 
 
-@lean_kernel
+@kernel
 def centroid(ring: FloatArray) -> tuple[float, float]:
     """Centroid of the area of a ring (V, 2) [m]."""
     # nuPlan rule 2: triangles from the first vertex, of coordinates that are not reduced

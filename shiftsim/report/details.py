@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.report.groups import Group, distinct_sets
 from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray
+from shiftsim.kernels import BoolArray
 from shiftsim.report.details import recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
 from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture

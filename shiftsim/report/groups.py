@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.errors import DataError
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.tables import Estimate
 from shiftsim.runs.results import Run

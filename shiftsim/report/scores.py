@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import one_of
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.groups import (
     COLUMNS,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.report.groups import Group
 from shiftsim.report.tables import Interval
 

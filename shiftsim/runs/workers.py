@@ -20,11 +20,12 @@ from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, wait
 from threading import Event, Thread
-from time import monotonic
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from time import monotonic, time
+from typing import Any, Generic, Literal, TypeVar
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import fresh_python
+from shiftsim.kernels import machine_code
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -35,6 +36,7 @@ _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a
 _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
 _PAUSE = 0.5  # s, before a process that ended is started again
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
+_TIME_TO_COMPILE = 20.0  # s, for one kernel: longer than any takes
 # one thread per worker: the parallelism is across scenarios
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
 
@@ -84,7 +86,7 @@ def map_unordered(
     if workers <= 1 and not limit:
         yield from _serial(make, tasks)
         return
-    payload = _payload(make, is_timed=limit > 0.0)
+    payload = _payload(make)
     pool = Pool(payload, max(1, workers), limit, pieces, group)
     try:
         yield from pool.run(tasks, alone)
@@ -132,8 +134,13 @@ def beside(make: Callable[[], object]) -> Iterator[None]:
             keeper.join(_PAUSE)
 
 
-def _payload(make: Callable[[], object], *, is_timed: bool = False) -> bytes:
-    return pickle.dumps((sys.path, pickle.dumps(make), is_timed))
+def _seconds_since_compiling() -> float:
+    """How long ago the last kernel was put into the cache [s]."""
+    return time() - max((path.stat().st_mtime for path in machine_code()), default=-inf)
+
+
+def _payload(make: Callable[[], object]) -> bytes:
+    return pickle.dumps((sys.path, pickle.dumps(make)))
 
 
 def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T, R], None, None]:
@@ -161,7 +168,7 @@ class _Worker:
         self.task: Any = None
         self.state: Literal["starting", "idle", "busy"] = "starting"
         self.is_new = True
-        self.deadline, self.left = inf, inf
+        self.deadline = inf
         with suppress(OSError):  # a worker that is dead already is noticed when it is waited for
             self.connection.send_bytes(payload)
 
@@ -183,14 +190,7 @@ class _Worker:
             message = self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             raise _DeathError(self.end()) from error
-        if isinstance(message, _Compiling):  # the clock stands still meanwhile
-            now = monotonic()
-            if message.begins:
-                self.left, self.deadline = self.deadline - now, inf
-            else:
-                self.deadline = now + self.left
-        else:
-            self.state, self.deadline = "idle", inf
+        self.state, self.deadline = "idle", inf
         return message
 
     def end(self) -> str:
@@ -205,12 +205,6 @@ class _Worker:
             with suppress(ValueError):
                 return f"worker process killed by {signal.Signals(-code).name}"
         return f"worker process ended with exit code {code}"
-
-
-class _Compiling(NamedTuple):
-    """What a worker says when it begins or ends to compile, if there is a limit of time."""
-
-    begins: bool
 
 
 class _DeathError(Exception):
@@ -289,7 +283,12 @@ class Pool:
             if outcome is not None:
                 yield outcome
         now = monotonic()
-        for worker in [worker for worker in self.workers if worker.deadline < now]:
+        late = [worker for worker in self.workers if worker.deadline < now]
+        if late and _seconds_since_compiling() < _TIME_TO_COMPILE:
+            for worker in late:
+                worker.deadline = now + _TIME_TO_COMPILE
+            return
+        for worker in late:
             worker.process.kill()
             worker.end()
             self.workers.remove(worker)
@@ -311,8 +310,7 @@ class Pool:
                 ) from death
             return None
         self.failed_starts = 0
-        told = starting or isinstance(message, _Compiling)
-        return None if told else Outcome(worker.task, message)
+        return None if starting else Outcome(worker.task, message)
 
     def close(self) -> None:
         """End all workers: idle ones leave by themselves, the others are killed."""
@@ -348,10 +346,8 @@ def serve(parent: int, handle: int) -> None:
         handle = socket.fromshare(sys.stdin.buffer.read()).detach()
     connection: Connection[Any, Any] = Connection(handle)
     try:
-        path, pickled, is_timed = pickle.loads(connection.recv_bytes())
+        path, pickled = pickle.loads(connection.recv_bytes())
         sys.path[:] = path
-        if is_timed:
-            _tell_of_compiling(connection)
         function = pickle.loads(pickled)()
         try:
             connection.send("ready")
@@ -361,26 +357,6 @@ def serve(parent: int, handle: int) -> None:
             _close(function)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent has gone
-
-
-def _tell_of_compiling(connection: "Connection[Any, Any]") -> None:
-    """Say when kernels are compiled, those that they call included."""
-    from numba.core import event
-
-    class Watch(event.Listener):
-        depth = 0
-
-        def on_start(self, event: Any) -> None:
-            self.depth += 1
-            if self.depth == 1:
-                connection.send(_Compiling(True))
-
-        def on_end(self, event: Any) -> None:
-            self.depth -= 1
-            if self.depth == 0:
-                connection.send(_Compiling(False))
-
-    event.register("numba:compile", Watch())  # type: ignore[no-untyped-call]
 
 
 def _end_with(parent: int) -> None:

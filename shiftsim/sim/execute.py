@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, sample_poses
 from shiftsim.sim.plan_check import GOOD, check_values

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 

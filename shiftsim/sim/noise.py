@@ -10,9 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import load_attribute
+from shiftsim.kernels import FloatArray
 
 CHANNELS = ("noise-accel", "noise-steer")
 NOISE_NAMES = ("none", "awgn-low", "awgn-mid", "awgn-high", "ou-low", "ou-mid", "ou-high")

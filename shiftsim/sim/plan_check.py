@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
 
 MIN_SPAN_US = 200_000  # us, three poses at 0.1 s: the tracker cannot be built with fewer
@@ -123,7 +123,7 @@ def _describe(value: object) -> str:
     return type(value).__name__
 
 
-@lean_kernel
+@kernel
 def check_values(
     time_us: IntArray, states: FloatArray, now_us: int, next_us: int
 ) -> tuple[int, int, int]:

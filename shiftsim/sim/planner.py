@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, opaque, read_only, sealed
+from shiftsim.kernels import FloatArray, IntArray, readonly
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -185,7 +185,7 @@ def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> Sce
         route=scenario.route,
         goal=scenario.mission_goal,
         dt=float(np.diff(times).mean() * 1e-6),
-        times=sealed(times),
+        times=readonly(times),
         token=scenario.token,
         log_name=scenario.log_name,
         seed=seed,
@@ -224,11 +224,11 @@ def observe_log(
     rows = past_rows(scenario, iteration, samples)
     now = int(scenario.iteration_rows[iteration])
     history = History(
-        sealed(scenario.time_us[rows]),
-        sealed(scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)),
-        (scenario.tracks.rows(rows) if tracks is None else tracks).sealed(),
+        readonly(scenario.time_us[rows]),
+        readonly(scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)),
+        (scenario.tracks.rows(rows) if tracks is None else tracks).readonly(),
     )
-    lights = scenario.traffic_lights.rows(np.array([now])).sealed()
+    lights = scenario.traffic_lights.rows(np.array([now])).readonly()
     return Observation(iteration, int(scenario.time_us[now]), history, lights)
 
 
@@ -267,10 +267,10 @@ class Sight:
         """Arrays of a rollout."""
         self._times = time_us.tolist()
         # these show nothing of later rows: the times are known, and the ego has not been there
-        self._time_us, self._ego = memoryview(sealed(time_us)), memoryview(sealed(ego))
+        self._time_us, self._ego = memoryview(readonly(time_us)), memoryview(readonly(ego))
         arrays = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
-        self._tracks = tuple(map(read_only, arrays))
-        self._kinds, self._tokens = sealed(tracks.kinds), tracks.tokens
+        self._tracks = tuple(map(readonly, arrays))
+        self._kinds, self._tokens = readonly(tracks.kinds), tracks.tokens
         self._connectors, self._status = lights.connector_ids, lights.status.tobytes()
         self._listed, self._lights = b"?", TrafficLights.empty(1)
 
@@ -279,10 +279,10 @@ class Sight:
         past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
         valid, poses, velocities, sizes = self._tracks
         tracks = _tracks(
-            opaque(valid[past]),
-            opaque(poses[past]),
-            opaque(velocities[past]),
-            opaque(sizes[past]),
+            readonly(valid[past]),
+            readonly(poses[past]),
+            readonly(velocities[past]),
+            readonly(sizes[past]),
             self._kinds,
             self._tokens,
         )

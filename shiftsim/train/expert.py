@@ -8,7 +8,7 @@ acceleration and a steering angle. The angle is the present one and what the rat
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import MAX_ACCELERATION, MAX_BRAKING, MAX_STEERING
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track

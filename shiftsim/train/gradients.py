@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shiftsim.arrays import IntArray
+from shiftsim.kernels import IntArray
 from shiftsim.train.network import Laid, tensor_of
 from shiftsim.train.pictures import Blocks
 

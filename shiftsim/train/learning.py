@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from shiftsim.arrays import BoolArray, IntArray
+from shiftsim.kernels import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train.gradients import Gradients
 from shiftsim.train.network import (

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shiftsim.arrays import kernel
+from shiftsim.kernels import kernel
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.view import CHANNELS, SIZE
 

@@ -15,8 +15,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.files import write_text
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train.curves import Say, write_table
 from shiftsim.train.gradients import Gradients

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.carl.planner import MAX_STEERING
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.train.driving import State

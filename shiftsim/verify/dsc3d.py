@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.recording import Converted, convert_recording
 from shiftsim.data.deepplan.states import rows_between, sample_runs
 from shiftsim.data.deepplan.windows import EGO, ROW_S, ConversionConfig, find_runs, judge_windows
@@ -20,6 +19,7 @@ from shiftsim.data.opendrive.lanes import LaneKey
 from shiftsim.data.opendrive.map import Origin, build_road_map
 from shiftsim.data.opendrive.reading import read_opendrive
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics.route import driven_route
 from shiftsim.verify.files import Compare, Parts, Source, open_tables, read_file, verify_files
 from shiftsim.verify.report import Report

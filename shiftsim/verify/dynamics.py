@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr

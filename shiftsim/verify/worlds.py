@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import DataError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.scene import Shown, map_lines, violations

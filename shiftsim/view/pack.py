@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 MISSING = -(2**31)  # stands for NaN
 _LARGEST = 2**31 - 1

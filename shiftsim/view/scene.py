@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import REASONS, violation_words

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, MissingExtraError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.report.palette import RECORDED, new_figure, planner_styles, save_picture
 from shiftsim.sim.log import as_recorded
 from shiftsim.view.drawing import (

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.data.deepplan.recording import Converted
 from shiftsim.data.tracks.columns import KINDS
 from shiftsim.data.tracks.convert import Looked
 from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind

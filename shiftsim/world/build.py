@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import MapError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.layers import Layer, make_layer, make_lists, make_polylines
 from shiftsim.world.map import NONE, VectorMap
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.polylines import point_on_polyline
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.world.layers import Polylines
 from shiftsim.world.map import VectorMap
 
@@ -118,7 +118,7 @@ def poses_on_edge(map: VectorMap, edge: int, progress: FloatArray) -> FloatArray
     return np.column_stack([here, np.arctan2(step[:, 1], step[:, 0])])
 
 
-@lean_kernel
+@kernel
 def initial_curvature(baselines: Polylines, edge: int) -> float:
     """Absolute curvature of a baseline at its start, of the circle through three points [1/m]."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]

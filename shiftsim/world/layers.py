@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel, sealed
 from shiftsim.errors import MapError
 from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.geometry.rings import (
@@ -25,6 +24,7 @@ from shiftsim.geometry.rings import (
     polygon_distance,
     segments_intersect,
 )
+from shiftsim.kernels import FloatArray, IntArray, kernel, readonly
 
 if TYPE_CHECKING:
     from rtree.index import Index
@@ -87,7 +87,7 @@ def make_lists(rows: Iterable[Sequence[int]]) -> Lists:
     ptr = np.zeros(len(kept) + 1, np.int64)
     np.cumsum([len(row) for row in kept], out=ptr[1:])
     items = np.concatenate(kept) if kept else np.zeros(0, np.int64)
-    return Lists(sealed(ptr), sealed(items))
+    return Lists(readonly(ptr), readonly(items))
 
 
 def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
@@ -101,7 +101,7 @@ def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
 
 def index_polylines(xy: FloatArray, ptr: IntArray) -> Polylines:
     """Add arc lengths to flat polylines (arrays as in `Polylines`)."""
-    return Polylines(sealed(xy), sealed(ptr), sealed(arc_lengths(xy, ptr)))
+    return Polylines(readonly(xy), readonly(ptr), readonly(arc_lengths(xy, ptr)))
 
 
 def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
@@ -141,7 +141,7 @@ def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Po
     cell_ptr, cell_items = _fill_cells(first, last, shape)
     grid = np.array([low[0], low[1], cell])
     arrays = (xy, ring_ptr, poly_ptr, bounds, grid, shape, cell_ptr, cell_items)
-    return Polygons(*(sealed(array) for array in arrays))
+    return Polygons(*(readonly(array) for array in arrays))
 
 
 def _open_ring(ring: FloatArray) -> FloatArray:
@@ -162,13 +162,13 @@ def _fill_cells(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntAr
     return ptr, polygon[np.argsort(cell, kind="stable")]
 
 
-@lean_kernel
+@kernel
 def project_on_line(lines: Polylines, line: int, x: float, y: float) -> float:
     """Arc length of the point of a line nearest to (x, y); the first one on ties [m]."""
     return project_on_polyline(lines.xy, lines.arc, lines.ptr[line], lines.ptr[line + 1], x, y)
 
 
-@lean_kernel
+@kernel
 def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
     """Write the polygons that hold a point in their interior into `out`, ascending; their number.
 
@@ -189,7 +189,7 @@ def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
     return found
 
 
-@lean_kernel
+@kernel
 def contains(polygons: Polygons, poly: int, x: float, y: float) -> bool:
     """Whether polygon `poly` holds a point in its interior; the boundary does not count."""
     if (
@@ -209,14 +209,14 @@ def in_any(polygons: Polygons, x: float, y: float) -> bool:
     return containing(polygons, x, y, np.empty(0, np.int64)) > 0
 
 
-@lean_kernel
+@kernel
 def distance_to(polygons: Polygons, poly: int, x: float, y: float) -> float:
     """Distance from a point to polygon `poly`, 0 inside [m]."""
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
     return polygon_distance(polygons.xy, polygons.ring_ptr, first, last, x, y)
 
 
-@lean_kernel
+@kernel
 def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, float]:
     """The polygon nearest to a point and its distance [m]; (-1, inf) when none is within `limit`.
 
@@ -225,7 +225,7 @@ def nearest(polygons: Polygons, x: float, y: float, limit: float) -> tuple[int, 
     return nearest_of(polygons, 0, len(polygons.bounds), x, y, limit)
 
 
-@lean_kernel
+@kernel
 def nearest_of(
     polygons: Polygons, first: int, stop: int, x: float, y: float, limit: float
 ) -> tuple[int, float]:
@@ -243,7 +243,7 @@ def nearest_of(
     return found, best
 
 
-@lean_kernel
+@kernel
 def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
     """Whether polygon `poly` shares a point with a convex ring (V, 2), counter-clockwise [m]."""
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
@@ -265,7 +265,7 @@ def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _in_convex(ring: FloatArray, x: float, y: float) -> bool:
     """Whether a point lies in a convex ring (V, 2), counter-clockwise, or on it."""
     for corner in range(len(ring)):

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, sealed
 from shiftsim.errors import MapError, one_of
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, readonly
 from shiftsim.world.layers import (
     Layer,
     Lists,
@@ -120,7 +120,7 @@ class VectorMap:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, sealed(value))
+                object.__setattr__(self, item.name, readonly(value))
 
     def __repr__(self) -> str:
         connectors = len(self.edges) - self.num_lanes

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, sealed
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray, IntArray, readonly
 from shiftsim.world.map import VectorMap
 from shiftsim.world.script import Script
 from shiftsim.world.state import Tracks, TrafficLights
@@ -81,9 +81,9 @@ class Scenario:
     def __post_init__(self) -> None:
         for name in ("time_us", "ego", "iteration_rows", "mission_goal"):
             if (array := getattr(self, name)) is not None:
-                object.__setattr__(self, name, sealed(array))
-        object.__setattr__(self, "tracks", self.tracks.sealed())
-        object.__setattr__(self, "traffic_lights", self.traffic_lights.sealed())
+                object.__setattr__(self, name, readonly(array))
+        object.__setattr__(self, "tracks", self.tracks.readonly())
+        object.__setattr__(self, "traffic_lights", self.traffic_lights.readonly())
 
     def __repr__(self) -> str:
         times = self.iteration_times

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.layers import contains
 from shiftsim.world.map import VectorMap
 

@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, sealed
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, readonly
 
 # Columns of an ego state row. Velocities and accelerations are in the body frame at the rear axle.
 X, Y, HEADING = 0, 1, 2  # m, m, rad
@@ -162,10 +162,10 @@ class Tracks:
             self.tokens,
         )
 
-    def sealed(self) -> "Tracks":
+    def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
         arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)
-        valid, poses, velocities, sizes, kinds = map(sealed, arrays)
+        valid, poses, velocities, sizes, kinds = map(readonly, arrays)
         return Tracks(valid, poses, velocities, sizes, kinds, self.tokens)
 
     @staticmethod
@@ -220,9 +220,9 @@ class TrafficLights:
         """The same connectors over other rows."""
         return TrafficLights(self.connector_ids, self.status[index])
 
-    def sealed(self) -> "TrafficLights":
+    def readonly(self) -> "TrafficLights":
         """The same lights in an array that cannot be written."""
-        return TrafficLights(self.connector_ids, sealed(self.status))
+        return TrafficLights(self.connector_ids, readonly(self.status))
 
     def listed(self, row: int) -> list[tuple[str, LightStatus]]:
         """Connector ids and states that one row lists; an id may occur several times."""

@@ -7,8 +7,8 @@ from boxes import boxes_intersect, to_frame
 from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
-from shiftsim.arrays import kernel
 from shiftsim.geometry import boxes, polylines, rings
+from shiftsim.kernels import kernel
 
 NUM_PAIRS = 60_000  # twice, at both offsets: more than 1e5 pairs of each kind
 

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from shiftsim.arrays import sealed
+from shiftsim.kernels import readonly
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.original import Original
 
@@ -13,7 +13,7 @@ from shiftsim.planners.original import Original
 class Holder(ConstantVelocity):
     def __init__(self):
         self.seen = [1]
-        self.table = sealed(np.arange(5.0))
+        self.table = readonly(np.arange(5.0))
         self.scratch = np.zeros(5)
         self.closed = []
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario
 
-from shiftsim import arrays
 from shiftsim.errors import InvalidTrajectoryError
+from shiftsim.kernels import readonly
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.sim.loop import Rollout, simulate
@@ -71,13 +71,6 @@ def test_no_array_that_a_planner_is_given_can_be_written(scenario):
             array.setflags(write=True)
         with pytest.raises(ValueError, match="WRITEABLE"):
             array.flags.writeable = True
-
-
-def test_the_same_holds_where_numpy_is_too_old_to_do_it(scenario, monkeypatch):
-    monkeypatch.setattr(arrays, "opaque", arrays._behind_door)
-    monkeypatch.setattr("shiftsim.sim.planner.opaque", arrays._behind_door)
-    test_no_array_that_a_planner_is_given_can_be_written(scenario)
-    test_nothing_leads_from_an_observation_to_the_recorded_future(scenario)
 
 
 def test_the_index_of_a_map_cannot_be_written(scenario):
@@ -273,7 +266,7 @@ class Mirrors(ConstantVelocity):
         plan = super().plan(observation)
         seen = observe_log(self.scenario, 0).history
         assert not seen.ego.flags.writeable
-        return Trajectory(arrays.sealed(plan.time_us), arrays.sealed(plan.states), relative=True)
+        return Trajectory(readonly(plan.time_us), readonly(plan.states), relative=True)
 
 
 def test_read_only_plans_compile_no_second_kernel(scenario):

@@ -7,7 +7,7 @@ holds, and words that are zero are passed over.
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import kernel
+from shiftsim.kernels import kernel
 from shiftsim.planners.learned.carl.raster import Raster
 
 _BYTES = 8  # pixels in a word

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster

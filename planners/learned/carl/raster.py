@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import IntArray, kernel
+from shiftsim.kernels import IntArray, kernel
 
 _ONE, _HALF = 1 << 16, 1 << 15  # a pixel, and half of one, in fixed point
 

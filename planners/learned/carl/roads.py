@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.areas import index_ranks
 from shiftsim.world.layers import Lists, Polygons, Polylines, index_polygons, make_polylines
 from shiftsim.world.map import NONE, VectorMap

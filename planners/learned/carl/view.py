@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
 from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.geometry.rings import segments_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.layers import Polygons, Polylines, distance_to, meets_convex
 
 POINTS = 20  # of a lane

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
     NO_ROUTE,

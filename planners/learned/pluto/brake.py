@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.planners.proposals.tracker import (
     DT,
     Profiles,

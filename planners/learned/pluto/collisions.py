@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import circle_around, meets_bounds
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.features import AgentFeatures, stack_scenes
 from shiftsim.planners.learned.map_features import RoadFeatures
 from shiftsim.planners.learned.pluto.reference import LineFeatures

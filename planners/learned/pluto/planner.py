@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
     NO_ROUTE,

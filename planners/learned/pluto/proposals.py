@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 from shiftsim.planners.proposals.tracker import STEPS
 
 MAX_PROPOSALS = 20  # that compete by their logits

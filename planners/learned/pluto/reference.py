@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import meets_bounds, wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
 from shiftsim.planners.routes.graph import LanePath, deviation, lane_path, sub_path
 from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around

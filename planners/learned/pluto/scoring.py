@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel
 from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
+from shiftsim.kernels import BoolArray, FloatArray, kernel
 from shiftsim.planners.learned.pluto.collisions import (
     TTC_STEPS,
     collisions,

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners, meets_bounds
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
 from shiftsim.planners.proposals.contacts import Others, touches_boxes
 from shiftsim.planners.proposals.tracker import SCORED

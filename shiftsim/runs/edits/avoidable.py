@@ -7,7 +7,7 @@ tracker and the motion model of every rollout, beside replayed traffic.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.collision import classify, first_contacts, flat_ego, flat_tracks
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.sim.log import SimulationLog

@@ -6,8 +6,8 @@ follows from the new ones. Speed may become negative; only the steering angle is
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.world.state import (
     AX,
     AY,
@@ -29,14 +29,14 @@ STEERING_TIME_CONSTANT = 0.05  # s, nuPlan kinematic bicycle
 WHEEL_BASE = PACIFICA.wheel_base  # m
 
 
-@lean_kernel
+@kernel
 def step_seconds(now_us: int, next_us: int) -> float:
     """Seconds from one time stamp to another, for the motion model."""
     # nuPlan rule 11: microseconds times 1e-6, so 100000 us are 0.09999999999999999 s
     return (next_us - now_us) * 1e-6
 
 
-@lean_kernel
+@kernel
 def step_bicycle(
     state: FloatArray,  # (11,) columns of `state.STATE_COLUMNS`; vy and ay are ignored
     accel: float,  # commanded longitudinal acceleration [m/s^2]
@@ -51,7 +51,7 @@ def step_bicycle(
     turn_and_step(state, np.tan(state[STEERING]), accel, steering_rate, wheel_base, dt, out)
 
 
-@lean_kernel
+@kernel
 def turn_and_step(
     state: FloatArray,
     tangent: float,  # of the steering angle
@@ -89,7 +89,7 @@ def turn_and_step(
     return new_tangent
 
 
-@lean_kernel
+@kernel
 def command_and_step(
     now_us: int,  # time stamp of `state` [us]
     next_us: int,  # time stamp of the next iteration [us]

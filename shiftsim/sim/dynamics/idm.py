@@ -5,12 +5,12 @@ Used by reactive agents and by the IDM planner.
 
 import numpy as np
 
-from shiftsim.arrays import lean_kernel
+from shiftsim.kernels import kernel
 
 EXPONENT = 4.0  # of the free-road term, nuPlan
 
 
-@lean_kernel
+@kernel
 def idm_acceleration(
     speed: float,  # own speed [m/s]
     # free distance to the lead's rear, own progress and the lead's rear length taken off; less than
@@ -34,7 +34,7 @@ def idm_acceleration(
     return accel_max * (1.0 - (speed / target_speed) ** EXPONENT - ratio**2)
 
 
-@lean_kernel
+@kernel
 def idm_step(
     speed: float,
     gap: float,

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
 from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
@@ -71,13 +71,13 @@ class Reference(NamedTuple):
     curvature: FloatArray  # (horizon,) of the plan at the next steps [1/m]
 
 
-@lean_kernel
+@kernel
 def num_resampled(traj_time_us: IntArray, step_us: int) -> int:
     """Number of poses of a trajectory at whole steps from its start."""
     return (traj_time_us[-1] - traj_time_us[0]) // step_us + 1
 
 
-@lean_kernel
+@kernel
 def resample_poses(
     traj_time_us: IntArray, traj_states: FloatArray, step_us: int, out: FloatArray
 ) -> None:
@@ -178,7 +178,7 @@ def fit_curvature(
         out[row] = (out[row] + out[row - 1]) / (1.0 + gains[row])
 
 
-@lean_kernel
+@kernel
 def profile_at(profile: FloatArray, start_us: int, step_us: int, seconds: float) -> float:
     """Value of a profile sampled at whole steps, at a time [s]; clamped at both ends."""
     # nuPlan rule 11: the sample times are microseconds / 1e6, the queried time microseconds * 1e-6
@@ -239,14 +239,14 @@ def reference(
     return Reference(TRACKED, lateral, wrap_angle(state[HEADING] - heading), speed, curvature)
 
 
-@lean_kernel
+@kernel
 def is_stopping(speed: float, reference_speed: float, params: LqrParameters) -> bool:
     """Whether the stop controller acts."""
     # nuPlan rule 18: speeds are compared with their sign, so it also acts when reversing
     return reference_speed <= params.stopping_speed and speed <= params.stopping_speed
 
 
-@lean_kernel
+@kernel
 def steering_rate(
     ref: Reference, speed: float, steering: float, accel: float, params: LqrParameters
 ) -> float:
@@ -277,7 +277,7 @@ def steering_rate(
     return -top / bottom
 
 
-@lean_kernel
+@kernel
 def command(state: FloatArray, ref: Reference, params: LqrParameters) -> tuple[float, float]:
     """Acceleration [m/s^2] and steering rate [rad/s] that follow the reference."""
     # nuPlan rule 22: neither of them is limited
@@ -309,7 +309,7 @@ def track(
     return TRACKED, accel, rate
 
 
-@lean_kernel
+@kernel
 def track_and_step(
     now_us: int,  # time stamp of `state` [us]
     next_us: int,  # time stamp of the next iteration [us]

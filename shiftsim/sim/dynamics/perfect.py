@@ -7,10 +7,10 @@ out as 0; nothing is extrapolated.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.errors import InvalidTrajectoryError, PlannerError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.state import (
     HEADING,
     NUM_STATE,
@@ -29,7 +29,7 @@ MAX_SPEED = 50.0  # m/s, nuPlan perfect tracking controller
 KEPT_US = np.concatenate([np.arange(0, 1_000_001, 100_000), np.arange(2, 9) * 1_000_000])
 
 
-@lean_kernel
+@kernel
 def unwrap_correction(before: float, after: float) -> float:
     """What to add to a heading (and all later ones) to make the step from the one before small."""
     # nuPlan rule 16: as numpy.unwrap, whose steps of exactly half a turn keep their sign
@@ -42,7 +42,7 @@ def unwrap_correction(before: float, after: float) -> float:
     return wrapped - step
 
 
-@lean_kernel
+@kernel
 def segment_end(traj_time_us: IntArray, query_us: int) -> int:
     """Index of the first knot at or after the query, at least 1, at most the last knot."""
     low, high = 1, len(traj_time_us) - 1
@@ -55,7 +55,7 @@ def segment_end(traj_time_us: IntArray, query_us: int) -> int:
     return low
 
 
-@lean_kernel
+@kernel
 def interpolate(
     traj_time_us: IntArray, traj_states: FloatArray, query_us: int, out: FloatArray
 ) -> bool:

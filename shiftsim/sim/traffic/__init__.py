@@ -10,9 +10,9 @@ import inspect
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import load_attribute
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, Tracks
 

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import point_on_polyline, project_on_polyline
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.layers import Lists, Polygons, Polylines, containing
 from shiftsim.world.map import VectorMap
 
@@ -38,7 +38,7 @@ def lanes_of(road: VectorMap) -> Lanes:
     )
 
 
-@lean_kernel
+@kernel
 def heading_at(lines: Polylines, line: int, along: float) -> float:
     """Direction of a line at an arc length [rad]."""
     start, stop = lines.ptr[line], lines.ptr[line + 1]
@@ -49,7 +49,7 @@ def heading_at(lines: Polylines, line: int, along: float) -> float:
     return np.arctan2(by - ay, bx - ax)
 
 
-@lean_kernel
+@kernel
 def _misfit(lines: Polylines, line: int, x: float, y: float, heading: float) -> float:
     """How badly a lane fits a pose: turn [rad], and metres aside counted as such; inf if not."""
     start, stop = lines.ptr[line], lines.ptr[line + 1]
@@ -62,7 +62,7 @@ def _misfit(lines: Polylines, line: int, x: float, y: float, heading: float) -> 
     return turn + _METRE * aside
 
 
-@lean_kernel
+@kernel
 def choose_lane(
     lanes: Lanes, x: float, y: float, heading: float, followed: int, found: IntArray
 ) -> int:
@@ -81,7 +81,7 @@ def choose_lane(
     return best
 
 
-@lean_kernel
+@kernel
 def next_lane(lanes: Lanes, edge: int) -> int:
     """The edge behind another one that bends least, or NO_LANE."""
     lines, best, least = lanes.baselines, NO_LANE, np.inf

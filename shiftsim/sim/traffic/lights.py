@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
+from shiftsim.kernels import IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LightStatus
 

@@ -5,8 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 

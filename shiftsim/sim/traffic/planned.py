@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import InvalidTrajectoryError, TrafficError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.plan_check import find_fault, plain

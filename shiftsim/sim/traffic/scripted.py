@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import TrafficError
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.traffic import Traffic
 from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, kernel
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import BoolArray, FloatArray, kernel
 from shiftsim.sim.traffic.learned.network import LIMITS
 from shiftsim.world.state import Tracks
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, kernel
 from shiftsim.errors import DataError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic import LogReplay, Traffic
 from shiftsim.world.layers import in_any

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import IntArray
 from shiftsim.errors import DataError, MissingExtraError
+from shiftsim.kernels import IntArray
 from shiftsim.planners.learned.reader import BROKEN, PlainReader
 from shiftsim.verify.files import DAMAGED, Source
 from shiftsim.verify.report import Report

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import BoolArray, FloatArray
 from shiftsim.geometry import polylines
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.planners.pdm import forecast as around
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.planner import PdmClosed, Seen

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError, ShiftsimError
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.edits.density import fill_lanes
 from shiftsim.world.edits.draft import Draft, begin
 from shiftsim.world.edits.movers import add_mover

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.edits.draft import Draft
 from shiftsim.world.edits.movers import add_mover
 from shiftsim.world.edits.spec import LEVELS, Density

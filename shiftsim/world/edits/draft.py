@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.script import FOLLOW, STOPPED, Finish, Walker
 from shiftsim.world.state import (
     LAST_AGENT_KIND,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.edits.draft import Draft
 from shiftsim.world.lanes import find_start
 from shiftsim.world.map import VectorMap

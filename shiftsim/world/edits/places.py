@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, lean_kernel
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import BoolArray, FloatArray, kernel
 from shiftsim.world.edits.spec import At
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import center_poses
@@ -70,7 +70,7 @@ def _spaced(xy: FloatArray) -> FloatArray:
     return xy[kept]
 
 
-@lean_kernel
+@kernel
 def _mark_spaced(xy: FloatArray, kept: BoolArray) -> None:
     kept[0], last = True, 0
     for index in range(1, len(xy)):

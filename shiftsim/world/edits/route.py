@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from shapely.ops import split
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import vertex_headings
+from shiftsim.kernels import FloatArray
 from shiftsim.world.edits.draft import Draft
 from shiftsim.world.edits.spec import Reroute
 from shiftsim.world.lanes import find_start, pose_on_line

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from shiftsim.arrays import read_only
 from shiftsim.data.store import boxes
 from shiftsim.data.store.plausible import BOX_LIMITS
+from shiftsim.kernels import readonly
 
 ROWS, TRACKS, FIRST, LAST = 12, 5, 3, 10
 ODD = (0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, 5e-324, -5e-324)
@@ -26,9 +26,9 @@ def block(rng: np.random.Generator, is_plain: bool) -> tuple[boxes.BoxBlock, np.
         edges = low, high, np.nextafter(low, -np.inf), np.nextafter(high, np.inf), *ODD
         values[kind, rng.integers(0, len(row))] = rng.choice(edges)
     motion = [v.view(np.uint64) if is_plain else boxes.second_differences(v) for v in values[:5]]
-    extent = read_only(values[5]), read_only(values[6])
-    indices = (read_only(column.astype(np.int32)) for column in (row, track))
-    return boxes.BoxBlock(*indices, tuple(map(read_only, motion)), extent, is_plain), values
+    extent = readonly(values[5]), readonly(values[6])
+    indices = (readonly(column.astype(np.int32)) for column in (row, track))
+    return boxes.BoxBlock(*indices, tuple(map(readonly, motion)), extent, is_plain), values
 
 
 @pytest.mark.parametrize("is_plain", [False, True])
@@ -69,8 +69,8 @@ def test_boxes_are_where_their_row_and_track_say(is_plain, rng):
 def test_a_track_that_is_none_is_noticed(wrong, rng):
     track = np.array([0, 0, wrong], np.int32)
     place, spans = np.zeros(TRACKS, np.int64), np.empty((4, 3), np.int64)
-    rows = read_only(np.arange(3, dtype=np.int32))
-    assert boxes.cut_spans(rows, read_only(track), 0, 3, place, spans) == -1
+    rows = readonly(np.arange(3, dtype=np.int32))
+    assert boxes.cut_spans(rows, readonly(track), 0, 3, place, spans) == -1
 
 
 def walk(row, track, first, last):
@@ -96,7 +96,7 @@ def test_spans_longer_than_what_is_looked_at_together_end_where_a_walk_says(rng)
                 column[rng.integers(0, len(row))] = rng.integers(0, TRACKS)
         first = rng.integers(0, 100)
         last = first + rng.integers(1, 100)
-        indices = (read_only(column.astype(np.int32)) for column in (row, track))
+        indices = (readonly(column.astype(np.int32)) for column in (row, track))
         place, out = np.zeros(TRACKS, np.int64), np.empty((len(row) + 1, 3), np.int64)
         count = boxes.cut_spans(*indices, first, last, place, out)
         spans, seen = walk(row.tolist(), track.tolist(), first, last)

@@ -14,7 +14,7 @@ def test_red_lights_come_in_the_order_of_the_lights_with_their_outlines():
     first, second, other = (road.edges.index[name] for name in ("20", "21", "10"))
     watch = LightWatch(road, [first, second])
     listed = lights(("21", "10", "unknown", "20", "20"), 2, 2, 2, LightStatus.GREEN, 2)
-    red = watch.at(listed.sealed())
+    red = watch.at(listed.readonly())
     assert red.lanes == [second, first]
     assert other not in red.lanes
     for place, lane in enumerate(red.lanes):
@@ -25,7 +25,7 @@ def test_red_lights_come_in_the_order_of_the_lights_with_their_outlines():
 
 def test_lights_are_looked_at_again_when_they_change():
     watch = LightWatch(straight_road(), range(100))
-    red, green = lights(("21",), 2).sealed(), lights(("21",), 0).sealed()
+    red, green = lights(("21",), 2).readonly(), lights(("21",), 0).readonly()
     seen = watch.at(red)
     assert len(seen.lanes) == 1
     assert watch.at(red) is seen

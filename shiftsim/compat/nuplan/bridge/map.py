@@ -13,8 +13,8 @@ import shapely
 
 from nuplan.common.maps.abstract_map import AbstractMap
 from nuplan.common.maps.maps_datatypes import SemanticMapLayer, StopLineType
-from shiftsim.arrays import FloatArray
 from shiftsim.compat.nuplan.bridge.map_objects import KINDS, BridgeLaneConnector
+from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer, nearest_of
 from shiftsim.world.map import VectorMap
 

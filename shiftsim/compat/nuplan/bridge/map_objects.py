@@ -17,8 +17,8 @@ from nuplan.common.maps.abstract_map_objects import (
     StopLine,
 )
 from nuplan.common.maps.maps_datatypes import IntersectionType, LaneConnectorType, StopLineType
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import MapError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer, Lists
 from shiftsim.world.map import NONE, VectorMap
 

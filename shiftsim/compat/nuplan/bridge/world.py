@@ -23,8 +23,8 @@ from nuplan.planning.simulation.simulation_time_controller.simulation_iteration 
 )
 from nuplan.planning.simulation.trajectory.abstract_trajectory import AbstractTrajectory
 from nuplan.planning.simulation.trajectory.interpolated_trajectory import InterpolatedTrajectory
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import PlannerError
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, SceneInfo
 from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, Tracks, TrafficLights, Trajectory
 from shiftsim.world.state import VehicleParameters as Dimensions

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray
+from shiftsim.kernels import FloatArray
 
 
 def part(path: str, doc: str) -> Any:

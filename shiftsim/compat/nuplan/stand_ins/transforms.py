@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray
 from shiftsim.compat.nuplan.stand_ins.geometry import Point2D, StateSE2, StateVector2D
+from shiftsim.kernels import FloatArray
 
 # nuplan.common.geometry.transform
 

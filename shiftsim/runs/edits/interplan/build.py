@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angle
+from shiftsim.kernels import FloatArray
 from shiftsim.runs.edits.interplan import codes
 from shiftsim.runs.edits.interplan.path import Plan, make_plan
 from shiftsim.sim.traffic.scripted import PEDESTRIAN_SIZE

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics.interplan import simplified
 from shiftsim.metrics.route import driven_route
 from shiftsim.runs.edits.interplan.codes import COMMANDS

@@ -6,10 +6,10 @@ which there is none, or no space, are not simulated.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, lean_kernel
 from shiftsim.errors import TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.traffic.idm.paths import (
     append_baseline,
     clamp_progress,
@@ -55,7 +55,7 @@ def place_agents(
     return out
 
 
-@lean_kernel
+@kernel
 def touches_any(box: FloatArray, boxes: FloatArray, count: int) -> bool:
     """Whether a box (4, 2) touches one of the first `count` of others (M, 4, 2)."""
     for index in range(count):

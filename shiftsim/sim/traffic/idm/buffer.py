@@ -8,8 +8,8 @@ belongs to the buffer where the curve winds around it.
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.rings import orientation, point_segment_distance
+from shiftsim.kernels import BoolArray, FloatArray, kernel
 
 QUADRANT_SEGMENTS = 16  # per right angle of a round join; what shapely's method defaults to
 _SIMPLIFY = 0.01  # concave vertices shallower than this share of the distance are left out
@@ -20,13 +20,13 @@ _CLOSING = 80.0  # closing points of an inner turn lie this much nearer to the c
 _PER_VERTEX = 4  # most curve vertices of a join, fillets apart
 
 
-@lean_kernel
+@kernel
 def curve_capacity(num_points: int) -> int:
     """Most vertices the buffer curve of a polyline can have, whatever its turns add up to."""
     return 2 * num_points * (_PER_VERTEX + 2 * QUADRANT_SEGMENTS) + 8
 
 
-@lean_kernel
+@kernel
 def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray) -> int:
     """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
@@ -44,7 +44,7 @@ def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatA
     return int(count)
 
 
-@lean_kernel
+@kernel
 def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -> None:
     """Mark the vertices that stay when shallow turns to one side are left out."""
     concave, size = 1 if left else -1, len(line)
@@ -73,7 +73,7 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
             last = _walk(keep, size, middle, 1)
 
 
-@part_kernel
+@kernel
 def _side(line: FloatArray, before: int, at: int, after: int) -> int:
     """Side to which a line turns at a vertex between two others: 1 left, -1 right, 0 none."""
     ax, ay = line[before, 0], line[before, 1]
@@ -81,7 +81,7 @@ def _side(line: FloatArray, before: int, at: int, after: int) -> int:
     return orientation(ax, ay, bx, by, line[after, 0], line[after, 1])
 
 
-@lean_kernel
+@kernel
 def _is_shallow(line: FloatArray, i0: int, i1: int, i2: int, tolerance: float) -> bool:
     ax, ay = line[i0, 0], line[i0, 1]
     bx, by = line[i1, 0], line[i1, 1]
@@ -96,7 +96,7 @@ def _is_shallow(line: FloatArray, i0: int, i1: int, i2: int, tolerance: float) -
     return True
 
 
-@lean_kernel
+@kernel
 def _offset_side(
     line: FloatArray, distance: float, left: bool, keep: BoolArray, out: FloatArray, count: int
 ) -> int:
@@ -128,7 +128,7 @@ def _offset_side(
     return _add(out, count, x2 - ux, y2 - uy, distance)
 
 
-@lean_kernel
+@kernel
 def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
     """The next vertex that is kept, or one beyond the ends."""
     at += step
@@ -137,7 +137,7 @@ def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
     return at
 
 
-@lean_kernel
+@kernel
 def _offset(ax: float, ay: float, bx: float, by: float, distance: float) -> tuple[float, float]:
     """Vector from a segment to its offset on the left."""
     dx, dy = bx - ax, by - ay
@@ -145,7 +145,7 @@ def _offset(ax: float, ay: float, bx: float, by: float, distance: float) -> tupl
     return -distance * dy / length, distance * dx / length
 
 
-@lean_kernel
+@kernel
 def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> int:
     if count:
         dx, dy = x - out[count - 1, 0], y - out[count - 1, 1]
@@ -156,7 +156,7 @@ def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> in
     return count + 1
 
 
-@lean_kernel
+@kernel
 def _outer_turn(
     x: float,
     y: float,
@@ -185,7 +185,7 @@ def _outer_turn(
     return _add(out, count, x + ux, y + uy, distance)
 
 
-@lean_kernel
+@kernel
 def _inner_turn(
     x0: float,
     y0: float,

@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, lean_kernel
+from shiftsim.kernels import BoolArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import Courtesy, Scene
@@ -52,7 +52,7 @@ def no_courtesy(road: VectorMap, num_agents: int) -> Courtesy:
     return make_courtesy(road, OFF, np.zeros(num_agents, np.bool_), 0, 0)
 
 
-@lean_kernel
+@kernel
 def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float, vy: float) -> None:
     """Put the footprint of where the ego will be: a straight corridor with square ends.
 
@@ -85,7 +85,7 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
     bound_ring(curve[: footprints.curve_size[place]], footprints.bounds[place])
 
 
-@lean_kernel
+@kernel
 def ignores_ego_ahead(scene: Scene, agent: int) -> bool:
     """Whether an agent, in whose corridor the ego will be, does not mind.
 

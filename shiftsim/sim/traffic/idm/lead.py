@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.polylines import RUN, bound_runs, runs_of
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.courtesy import ignores_ego_ahead
 from shiftsim.sim.traffic.idm.paths import look_ahead
@@ -34,7 +34,7 @@ class Corridor(NamedTuple):
     half_width: float  # of the buffer [m]
 
 
-@part_kernel
+@kernel
 def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
     """The nearest footprint in the corridor ahead of an agent, the first one on ties, and the gap.
 
@@ -80,7 +80,7 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
     return (len(footprints.present), gap) if gap < best else (lead, best)
 
 
-@part_kernel
+@kernel
 def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> float:
     """Distance from an agent's footprint to the red stop lines of its route, at most `limit`."""
     fleet, graph, scratch = scene.fleet, scene.graph, scene.scratch
@@ -99,7 +99,7 @@ def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> flo
     return best
 
 
-@part_kernel
+@kernel
 def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: Scratch) -> int:
     """List footprints whose bounds come near the corridor, in `scratch.near`; returns how many.
 
@@ -131,7 +131,7 @@ def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: 
     return found
 
 
-@lean_kernel
+@kernel
 def _in_corridor(footprints: Footprints, other: int, corridor: Corridor, scratch: Scratch) -> bool:
     """Whether a footprint meets a corridor."""
     bounds = footprints.bounds[other]
@@ -143,7 +143,7 @@ def _in_corridor(footprints: Footprints, other: int, corridor: Corridor, scratch
     return _meets(corridor, curve, bounds, scratch)
 
 
-@lean_kernel
+@kernel
 def _meets(corridor: Corridor, ring: FloatArray, bounds: FloatArray, scratch: Scratch) -> bool:
     """Whether a ring with the given bounds (4,) meets a corridor."""
     first, half_width = corridor.first, corridor.half_width
@@ -160,7 +160,7 @@ def _meets(corridor: Corridor, ring: FloatArray, bounds: FloatArray, scratch: Sc
     return ring_gap(ring, scratch.outline[:outline], 1e-3) == 0.0
 
 
-@part_kernel
+@kernel
 def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
     """Distance between the footprint of an agent and another one, at most `limit` [m]."""
     best = limit
@@ -172,7 +172,7 @@ def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
     return best
 
 
-@lean_kernel
+@kernel
 def _ring_gap(footprints: Footprints, agent: int, ring: FloatArray, limit: float) -> float:
     """Distance from an agent's footprint to a ring, at most `limit` [m]."""
     best = limit

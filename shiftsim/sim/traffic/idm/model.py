@@ -9,9 +9,9 @@ baseline too short to be a path.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, Held, IntArray
 from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
 from shiftsim.sim.traffic.idm.courtesy import make_courtesy, no_courtesy
 from shiftsim.sim.traffic.idm.paths import set_box
@@ -133,7 +133,7 @@ class IdmTraffic:
             self._hold(scene, tracks)
         end, what, first = -1, 0, BEGIN
         while end != DONE:
-            end, what = advance(self._held, row, ego, self._spans[iteration], first)
+            end, what = advance(self._scene, self._rows, row, ego, self._spans[iteration], first)
             if end == LEFT_PATH:
                 raise TrafficError(
                     f"reactive agent {tracks.tokens[scene.agents[what]]} is outside of its own "
@@ -148,7 +148,7 @@ class IdmTraffic:
 
     def _hold(self, scene: Scene, tracks: Tracks) -> None:
         self._scene, self._tracks = scene, tracks
-        self._held = Held((scene, rows_of(tracks)))
+        self._rows = rows_of(tracks)
 
     def _drop_far(self, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Remove stopped vehicles that are far from the ego, for good: nuPlan rule 712."""

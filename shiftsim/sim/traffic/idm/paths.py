@@ -8,9 +8,9 @@ unwrapped along the path and wrapped when a pose is read.
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import bound_runs, interpolate, runs_of, vertex_heading
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
@@ -30,7 +30,7 @@ from shiftsim.world.layers import Polylines
 _SAME_PROGRESS = 1e-8  # m, vertices closer than this count as one (numpy's isclose to zero)
 
 
-@part_kernel
+@kernel
 def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int) -> int:
     """Append the vertices of a baseline to a raw path; returns the new number of vertices."""
     start, stop = baselines.ptr[edge], baselines.ptr[edge + 1]
@@ -42,7 +42,7 @@ def append_baseline(baselines: Polylines, edge: int, path: FloatArray, size: int
     return size
 
 
-@part_kernel
+@kernel
 def finish_path(path: FloatArray, size: int) -> int:
     """Fill in progress, drop repeated vertices and the last one, unwrap the headings.
 
@@ -68,13 +68,13 @@ def finish_path(path: FloatArray, size: int) -> int:
     return kept
 
 
-@lean_kernel
+@kernel
 def clamp_progress(path: FloatArray, size: int, progress: float) -> float:
     """Progress limited to the path [m]."""
     return max(path[0, PROGRESS], min(progress, path[size - 1, PROGRESS]))
 
 
-@lean_kernel
+@kernel
 def first_after(path: FloatArray, size: int, progress: float) -> int:
     """First vertex of a path whose progress exceeds `progress`; `size` if there is none."""
     low, high = 0, size
@@ -87,7 +87,7 @@ def first_after(path: FloatArray, size: int, progress: float) -> int:
     return low
 
 
-@lean_kernel
+@kernel
 def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
     index = min(max(first_after(path, size, progress), 1), size - 1)
@@ -98,14 +98,14 @@ def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, f
     return x, y, wrap_angle(interpolate(before[HEADING], after[HEADING], span, along))
 
 
-@lean_kernel
+@kernel
 def point_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float]:
     """Point x, y [m] at a progress within the path, as in `pose_on_path`."""
     index = min(max(first_after(path, size, progress), 1), size - 1)
     return _point_before(path, index, progress)
 
 
-@lean_kernel
+@kernel
 def _point_before(path: FloatArray, index: int, progress: float) -> tuple[float, float]:
     """Point x, y [m] at a progress on the segment that ends at a vertex."""
     start = path[index - 1, PROGRESS]
@@ -114,7 +114,7 @@ def _point_before(path: FloatArray, index: int, progress: float) -> tuple[float,
     return x, interpolate(path[index - 1, 1], path[index, 1], span, along)
 
 
-@part_kernel
+@kernel
 def choose_successor(graph: LaneGraph, edge: int) -> int:
     """The open outgoing edge that starts straightest, the first one on ties; -1 if none is open."""
     best, chosen = np.inf, -1
@@ -132,7 +132,7 @@ def choose_successor(graph: LaneGraph, edge: int) -> int:
     return chosen
 
 
-@part_kernel
+@kernel
 def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmParameters) -> int:
     """Lengthen the path of an agent until it is long enough or no edge is open.
 
@@ -160,7 +160,7 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         fleet.first[agent] = -1
 
 
-@part_kernel
+@kernel
 def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     """Move what is ahead of `progress` to the front of a path; returns how many vertices."""
     after = first_after(path, size, progress)
@@ -182,7 +182,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     return kept
 
 
-@part_kernel
+@kernel
 def _remember(fleet: Fleet, agent: int, edge: int) -> None:
     """Append an edge to the route of an agent, and drop the oldest one where it is full."""
     route, size = fleet.route[agent], fleet.route_size[agent]
@@ -194,7 +194,7 @@ def _remember(fleet: Fleet, agent: int, edge: int) -> None:
     fleet.route_size[agent] = size + 1
 
 
-@lean_kernel
+@kernel
 def set_box(
     footprints: Footprints,
     index: int,
@@ -212,7 +212,7 @@ def set_box(
     bound_ring(box, bounds)
 
 
-@part_kernel
+@kernel
 def look_ahead(fleet: Fleet, agent: int) -> None:
     """Make the `line` of an agent begin where it is; agents do not drive backwards."""
     path, size, line = fleet.path[agent], fleet.path_size[agent], fleet.line[agent]
@@ -232,7 +232,7 @@ def look_ahead(fleet: Fleet, agent: int) -> None:
         line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
 
 
-@part_kernel
+@kernel
 def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
     """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
@@ -254,7 +254,7 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
     return count + 1
 
 
-@part_kernel
+@kernel
 def move_agent(scene: Scene, agent: int) -> int:
     """Pose and footprint of an agent from its progress; returns -1 where a curve is too long."""
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray
 from shiftsim.geometry.polylines import runs_of
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap

@@ -8,9 +8,9 @@ runs of segments of their line (`geometry.polylines`).
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, lean_kernel, part_kernel
 from shiftsim.geometry.polylines import RUN
 from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
+from shiftsim.kernels import FloatArray, kernel
 
 APART, MEETING, UNSURE = 0, 1, 2
 # A buffer lies within these shares of its distance from the line: round joins are segmented (inner
@@ -18,7 +18,7 @@ APART, MEETING, UNSURE = 0, 1, 2
 _INNER, OUTER = 0.97, 1.02
 
 
-@lean_kernel
+@kernel
 def bound_ring(ring: FloatArray, bounds: FloatArray) -> None:
     """Widen `bounds` (4,) min x, min y, max x, max y by a ring (V, 2)."""
     for vertex in range(len(ring)):
@@ -28,7 +28,7 @@ def bound_ring(ring: FloatArray, bounds: FloatArray) -> None:
         bounds[3] = max(bounds[3], ring[vertex, 1])
 
 
-@lean_kernel
+@kernel
 def winds_around(ring: FloatArray, x: float, y: float) -> bool:
     """Whether a ring (V, 2) winds around a point, or has it on an edge."""
     winding = 0
@@ -47,7 +47,7 @@ def winds_around(ring: FloatArray, x: float, y: float) -> bool:
     return winding != 0
 
 
-@lean_kernel
+@kernel
 def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     """Distance between what two rings (V, 2) enclose, at most `limit`; 0 where they meet [m]."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
@@ -72,7 +72,7 @@ def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     return best
 
 
-@part_kernel
+@kernel
 def _box_apart(ring: FloatArray, low_x: float, low_y: float, high_x: float, high_y: float) -> float:
     """Lower bound of the distance from a ring to what lies in an axis-parallel box [m]."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
@@ -82,7 +82,7 @@ def _box_apart(ring: FloatArray, low_x: float, low_y: float, high_x: float, high
     return max(low_x - x1, x0 - high_x, low_y - y1, y0 - high_y)
 
 
-@part_kernel
+@kernel
 def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
     """Distance between two close vertices: an upper bound that makes the search short."""
     found = 0
@@ -105,7 +105,7 @@ def _vertex_distance(a: FloatArray, b: FloatArray) -> float:
     return np.sqrt(best)
 
 
-@part_kernel
+@kernel
 def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best: float) -> float:
     """The distance from q to a ring, or from a vertex of it to the segment p-q, if below `best`.
 
@@ -130,7 +130,7 @@ def _edge_gap(px: float, py: float, qx: float, qy: float, ring: FloatArray, best
     return best
 
 
-@lean_kernel
+@kernel
 def _nearer(x: float, y: float, ax: float, ay: float, bx: float, by: float, best: float) -> float:
     """Distance from a point to the segment a-b where it is less than `best`, else `best` [m]."""
     if _square_distance(x, y, ax, ay, bx, by) * (1.0 - 1e-9) >= best * best:
@@ -139,7 +139,7 @@ def _nearer(x: float, y: float, ax: float, ay: float, bx: float, by: float, best
     return distance if distance < best else best
 
 
-@lean_kernel
+@kernel
 def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """Square of the distance from a point to the segment a-b, up to rounding [m^2]."""
     dx, dy = bx - ax, by - ay
@@ -154,7 +154,7 @@ def _square_distance(x: float, y: float, ax: float, ay: float, bx: float, by: fl
     return cross * cross / square
 
 
-@lean_kernel
+@kernel
 def last_near_run(runs: FloatArray, first: int, reach: float, bounds: FloatArray) -> int:
     """The last run, of those from `first` on, that comes within `reach` [m] of bounds; or -1."""
     low_x, low_y = bounds[0] - reach, bounds[1] - reach
@@ -170,7 +170,7 @@ def last_near_run(runs: FloatArray, first: int, reach: float, bounds: FloatArray
     return -1
 
 
-@part_kernel
+@kernel
 def touches_corridor(
     line: FloatArray,
     runs: FloatArray,
@@ -219,7 +219,7 @@ def touches_corridor(
     return answer
 
 
-@part_kernel
+@kernel
 def _touches_segment(
     px: float, py: float, qx: float, qy: float, half_width: float, ring: FloatArray
 ) -> int:

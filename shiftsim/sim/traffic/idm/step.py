@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, Held, IntArray, contents, lean_kernel, part_kernel
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.idm import idm_step
 from shiftsim.sim.traffic.idm.courtesy import place_ego_ahead
 from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
@@ -17,21 +17,22 @@ BEGIN = -1  # instead of the agent that an interrupted step goes on with
 _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
 
-@lean_kernel
-def advance(held: Held, at: int, ego: FloatArray, span: float, first: int) -> tuple[int, int]:
+@kernel
+def advance(
+    scene: Scene, tracks: Row, at: int, ego: FloatArray, span: float, first: int
+) -> tuple[int, int]:
     """Move every agent by one step, `span` [s] long, and write where it is.
 
-    Held are the scene, which has the lights of the end of the step, and the tracks, of which row
-    `at` is of the end of the step; `ego` (11,) is of its beginning. `first` is BEGIN, or the agent
-    that an interrupted step goes on with.
+    The scene has the lights of the end of the step, and row `at` of the tracks is of the end of the
+    step; `ego` (11,) is of its beginning. `first` is BEGIN, or the agent that an interrupted step
+    goes on with.
 
     Returns:
         DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
         agent whose footprint needs more, to go on with; LEFT_PATH and the agent that is outside of
         its own corridor.
     """
-    scene, rows = contents(held)
-    row = Row(rows.valid[at], rows.poses[at], rows.velocities[at], rows.sizes[at])
+    row = Row(tracks.valid[at], tracks.poses[at], tracks.velocities[at], tracks.sizes[at])
     fleet, agents = scene.fleet, scene.agents
     heading = ego[EGO_HEADING]
     x = ego[0] + _EGO_CENTER * np.cos(heading)
@@ -62,7 +63,7 @@ def advance(held: Held, at: int, ego: FloatArray, span: float, first: int) -> tu
     return DONE, 0
 
 
-@part_kernel
+@kernel
 def _place_replayed(scene: Scene, row: Row) -> None:
     """Put the replayed tracks that are present where they are."""
     footprints = scene.footprints
@@ -75,7 +76,7 @@ def _place_replayed(scene: Scene, row: Row) -> None:
             set_box(footprints, place, x, y, heading, row.sizes[track, 0], row.sizes[track, 1])
 
 
-@part_kernel
+@kernel
 def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
     """Remove agents that are far from the ego's centre, for good."""
     fleet = scene.fleet
@@ -86,7 +87,7 @@ def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
             scene.footprints.present[agent] = False
 
 
-@part_kernel
+@kernel
 def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, span: float) -> None:
     """Progress and speed of an agent after the step, behind the lead that `find_lead` gave."""
     fleet, parameters = scene.fleet, scene.parameters
@@ -119,7 +120,7 @@ def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, spa
     fleet.speed[agent] = max(speed, 0.0)
 
 
-@part_kernel
+@kernel
 def write_agents(fleet: Fleet, tracks: IntArray, row: Row) -> None:
     """Write the agents, whose tracks are given (A,), into a row; the gone as absent."""
     for agent in range(len(tracks)):

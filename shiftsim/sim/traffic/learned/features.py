@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.arrays import BoolArray, FloatArray, IntArray, kernel, lean_kernel
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import point_on_polyline, project_on_polyline
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, Lanes, choose_lane, next_lane
 from shiftsim.world.state import AgentKind
 
@@ -43,7 +43,7 @@ class Motion(NamedTuple):
     kinds: IntArray  # (N,) AgentKind
 
 
-@lean_kernel
+@kernel
 def _trace(lanes: Lanes, edge: int, x: float, y: float, path: FloatArray) -> tuple[int, float]:
     """Write the path from a point on: (P, 3) x, y, distance along it; find the red light.
 
@@ -71,7 +71,7 @@ def _trace(lanes: Lanes, edge: int, x: float, y: float, path: FloatArray) -> tup
     return count, light
 
 
-@lean_kernel
+@kernel
 def _gap_ahead(path: FloatArray, count: int, reach: float, x: float, y: float) -> float:
     """Distance along a path (P, 3) to a point within `reach` of it [m]; inf if it is not."""
     for place in range(1, count):
@@ -211,7 +211,7 @@ def move_agents(
         moved[place, 3] = speed
 
 
-@lean_kernel
+@kernel
 def _walks_into(motion: Motion, agent: int, x: float, y: float) -> bool:
     """Whether an agent comes nearer to a pedestrian, and too near, when it goes to a point."""
     own = np.hypot(motion.sizes[agent, 0], motion.sizes[agent, 1])

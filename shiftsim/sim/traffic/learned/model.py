@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.arrays import FloatArray, IntArray
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.traffic import Move
 from shiftsim.sim.traffic.following import NO_LANE, Lanes, lanes_of
 from shiftsim.sim.traffic.learned.features import (

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.arrays import FloatArray
 from shiftsim.errors import CheckpointError
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
 
 HIDDEN = 96

@@ -1,0 +1,95 @@
+"""Array types, read-only arrays, and the decorator that compiles kernels: numba as it is shipped.
+
+numba's disk cache looks only at the file of the outermost kernel. The cache folder is therefore
+named by a hash of all kernel sources and of the versions of numba and NumPy: an edit of any of them
+starts a fresh cache.
+"""
+
+import hashlib
+import logging
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from shiftsim.files import PACKAGE, module_names, read_module, user_cache
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+_CACHES_KEPT = 3  # versions of the kernels whose machine code stays on disk
+_KEEPS_READ_ONLY = np.lib.NumpyVersion(np.__version__) >= "2.1.0"  # what NumPy's DLPack can pass on
+
+
+def kernel_hash() -> str:
+    """Hash of the modules with kernels, of those they import constants from, and of versions."""
+    modules = {name: read_module(name) for name in module_names()}
+    kernels = {name for name, (text, _) in modules.items() if b"\n@kernel\n" in text}
+    compiled = kernels.union(*(modules[name][1] for name in kernels))
+    digest = hashlib.sha256(f"{numba.__version__} {np.__version__}".encode())
+    for name in sorted(compiled):
+        digest.update(name.encode() + modules[name][0])
+    return digest.hexdigest()[:16]
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+def _cache_folder() -> str:
+    """Folder of the machine code; empty where none can be written.
+
+    It is in the checkout or beside the installed package, else in the cache folder of the user,
+    who is given a copy of what was compiled when an image was built.
+    """
+    is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
+    base = PACKAGE.parent / ".numba-cache" if is_checkout else PACKAGE / "__pycache__" / "kernels"
+    shipped, own = (folder / kernel_hash() for folder in (base, user_cache("kernels")))
+    folder = shipped if _is_writable(shipped) else own
+    if not _is_writable(folder):
+        logging.getLogger(__name__).warning(
+            "%s cannot be written: kernels are compiled anew by every process", folder
+        )
+        return ""
+    if folder is own and shipped.is_dir():
+        shutil.copytree(shipped, own, dirs_exist_ok=True)
+    caches = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
+    for old in caches[_CACHES_KEPT:]:
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+    return str(folder)
+
+
+config: Any = numba.config
+if not config.CACHE_DIR:  # NUMBA_CACHE_DIR
+    config.CACHE_DIR = _cache_folder()
+
+CACHE_FOLDER: str = config.CACHE_DIR
+# no fastmath, no parallel loops: results must not depend on the processor or the number of threads;
+# division by zero gives inf or NaN, as in NumPy
+kernel: Any = numba.njit(cache=bool(CACHE_FOLDER), error_model="numpy")
+
+
+def machine_code() -> list[Path]:
+    """Files of the kernels that are compiled, one for each combination of types."""
+    return [*Path(CACHE_FOLDER).rglob("*.nbc")] if CACHE_FOLDER else []
+
+
+def readonly(array: Any) -> Any:
+    """The same memory as an array that nobody can make writeable, and whose `base` is no array.
+
+    Before NumPy 2.1 it is a copy.
+    """
+    view = array.view() if _KEEPS_READ_ONLY else array.copy()
+    view.flags.writeable = False
+    return np.from_dlpack(view) if _KEEPS_READ_ONLY else view
