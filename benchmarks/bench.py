@@ -15,19 +15,19 @@ from typing import Any
 
 from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
 from shiftsim.benchmarks.coverage import coverage
+from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import whole_file, write_text
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
+from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import DEFAULT_STORE, make_config
-from shiftsim.runs.edits.avoidable import grade
-from shiftsim.runs.edits.edited import EditSet, edits_text, make_edits
+from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, Prepared, prepare
 from shiftsim.runs.results import Run, open_run, stored_results
 from shiftsim.runs.scenarios import open_edits, open_named_store
 from shiftsim.sim.traffic import traffic_name
-from shiftsim.world.edits.sampling import sample_edits
 
 MANIFEST = "bench.json"
 EDITS = "edits.toml"  # what was edited, in the folder of the benchmark

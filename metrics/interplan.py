@@ -17,7 +17,7 @@ from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import Script
+from shiftsim.world.script import RolloutEvents
 from shiftsim.world.state import center_poses
 
 LANES = "lane_changes_to_goal"
@@ -52,7 +52,7 @@ class LaneChanges:
 
 
 def role_of(metric: str, sorts: str) -> tuple[str, float | None]:
-    """Role (`multiplier`, `weighted` or empty) and weight of a metric; `sorts` as in `Script`.
+    """Role (`multiplier`, `weighted`, empty) and weight of a metric; `sorts` as in `RolloutEvents`.
 
     nuPlan rule 714: where an obstacle is to be passed, passing it takes the place of the driving
     direction, which then is weighted; beside a pedestrian both are multipliers.
@@ -94,7 +94,7 @@ def final_score(types: Sequence[tuple[int, float]], weights: Sequence[float]) ->
 
 
 def add_interplan(
-    result: MetricResult, log: SimulationLog, road: VectorMap, script: Script
+    result: MetricResult, log: SimulationLog, road: VectorMap, script: RolloutEvents
 ) -> MetricResult:
     """The result with interPlan's metrics and its score.
 

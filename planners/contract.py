@@ -17,7 +17,7 @@ import numpy as np
 from shiftsim.files import place_of
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.plan_check import FAR, SHORT, find_fault, is_short
 from shiftsim.world.scenario import Scenario
@@ -86,7 +86,7 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
     if subject is None or not _has_methods(subject, findings):
         return findings
     copy = _second(planner if is_made else None, subject, findings)
-    original = Original(lambda: subject)
+    original = PlannerPrototype(lambda: subject)
     seconds: list[float] = []
     first = _drive(subject, scenario, findings, seconds=seconds)
     if first is not None:
@@ -251,7 +251,11 @@ def _check_repeats(
 
 
 def _check_company(
-    original: Original, first: Plans, scenario: Scenario, other: Scenario, findings: list[Finding]
+    original: PlannerPrototype,
+    first: Plans,
+    scenario: Scenario,
+    other: Scenario,
+    findings: list[Finding],
 ) -> None:
     """Drive another scenario, then the same one again, as a worker would."""
     elsewhere: list[Finding] = []

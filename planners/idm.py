@@ -17,7 +17,7 @@ from shiftsim.planners.routes.corridor import (
     UNKNOWN,
     Index,
     Objects,
-    Survey,
+    ObstacleCache,
     find_lead,
     find_sides,
     is_tied,
@@ -318,7 +318,7 @@ def _roll_on(
     policy: Policy,
     centers: FloatArray,  # (17, 3) box centres x [m], y [m], heading [rad]
     motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
-    survey: Survey,
+    survey: ObstacleCache,
     sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
     footprint: FloatArray,  # (4, 2) receives the corners of the ego in the row returned [m]
 ) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from shiftsim.errors import PlannerError
 from shiftsim.planners import stub
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.planners.registry import load_planner, planner_fingerprint
 from shiftsim.sim import planner as interface
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -154,6 +154,6 @@ class Isolated:
 def at_home(hello: Mapping[str, Any]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """In the child: what makes planners, the classes of what they are given, and a fingerprint."""
     spec, arguments = hello["spec"], hello["arguments"]
-    original = Original(lambda: load_planner(spec, arguments))
+    original = PlannerPrototype(lambda: load_planner(spec, arguments))
     classes = {kind.__name__: kind for kind in _GIVEN}
     return original.copy, classes, planner_fingerprint(spec, arguments)

@@ -14,7 +14,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 LAYERS = (
     {"_moved", "errors", "files", "geometry", "kernels"},
     {"world"},
-    {"sim", "metrics", "data", "planners"},
+    {"sim", "metrics", "data", "planners", "edits"},
     {"runs"},
     {"report", "view", "verify", "env", "train", "compat"},
     {"api", "cli", "benchmarks", "__main__", "__init__"},

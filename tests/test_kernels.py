@@ -23,11 +23,11 @@ from numba.core.runtime import _nrt_python, rtsys
 from track_files import export_town, write_tracks
 from worlds import cruise_scenario
 
-from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.tracks.convert import convert_tracks, look_at
 from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.tracks.convert import convert_tracks, look_at
 from shiftsim.files import PACKAGE
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner

@@ -20,7 +20,7 @@ def test_a_module_that_moved_is_found(old, new):
 @pytest.mark.parametrize(
     ("package", "name", "new"),
     [
-        ("shiftsim.data.opendrive", "read_opendrive", "shiftsim.data.opendrive.reading"),
+        ("shiftsim.data.maps.opendrive", "read_opendrive", "shiftsim.data.maps.opendrive.reading"),
         ("shiftsim.data.store", "StoreWriter", "shiftsim.data.store.writing"),
         ("shiftsim.data.store", "open_store", "shiftsim.data.store.reading"),
         ("shiftsim.planners", "load_planner", "shiftsim.planners.registry"),

@@ -12,12 +12,12 @@ from time import process_time
 import numpy as np
 import pytest
 
-from shiftsim.runs.edits.interplan.build import apply_code
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.interplan.build import apply_code
+from shiftsim.edits.spec import make_edit
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.verify.files import Scenes
 from shiftsim.verify.scenario_edits import WINDOW
-from shiftsim.world.edits.apply import apply_edit
-from shiftsim.world.edits.spec import make_edit
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden"
 TOKEN = "03b23cc64ccf44cb"

@@ -26,7 +26,7 @@ from shiftsim.benchmarks.speed import gpu
 from shiftsim.benchmarks.speed.conftest import median_seconds
 from shiftsim.data.demo.store import bench_scene, demo_store
 from shiftsim.data.store.reading import open_store
-from shiftsim.planners.learned.owner import Ask, Owner, new_address
+from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout
@@ -314,8 +314,8 @@ def test_asking_another_process(scenes, loaded, size, note, name, batch):
     forks, observations = started(planner, [scenes[n] for n in NAMES if n in scenes], batch)
     features = [fork.features(seen) for fork, seen in zip(forks, observations, strict=True)]
     outputs = list(planner.infer(features))
-    with beside(partial(Owner, {name: partial(gpu.Repeating, outputs)}, address)):
-        ask = Ask(address, name)
+    with beside(partial(InferenceServer, {name: partial(gpu.Repeating, outputs)}, address)):
+        ask = InferenceClient(address, name)
         seconds = median_seconds(lambda: ask(features), size(ASKED, 2))
         answered = ask(features)
     assert pickle.dumps(answered) == pickle.dumps(outputs)
@@ -329,7 +329,7 @@ def test_asking_another_process(scenes, loaded, size, note, name, batch):
 MEMORY = """
 import re, sys
 from shiftsim.data.store.reading import open_store
-from shiftsim.planners.learned.owner import Ask, Owner, new_address
+from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.workers import beside
 from shiftsim.sim.loop import Rollout

@@ -9,8 +9,8 @@ from time import perf_counter, process_time
 
 import pytest
 
-from shiftsim.data.open_data.av2 import Av2Reader
-from shiftsim.data.open_data.scenes import convert_scenes
+from shiftsim.data.readers.open_data.av2 import Av2Reader
+from shiftsim.data.readers.open_data.scenes import convert_scenes
 
 SAMPLE = Path(__file__).resolve().parents[3] / "shared/reference/open_data/av2"
 

@@ -22,7 +22,7 @@ from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
-from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
+from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, ObservationBuilder
 from shiftsim.verify.files import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
@@ -94,7 +94,7 @@ def test_step_loop(measure, scenes, runner, name):
     measure(lambda: simulate(scenes[name], planner), calls=1, target=LOOP_TARGET)
 
 
-class PlainSight(Sight):
+class PlainSight(ObservationBuilder):
     """Shows views of the rows of the rollout, writable as they are: what costs least to write."""
 
     def __init__(self, *arrays):
@@ -114,16 +114,18 @@ def test_sealed_observations(size, note, monkeypatch, agents):
     scene, planner = bench_scene(agents, 0), run_planner("constant-velocity", {}).make()
 
     def step_seconds(sight):
-        monkeypatch.setattr(loop, "Sight", sight)
+        monkeypatch.setattr(loop, "ObservationBuilder", sight)
         began = process_time()
         for _ in range(size(4)):
             simulate(scene, planner)
         return (process_time() - began) / size(4) / (scene.num_iterations - 1)
 
     def pair(number):  # each goes first as often as the other
-        first, second = (Sight, PlainSight) if number % 2 else (PlainSight, Sight)
+        first, second = (
+            (ObservationBuilder, PlainSight) if number % 2 else (PlainSight, ObservationBuilder)
+        )
         taken = {first: step_seconds(first), second: step_seconds(second)}
-        return taken[Sight], taken[PlainSight]
+        return taken[ObservationBuilder], taken[PlainSight]
 
     pair(0)
     sealed, plain = np.array([pair(number) for number in range(size(60, 2))]).T

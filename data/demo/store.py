@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.data.deepplan.convert import ConversionReport, convert_dsc3d
 from shiftsim.data.demo.city import bench_scene
 from shiftsim.data.demo.files import write_demo
+from shiftsim.data.readers.deepplan.convert import ConversionReport, convert_dsc3d
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
 

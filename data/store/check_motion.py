@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.store.tracks import StoredRecording
-from shiftsim.data.tracks.motion import (
+from shiftsim.data.readers.tracks.motion import (
     MAX_SHARE,
     contradiction,
     fitted_velocities,
 )
+from shiftsim.data.store.tracks import StoredRecording
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, VX, VY, AgentKind

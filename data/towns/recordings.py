@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.data.deepplan.convert import convert_dsc3d
-from shiftsim.data.deepplan.windows import ROW_S, ConversionConfig
 from shiftsim.data.demo.files import write_site
 from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.scenes import DemoSite, Scene
+from shiftsim.data.readers.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.deepplan.windows import ROW_S, ConversionConfig
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import recording_folder

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shiftsim.data.deepplan.convert import Spread
+from shiftsim.data.readers.deepplan.convert import Spread
 from shiftsim.data.store.reading import ScenarioStore, read_report
 from shiftsim.data.store.tables import MANIFEST
 from shiftsim.data.store.writing import StoreWriter, window_row

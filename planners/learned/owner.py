@@ -49,7 +49,7 @@ def new_address() -> Address:
     return Address(place, secrets.token_bytes(32))
 
 
-class Owner:
+class InferenceServer:
     """Answers for planners, on threads, as long as it lives."""
 
     def __init__(self, planners: Mapping[str, Callable[[], Any]], address: Address) -> None:
@@ -87,7 +87,7 @@ class Owner:
             return told, traceback.format_exc()
 
 
-class Ask:
+class InferenceClient:
     """What takes the place of `infer` where an owner has the network.
 
     Copies of a planner share it, and its connection, which is made when it is needed.
@@ -100,7 +100,7 @@ class Ask:
         self._patience = PATIENCE
 
     def __reduce__(self) -> Any:
-        return Ask, (self.address, self.name)
+        return InferenceClient, (self.address, self.name)
 
     def __call__(self, features: Sequence[Any]) -> Sequence[Any]:
         """What the planner's `infer` returns.

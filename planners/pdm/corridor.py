@@ -13,7 +13,7 @@ from shiftsim.geometry.polylines import (
     OPEN,
     RUN,
     Path,
-    Stretch,
+    PathInterval,
     corridor_polygon,
     is_run_near,
     is_run_within,
@@ -102,7 +102,7 @@ def fill_corridor(
     low, high = corridors.spans[number, 0], corridors.spans[number, 1]
     begin, end = window(path, low, high)
     begin, end = without_repeats(path.xy, begin, end)
-    stretch = Stretch(path.xy, path.runs, begin, end, corridors.half_width)
+    stretch = PathInterval(path.xy, path.runs, begin, end, corridors.half_width)
     has_length = end - begin > 1
     reach = 1.5 * (1.0 + BAND) * stretch.half_width  # covers the corners of the square ends
     num_boxes = len(others.radii)
@@ -164,7 +164,7 @@ def fill_corridor(
 @kernel
 def _side_of_frame(
     path: Path,
-    stretch: Stretch,
+    stretch: PathInterval,
     first: int,  # run that may be near
     last: int,  # likewise; those outside are not
     radius: float,  # of a circle around the box [m]
@@ -207,7 +207,7 @@ def _square_from(frame: BoxFrame, dx: float, dy: float) -> float:
 
 @kernel
 def _runs_near(
-    stretch: Stretch, bounds: tuple[float, float, float, float], reach: float
+    stretch: PathInterval, bounds: tuple[float, float, float, float], reach: float
 ) -> tuple[int, int]:
     """The first and the last run of a stretch near to bounds; where none is, the last is less."""
     first, last = len(stretch.runs), -1

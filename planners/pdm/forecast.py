@@ -10,7 +10,7 @@ from shiftsim.geometry.rings import centroid, ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks
-from shiftsim.planners.proposals.contacts import Others, touches_box
+from shiftsim.planners.proposals.contacts import Obstacles, touches_box
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.planners.routes.lights import RedLights
@@ -24,7 +24,7 @@ NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a 
 class Forecast(NamedTuple):
     """Tracks around the ego on every forecast map, and red lights. B boxes, M = B + lights."""
 
-    others: Others  # the boxes on 41 maps; what the ego has touched before is ignored
+    others: Obstacles  # the boxes on 41 maps; what the ego has touched before is ignored
     moves: BoolArray  # (B,) whether a box changes from map to map
     headings: FloatArray  # (B,) of the box [rad]
     # (M,) whether the ego has touched it before; the first B are those of `others`
@@ -102,7 +102,7 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
     count = len(chosen)
     shape = (NUM_FORECASTS, count)
     ignored = np.zeros(count + len(lights.bounds), np.bool_)
-    others = Others(
+    others = Obstacles(
         boxes=np.empty((*shape, 4, 2)),
         centers=np.empty((*shape, 2)),
         centroids=np.empty((*shape, 2)),

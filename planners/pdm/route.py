@@ -7,7 +7,13 @@ import numpy as np
 
 from shiftsim.errors import PlannerError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, Slabs, covering, index_ranks, make_areas
+from shiftsim.planners.proposals.areas import (
+    Areas,
+    ScanlineIndex,
+    covering,
+    index_ranks,
+    make_areas,
+)
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.routes.graph import (
@@ -85,7 +91,7 @@ def lanes_at(
 
 @kernel
 def _lanes_at(
-    slabs: Slabs,
+    slabs: ScanlineIndex,
     on_route: BoolArray,
     lane: IntArray,
     selected: IntArray,

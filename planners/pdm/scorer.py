@@ -12,7 +12,7 @@ from shiftsim.geometry.polylines import Path, project
 from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
-from shiftsim.planners.proposals.areas import Areas, Slabs
+from shiftsim.planners.proposals.areas import Areas, ScanlineIndex
 from shiftsim.planners.proposals.comfort import (
     Comfort,
     ComfortBounds,
@@ -24,7 +24,7 @@ from shiftsim.planners.proposals.comfort import (
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
-    Others,
+    Obstacles,
     is_at_fault,
     project_box,
 )
@@ -32,7 +32,7 @@ from shiftsim.planners.proposals.places import (
     OFF_ROAD,
     OFF_ROUTE,
     EgoBox,
-    Places,
+    ProposalStates,
     empty_places,
     find,
 )
@@ -83,7 +83,7 @@ class Place(NamedTuple):
 
 
 def score(
-    states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
+    states: FloatArray, place: Place, others: Obstacles, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
     at, felt, near = empty_places(states), empty_comfort(states), np.empty_like(place.selected)
@@ -122,17 +122,17 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 @kernel
 def _judge(
-    slabs: Slabs,
+    slabs: ScanlineIndex,
     on_route: BoolArray,
     selected: IntArray,
     near: IntArray,  # scratch for some of them
     intersections: Polygons,
     centerline: Path,
-    others: Others,
+    others: Obstacles,
     size: EgoBox,
     filters: Filters,
     bounds: tuple[tuple[float, float], ComfortBounds],  # of the direction, of comfort
-    at: Places,
+    at: ProposalStates,
     felt: Comfort,
     found: Findings,
 ) -> None:
@@ -210,7 +210,7 @@ def _meet(
     motion: FloatArray,  # (T, 3) speed [m/s], cosine and sine of the heading
     size: EgoBox,
     index: int,  # of one of the others
-    boxes: FloatArray,  # of the others, as in `Others`
+    boxes: FloatArray,  # of the others, as in `Obstacles`
     others_at: FloatArray,
     centroids: FloatArray,
     speeds: FloatArray,

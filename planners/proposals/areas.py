@@ -21,7 +21,7 @@ _NOTHING = np.empty((2, 0))
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 
 
-class Slabs(NamedTuple):
+class ScanlineIndex(NamedTuple):
     """Areas sliced into horizontal slabs, each with the edges in it. M areas, S slabs, E edges."""
 
     bounds: FloatArray  # (M, 4) of the areas: min x, min y, max x, max y [m]
@@ -38,7 +38,7 @@ class Areas(NamedTuple):
     """Areas of all lanes and connectors of a map, then of its car parks."""
 
     polygons: Polygons  # the areas
-    slabs: Slabs  # the same, to find out what they hold
+    slabs: ScanlineIndex  # the same, to find out what they hold
     on_route: BoolArray  # (M,) whether the route holds a lane of that id
     lane: IntArray  # (M,) the lane of that id; for a car park usually -1
 
@@ -74,16 +74,24 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
     height = polygons.bounds[:, 3] - polygons.bounds[:, 1]
     scale = np.where(height > 0.0, num_slabs / np.where(height > 0.0, height, 1.0), 0.0)
     counts, fixed = np.zeros(slab_ptr[-1], np.int64), (polygons.bounds, scale, slab_ptr)
-    _slice(polygons, Slabs(*fixed, counts, np.empty((0, 2)), np.empty((0, 4))), counts, _NOTHING)
+    _slice(
+        polygons,
+        ScanlineIndex(*fixed, counts, np.empty((0, 2)), np.empty((0, 4))),
+        counts,
+        _NOTHING,
+    )
     edge_ptr = np.concatenate([[0], np.cumsum(counts)])
     ends, spans = np.empty((2 * edge_ptr[-1], 2)), np.empty((len(counts), 4))
-    slabs, scratch = Slabs(*fixed, edge_ptr, ends, spans), np.empty((2, counts.max(initial=0)))
+    slabs, scratch = (
+        ScanlineIndex(*fixed, edge_ptr, ends, spans),
+        np.empty((2, counts.max(initial=0))),
+    )
     _slice(polygons, slabs, edge_ptr[:-1].copy(), scratch)
     return Areas(polygons, slabs, on_route, lane)
 
 
 @kernel
-def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray) -> None:
+def _slice(polygons: Polygons, slabs: ScanlineIndex, fill: IntArray, scratch: FloatArray) -> None:
     """Add the edges of every slab to `fill`; write their ends and the spans, unless there are none.
 
     `scratch` (2, E) is for the edges of a slab.
@@ -111,7 +119,7 @@ def _slice(polygons: Polygons, slabs: Slabs, fill: IntArray, scratch: FloatArray
 
 
 @kernel
-def _span(slabs: Slabs, lows: FloatArray, highs: FloatArray) -> None:
+def _span(slabs: ScanlineIndex, lows: FloatArray, highs: FloatArray) -> None:
     """Fill in the spans; `lows` and `highs` are scratch for the edges of a slab."""
     bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
     for area in range(len(scale)):
@@ -182,7 +190,7 @@ def _select(
 
 @kernel
 def held_points(
-    slabs: Slabs, area: int, points: FloatArray, first: int, stop: int
+    slabs: ScanlineIndex, area: int, points: FloatArray, first: int, stop: int
 ) -> tuple[int, int]:
     """Which of some points (K, 2) lie in the interior of an area, which on its boundary: bits."""
     bounds, scale, slab_ptr, edge_ptr, ends, spans = slabs
@@ -221,7 +229,7 @@ def held_points(
 
 
 @kernel
-def covering(slabs: Slabs, selected: IntArray, points: FloatArray, out: IntArray) -> int:
+def covering(slabs: ScanlineIndex, selected: IntArray, points: FloatArray, out: IntArray) -> int:
     """Write the selected areas that hold a point (1, 2), or have it on their boundary, into `out`.
 
     They keep their order; how many they are.

@@ -10,7 +10,7 @@ import numpy as np
 from shiftsim.geometry.boxes import BEHIND, bearing, circle_around, front_touches
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.places import Places
+from shiftsim.planners.proposals.places import ProposalStates
 from shiftsim.world.state import HEADING, VX, VY
 
 STOPPED = 5e-2  # m/s, of the ego and of others in a collision
@@ -18,7 +18,7 @@ TTC_STOPPED = 5e-3  # m/s, of the ego
 NEVER = np.inf
 
 
-class Others(NamedTuple):
+class Obstacles(NamedTuple):
     """Boxes of all that a proposal can hit."""
 
     boxes: FloatArray  # (R, N, 4, 2) corners [m]
@@ -59,7 +59,7 @@ def touches_box(footprint: FloatArray, circle: tuple[float, float, float], box: 
 
 
 @kernel
-def near_others(places: Places, others: Others, rows: int, horizon: float) -> IntArray:
+def near_others(places: ProposalStates, others: Obstacles, rows: int, horizon: float) -> IntArray:
     """Those that can touch an ego box, or its projection over `horizon` [s], in the first rows."""
     states, corners = places.states, places.corners
     low_x = low_y = np.inf
@@ -90,7 +90,7 @@ def near_others(places: Places, others: Others, rows: int, horizon: float) -> In
 
 @kernel
 def hits(
-    others: Others, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
+    others: Obstacles, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
 ) -> bool:
     """Whether a box (4, 2) and the circle around it touch one of the others at a row of time."""
     dx = others.centers[row, index, 0] - circle[0]
@@ -125,7 +125,7 @@ def is_at_fault(
 
 @kernel
 def first_faults(
-    places: Places, others: Others, near: IntArray, rows: IntArray
+    places: ProposalStates, others: Obstacles, near: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of the others that are near.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, Slabs, held_points
+from shiftsim.planners.proposals.areas import Areas, ScanlineIndex, held_points
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
@@ -25,7 +25,7 @@ class EgoBox(NamedTuple):
     rear_axle_to_center: float
 
 
-class Places(NamedTuple):
+class ProposalStates(NamedTuple):
     """Driven proposals and where they are."""
 
     states: FloatArray  # (P, T, 11) driven states
@@ -49,17 +49,17 @@ def find_places(
     limits: FloatArray,  # (M,) speed limits of all areas, or none of them [m/s]
     *,
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
-) -> Places:
-    """Places of driven states (P, T, 11)."""
+) -> ProposalStates:
+    """ProposalStates of driven states (P, T, 11)."""
     at, near = empty_places(states), np.empty_like(selected)
     find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
     return at
 
 
-def empty_places(states: FloatArray) -> Places:
+def empty_places(states: FloatArray) -> ProposalStates:
     """Driven states (P, T, 11) and arrays for their places."""
     shape = states.shape[:2]
-    return Places(
+    return ProposalStates(
         states,
         np.empty((*shape, 4, 2)),
         np.empty((*shape, 2)),
@@ -71,14 +71,14 @@ def empty_places(states: FloatArray) -> Places:
 
 @kernel
 def find(
-    slabs: Slabs,
+    slabs: ScanlineIndex,
     on_route: BoolArray,
     selected: IntArray,
     limits: FloatArray,
     by_center: bool,
     size: EgoBox,
     near: IntArray,  # (M,) scratch
-    at: Places,  # the states are there
+    at: ProposalStates,  # the states are there
 ) -> None:
     """Fill in the places."""
     bounds, flags = slabs.bounds, at.flags
@@ -148,7 +148,7 @@ def find(
 
 @kernel
 def _place_ego(
-    at: Places, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
+    at: ProposalStates, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
 ) -> int:
     """Write corners and centres, and which of the selected areas may be met; how many they are."""
     low_x = low_y = np.inf

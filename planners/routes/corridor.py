@@ -45,7 +45,7 @@ class Objects(NamedTuple):
     speeds: FloatArray  # (M,) speed, 0 for static objects and red lights [m/s]
 
 
-class Survey(NamedTuple):
+class ObstacleCache(NamedTuple):
     """What is known of the objects along a path of S segments, for one width of the corridor."""
 
     half_width: float  # of the corridor [m]
@@ -56,15 +56,15 @@ class Survey(NamedTuple):
     runs: IntArray  # (M, 2) first and last run of the path that come near, or UNKNOWN
 
 
-def make_survey(path: Path, half_width: float, count: int) -> Survey:
+def make_survey(path: Path, half_width: float, count: int) -> ObstacleCache:
     """Nothing is known yet of so many objects."""
     sides = np.full((count, len(path.xy) - 1), UNKNOWN, np.int8)
     hits, runs = np.full(count, UNKNOWN), np.full((count, 2), UNKNOWN)
-    return Survey(half_width, sides, hits, np.empty((count, 4)), runs)
+    return ObstacleCache(half_width, sides, hits, np.empty((count, 4)), runs)
 
 
 @kernel
-def start_survey(survey: Survey, path: Path, objects: Objects, progress: float) -> None:
+def start_survey(survey: ObstacleCache, path: Path, objects: Objects, progress: float) -> None:
     """Find out which runs of the path, from a progress on, come near each object."""
     first = max(int(np.searchsorted(path.progress, progress)) - 1, 0) // RUN
     reach = 2.0 * (1.0 + BAND) * survey.half_width  # covers the corners of the square ends
@@ -87,7 +87,7 @@ def find_sides(
     high: float,  # progress at which it ends, within the path [m]
     footprint: FloatArray,  # (4, 2) of the ego [m]
     objects: Objects,
-    survey: Survey,
+    survey: ObstacleCache,
     ends: FloatArray,  # (4, 2) scratch
     out: IntArray,  # (M,)
 ) -> None:
@@ -154,7 +154,7 @@ def _side(
     has_ends: bool,
     ends: FloatArray,
     ring: FloatArray,
-    survey: Survey,
+    survey: ObstacleCache,
     index: int,
 ) -> int:
     """CLEAR, HIT or OPEN: whether the ring of an object touches the corridor of a stretch."""
@@ -193,7 +193,9 @@ def _side(
 
 
 @kernel
-def _segment_side(path: Path, segment: int, ring: FloatArray, survey: Survey, index: int) -> int:
+def _segment_side(
+    path: Path, segment: int, ring: FloatArray, survey: ObstacleCache, index: int
+) -> int:
     """CLEAR, HIT or OPEN: whether a ring touches the corridor of a segment, without its ends."""
     known = survey.sides[index, segment]
     if known == UNKNOWN:

@@ -21,10 +21,10 @@ from shiftsim.cli import (
 )
 
 if TYPE_CHECKING:
-    from shiftsim.data.deepplan.convert import ConversionReport
-    from shiftsim.data.deepplan.recording import Converted, RecordingSummary
-    from shiftsim.data.deepplan.windows import ConversionConfig
-    from shiftsim.data.tracks.convert import Looked
+    from shiftsim.data.readers.deepplan.convert import ConversionReport
+    from shiftsim.data.readers.deepplan.recording import Converted, RecordingSummary
+    from shiftsim.data.readers.deepplan.windows import ConversionConfig
+    from shiftsim.data.readers.tracks.convert import Inspection
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 _DATA, PARTIAL = 2, 3
@@ -152,7 +152,7 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
-    from shiftsim.data.deepplan.convert import convert_dsc3d
+    from shiftsim.data.readers.deepplan.convert import convert_dsc3d
     from shiftsim.files import store_path
 
     flags = {
@@ -221,8 +221,8 @@ def tracks(
     the picture beside the report shows tracks and map. Recordings shorter than a window become one
     scenario each, with 2 s of history.
     """
+    from shiftsim.data.readers.tracks.convert import convert_tracks, look_at, tracks_config
     from shiftsim.data.store.tables import picture_file
-    from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml, store_path
 
@@ -269,7 +269,7 @@ def tracks(
         say(f" next: shiftsim check {store}, then shiftsim run --planner idm --store {store}")
 
 
-def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None:
+def _draw_tracks(path: Path, looked: "Inspection", made: "Converted | None") -> None:
     """The picture of map and tracks; without matplotlib a line that says how to get it."""
     from shiftsim.errors import MissingExtraError
     from shiftsim.view.tracks import save_tracks_picture
@@ -306,7 +306,7 @@ def _category_map(words: list[str]) -> dict[str, str] | None:
 
 
 def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
-    from shiftsim.data.deepplan.windows import make_config
+    from shiftsim.data.readers.deepplan.windows import make_config
     from shiftsim.errors import ConfigError
     from shiftsim.files import read_toml
 

@@ -29,8 +29,8 @@ def check(
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
     from shiftsim.errors import ConfigError, ShiftsimError
-    from shiftsim.runs.edits.avoidable import is_avoidable
-    from shiftsim.runs.edits.edited import EditedStore
+    from shiftsim.runs.avoidable import is_avoidable
+    from shiftsim.runs.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.sim.traffic import traffic_name
 
@@ -77,7 +77,7 @@ def show(
     """What an edit makes of a scenario: words, and a picture of before and after."""
     from shiftsim.errors import beginning
     from shiftsim.report.palette import save_picture
-    from shiftsim.runs.edits.edited import EditedStore
+    from shiftsim.runs.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.view.edited import before_and_after
 
@@ -111,9 +111,9 @@ def import_edits(
     debug: Debug = False,
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
+    from shiftsim.edits.interplan.codes import import_names
     from shiftsim.files import write_text
-    from shiftsim.runs.edits.edited import edits_text, make_edits
-    from shiftsim.runs.edits.interplan.codes import import_names
+    from shiftsim.runs.edited import edits_text, make_edits
 
     table = import_names(names, modifications, window)
     made = make_edits(table, out.stem)
@@ -140,12 +140,12 @@ def sample(
     from collections import Counter
     from functools import lru_cache
 
+    from shiftsim.edits.sampling import KINDS, sample_edits
     from shiftsim.errors import one_of
     from shiftsim.files import write_text
-    from shiftsim.runs.edits.avoidable import grade
-    from shiftsim.runs.edits.edited import edits_text
+    from shiftsim.runs.avoidable import grade
+    from shiftsim.runs.edited import edits_text
     from shiftsim.runs.scenarios import find_split, open_named_store
-    from shiftsim.world.edits.sampling import KINDS, sample_edits
 
     one_of("kind", kind, KINDS)
     opened = open_named_store(store)

@@ -10,7 +10,7 @@ from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json
 from shiftsim.cli.convert import MAX_NAMED, PARTIAL, Store, app, in_parts
 
 if TYPE_CHECKING:
-    from shiftsim.data.open_data.scenes import Reader
+    from shiftsim.data.readers.open_data.scenes import Reader
 
 __all__ = ["app"]  # the commands of `convert`, these among them
 Source = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the data set.")]
@@ -36,7 +36,7 @@ def av2(
     A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
     on when it is started again. That holds for py123d and commonroad as well.
     """
-    from shiftsim.data.open_data.av2 import Av2Reader
+    from shiftsim.data.readers.open_data.av2 import Av2Reader
 
     _convert_scenes(Av2Reader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
 
@@ -57,7 +57,7 @@ def py123d(
 
     FOLDER holds logs/ and, for data sets with one map per city, maps/.
     """
-    from shiftsim.data.open_data.py123d import Py123dReader
+    from shiftsim.data.readers.open_data.py123d import Py123dReader
 
     _convert_scenes(Py123dReader(), folder, store, egos, settings, quiet=quiet, as_json=as_json)
 
@@ -77,7 +77,7 @@ def commonroad(
 
     The files have no recording car: each vehicle that drives is an ego.
     """
-    from shiftsim.data.open_data.commonroad import CommonRoadReader
+    from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
 
     reader = CommonRoadReader()
     _convert_scenes(reader, folder, store, "vehicles", settings, quiet=quiet, as_json=as_json)
@@ -93,7 +93,7 @@ def _convert_scenes(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    from shiftsim.data.open_data.scenes import convert_scenes
+    from shiftsim.data.readers.open_data.scenes import convert_scenes
     from shiftsim.errors import one_of
     from shiftsim.files import store_path
 

@@ -22,7 +22,7 @@ from gymnasium.vector.utils import batch_space, read_from_shared_memory
 
 from shiftsim.env import share
 from shiftsim.env.driving import DrivingEnv
-from shiftsim.env.share import SETS, SPAWN, TERMS, TRUNCATED, Share
+from shiftsim.env.share import SETS, SPAWN, TERMS, TRUNCATED, EnvWorker
 from shiftsim.env.terms import make_terms
 from shiftsim.errors import ConfigError, ShiftsimError
 
@@ -45,11 +45,11 @@ class _Holder(Protocol):
         """Let it go."""
 
 
-class _Here:
+class _Local:
     """A share in this process."""
 
     def __init__(self, *arguments: Any) -> None:
-        self._share, self._answer = Share(*arguments), None
+        self._share, self._answer = EnvWorker(*arguments), None
 
     def ask(self, name: str, *arguments: Any) -> None:
         self._answer = getattr(self._share, name)(*arguments)
@@ -60,7 +60,7 @@ class _Here:
     def close(self) -> None: ...
 
 
-class _Elsewhere:
+class _Remote:
     """A share in a process of its own."""
 
     def __init__(self, settings: bytes, places: range, *others: Any) -> None:
@@ -107,7 +107,7 @@ def _serve(connection: Connection, settings: bytes, *others: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks decides
     with suppress(*_GONE):
         try:
-            own = Share(pickle.loads(settings), *others)
+            own = EnvWorker(pickle.loads(settings), *others)
             connection.send(None)
             while True:
                 name, arguments = connection.recv()
@@ -176,9 +176,9 @@ class DrivingVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         *others, own = (range(int(part[0]), int(part[-1]) + 1) for part in parts)
         sent = _pickled(settings) if others else b""
         for places in others:
-            self._shares.append(_Elsewhere(sent, places, *rest))
+            self._shares.append(_Remote(sent, places, *rest))
         # the last one: it does at once what it is asked for, and meanwhile the others do so too
-        self._shares.append(_Here(settings, own, *rest))
+        self._shares.append(_Local(settings, own, *rest))
         self._answers()
 
     def reset(

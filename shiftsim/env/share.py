@@ -65,7 +65,7 @@ def figures_in(memory: Memory) -> FloatArray:
     return np.frombuffer(memory.figures).reshape(-1, NUM_FIGURES)
 
 
-class Share:
+class EnvWorker:
     """Some of the environments, one after the other."""
 
     def __init__(

@@ -261,7 +261,7 @@ def window(path: Path, low: float, high: float) -> tuple[int, int]:
     return first, max(first, last)
 
 
-class Stretch(NamedTuple):
+class PathInterval(NamedTuple):
     """A stretch of a polyline and the half width of its corridor."""
 
     xy: FloatArray  # (K, 2) vertices of the whole polyline [m]
@@ -282,7 +282,7 @@ def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
 
 
 @kernel
-def side_of(stretch: Stretch, ring: FloatArray) -> int:
+def side_of(stretch: PathInterval, ring: FloatArray) -> int:
     """CLEAR, HIT or OPEN: whether a ring (V, 2) touches the corridor of a stretch.
 
     The stretch ends `without_repeats`; OPEN where it has a single vertex.

@@ -10,7 +10,7 @@ from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
 from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words
-from shiftsim.runs.edits.edited import edit_words
+from shiftsim.runs.edited import edit_words
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 

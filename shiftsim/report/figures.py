@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray
 from shiftsim.report.details import recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
@@ -22,7 +23,6 @@ from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate
 from shiftsim.report.words import LONG
-from shiftsim.world.edits.sampling import GRADES, graded
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}

@@ -11,7 +11,7 @@ from typing import Any
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
-from shiftsim.runs.edits.edited import make_edits
+from shiftsim.runs.edited import make_edits
 from shiftsim.runs.execute import Progress, ended, record
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now

@@ -211,13 +211,17 @@ def _networks_beside(
     if not prepared.shared:
         yield planners, traffic
         return
-    from shiftsim.planners.learned.owner import Ask, Owner, new_address
+    from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
     from shiftsim.runs.workers import beside
 
     known = planners | ({name: traffic} if traffic else {})
     address = new_address()
-    asking = {who: replace(known[who], ask=Ask(address, who)) for who in prepared.shared}
-    with beside(partial(Owner, {who: known[who].make for who in prepared.shared}, address)):
+    asking = {
+        who: replace(known[who], ask=InferenceClient(address, who)) for who in prepared.shared
+    }
+    with beside(
+        partial(InferenceServer, {who: known[who].make for who in prepared.shared}, address)
+    ):
         yield {who: asking.get(who, planners[who]) for who in planners}, asking.get(name, traffic)
 
 

@@ -59,7 +59,7 @@ ROW_GROUP = 1 << 16  # rows
 _CHUNK = 256  # results turned into tables at once
 
 
-class Ended(NamedTuple):
+class TaskRecord(NamedTuple):
     """A task that has ended."""
 
     number: int  # its entry in the journal
@@ -101,12 +101,12 @@ class RunWriter:
         self._number = next_number(self.rollouts)  # of the next file that is linked to
         self._linked: dict[Path, Path] = {}
 
-    def _entries(self) -> Iterator[tuple[Task, Ended]]:
+    def _entries(self) -> Iterator[tuple[Task, TaskRecord]]:
         for number, key, values, has_rollout in self._journal.items():
             place = values["place"] and Place(
                 part_file(self.rollouts, values["place"][0]), *values["place"][1:]
             )
-            yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
+            yield Task(*json.loads(key)), TaskRecord(number, values["status"], place, has_rollout)
 
     def results(self) -> Iterator[TaskResult]:
         """What has ended so far, without the rollouts."""
@@ -123,7 +123,7 @@ class RunWriter:
         """
         place = stored and stored._replace(file=self._link(stored.file))
         number = self._journal.put(*_entry((result, place)), result.rollout)
-        self.ended[result.task] = Ended(number, result.status, place, bool(result.rollout))
+        self.ended[result.task] = TaskRecord(number, result.status, place, bool(result.rollout))
 
     def _link(self, file: Path) -> Path:
         """Have a file of another run in this one, too; returns where it is here."""

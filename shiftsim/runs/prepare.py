@@ -35,7 +35,7 @@ from shiftsim.sim.traffic import PLANNER, BatchTraffic, make_traffic, traffic_na
 
 if TYPE_CHECKING:
     from shiftsim.planners.isolated import Isolated
-    from shiftsim.runs.edits.edited import EditSet
+    from shiftsim.runs.edited import EditSet
 
 RUNS = Path("runs")
 _NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
@@ -73,7 +73,7 @@ class Prepared:
         return tuple(task for batch in self.batches for task in batch.tasks)
 
 
-class Chosen(NamedTuple):
+class Selection(NamedTuple):
     """The scenarios of a run."""
 
     split: str  # name of the split
@@ -237,7 +237,7 @@ def _checkpoints(config: RunConfig, sources: Sequence[Any]) -> dict[str, str]:
     return out
 
 
-def _scenarios(config: RunConfig, store: ScenarioStore, given: "EditSet | None") -> Chosen:
+def _scenarios(config: RunConfig, store: ScenarioStore, given: "EditSet | None") -> Selection:
     known = tuple(store.tokens)
     whole = config.split in ("", store.path.name)
     verdicts, usable = None, known
@@ -275,7 +275,7 @@ def _scenarios(config: RunConfig, store: ScenarioStore, given: "EditSet | None")
     if edits is not None:
         determining["edits"] = edits.digest
     present = [token for token in tokens if token in store_tokens]
-    return Chosen(name, present, missing, len(known) - len(usable), determining, edits, made)
+    return Selection(name, present, missing, len(known) - len(usable), determining, edits, made)
 
 
 def _edits(config: RunConfig, store: ScenarioStore) -> "EditSet | None":

@@ -19,7 +19,7 @@ from shiftsim.runs.config import DEFAULT_STORE
 from shiftsim.runs.results import Run
 
 if TYPE_CHECKING:
-    from shiftsim.runs.edits.edited import EditSet
+    from shiftsim.runs.edited import EditSet
 
 BUNDLE = "store"  # folder below that of the run
 
@@ -80,7 +80,7 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         )
     found.hash = run.manifest["determining"]["store"]
     if edits := run.manifest.get("edits"):
-        from shiftsim.runs.edits.edited import EditedStore, make_edits
+        from shiftsim.runs.edited import EditedStore, make_edits
 
         return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
@@ -92,7 +92,7 @@ def open_edits(name: str, store: ScenarioStore) -> "EditSet":
     Raises:
         ConfigError: There is no such file, or it is wrong.
     """
-    from shiftsim.runs.edits.edited import read_edits
+    from shiftsim.runs.edited import read_edits
 
     path, known = Path(store.path), store.tokens
     edits = read_edits(name, path)

@@ -21,7 +21,7 @@ from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.files import place_of
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
 from shiftsim.metrics.interplan import add_interplan
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
@@ -35,7 +35,7 @@ from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 
 if TYPE_CHECKING:
-    from shiftsim.runs.edits.edited import EditSet
+    from shiftsim.runs.edited import EditSet
 
 T = TypeVar("T")
 
@@ -105,7 +105,7 @@ class TaskRunner:
     noises: Mapping[str, NoiseModel]  # the noise models, by name
     traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
     edits: "EditSet | None" = None  # what makes the scenarios of recorded ones
-    _originals: dict[str, Original] = field(default_factory=dict, init=False)
+    _originals: dict[str, PlannerPrototype] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self._scenarios = Scenarios(self.store, self.edits)
@@ -220,9 +220,9 @@ class TaskRunner:
 
         return PlannedTraffic(self._original(self.config.traffic, planner).copy)
 
-    def _original(self, name: str, planner: RunPlanner) -> Original:
+    def _original(self, name: str, planner: RunPlanner) -> PlannerPrototype:
         if name not in self._originals:
-            self._originals[name] = Original(planner.make)
+            self._originals[name] = PlannerPrototype(planner.make)
         return self._originals[name]
 
     def close(self) -> None:

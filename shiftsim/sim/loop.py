@@ -32,8 +32,8 @@ from shiftsim.sim.plan_check import (
 from shiftsim.sim.planner import (
     BatchPlanner,
     Observation,
+    ObservationBuilder,
     Planner,
-    Sight,
     rollout_rows,
     scene_info,
 )
@@ -116,7 +116,7 @@ class Rollout:
         if scenario.script is not None and scenario.script.has_pedestrians:
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
-        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
+        self._sight = ObservationBuilder(self._time_us, self._ego, self._tracks, self._lights)
         self._is_tracked = planner is not None and setting.controller == "lqr"
         noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples

@@ -254,7 +254,7 @@ def _quick(kind: type[_Frozen]) -> Callable[..., _Frozen]:
 _tracks, _history, _observation = _quick(Tracks), _quick(History), _quick(Observation)
 
 
-class Sight:
+class ObservationBuilder:
     """What a planner is shown of a rollout, in arrays that cannot be written.
 
     They end with the present row, and nothing leads from them to the rows of the rollout that they

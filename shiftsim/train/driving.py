@@ -61,7 +61,7 @@ class Driven(NamedTuple):
     failed: list[str]  # why a scenario was not
 
 
-class Student(Carl):
+class PolicyPlanner(Carl):
     """The network that is trained, as a planner."""
 
     def __init__(self, checkpoint: str) -> None:
@@ -86,7 +86,7 @@ class Student(Carl):
 class Lane:
     """One scenario under way."""
 
-    def __init__(self, start: Start, job: Job, scenario: Any, student: Student) -> None:
+    def __init__(self, start: Start, job: Job, scenario: Any, student: PolicyPlanner) -> None:
         self.start, self.job, self.student = start, job, student
         setting = Setting(start.noise, start.seed)
         self.episode = Episode(scenario, setting, np.zeros(2, np.float32))
@@ -134,7 +134,7 @@ class Driver:
 
     def __init__(self, store: str, checkpoint: str) -> None:
         """`checkpoint` is of the network that drives; any where PDM-Closed does."""
-        self._store, self._student = open_named_store(store), Student(checkpoint)
+        self._store, self._student = open_named_store(store), PolicyPlanner(checkpoint)
 
     def __call__(self, job: Job) -> Driven:
         """Drive all scenarios of a job."""
@@ -153,7 +153,7 @@ class Driver:
         return Driven(states, [episode.scores.get("cls", 0.0) for episode in ended], failed)
 
 
-def _step(lanes: list[Lane], student: Student, failed: list[str]) -> list[Lane]:
+def _step(lanes: list[Lane], student: PolicyPlanner, failed: list[str]) -> list[Lane]:
     """Drive all of them one step; those that can go on."""
     seen = []
     for lane in lanes:

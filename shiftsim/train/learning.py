@@ -83,7 +83,7 @@ def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
 
 
 @dataclass
-class Learned:
+class StepResult:
     """What a step came to."""
 
     loss: float  # mean over the batch
@@ -121,7 +121,7 @@ class Learner:
     def _trained(self) -> list[Tensor]:
         return [v for name, v in self._parameters.items() if not name.startswith("value_head")]
 
-    def learn(self, states: States, batch: Batch) -> Learned:
+    def learn(self, states: States, batch: Batch) -> StepResult:
         """Do one step."""
         laid = lay_out(self.network)
         count = len(batch.indices)
@@ -146,7 +146,7 @@ class Learner:
         self.step += 1
         self._average()
         means = (errors / count).tolist()
-        return Learned(loss / count, (means[0], means[1]))
+        return StepResult(loss / count, (means[0], means[1]))
 
     def _average(self) -> None:
         keep = min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))

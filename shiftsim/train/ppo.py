@@ -66,7 +66,7 @@ class Memory(NamedTuple):
     advantages: Values  # (M,)
 
 
-class Improved(NamedTuple):
+class UpdateResult(NamedTuple):
     """What an update came to."""
 
     loss: float
@@ -176,7 +176,7 @@ class Trainer:
     def __exit__(self, *_: object) -> None:
         self._envs.close()
 
-    def improve(self) -> Improved:
+    def improve(self) -> UpdateResult:
         """Drive one rollout, and learn from it."""
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
@@ -192,7 +192,7 @@ class Trainer:
                 done, clipped = self._learn(memory, rows, critic_only=share < ALONE)
                 loss, cut = loss + done * len(rows), cut + clipped
         self.update += 1
-        return Improved(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
+        return UpdateResult(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
 
     def _drive(self, steps: int) -> Memory:
         """Act in all environments for so many steps."""

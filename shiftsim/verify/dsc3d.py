@@ -11,13 +11,25 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from shiftsim.data.deepplan.recording import Converted, convert_recording
-from shiftsim.data.deepplan.states import rows_between, sample_runs
-from shiftsim.data.deepplan.windows import EGO, ROW_S, ConversionConfig, find_runs, judge_windows
-from shiftsim.data.dsc3d.recording import Annotations, Site, find_map, open_site, read_recording
-from shiftsim.data.opendrive.lanes import LaneKey
-from shiftsim.data.opendrive.map import Origin, build_road_map
-from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.lanes import LaneKey
+from shiftsim.data.maps.opendrive.map import Origin, build_road_map
+from shiftsim.data.maps.opendrive.reading import read_opendrive
+from shiftsim.data.readers.deepplan.recording import Converted, convert_recording
+from shiftsim.data.readers.deepplan.states import rows_between, sample_runs
+from shiftsim.data.readers.deepplan.windows import (
+    EGO,
+    ROW_S,
+    ConversionConfig,
+    find_runs,
+    judge_windows,
+)
+from shiftsim.data.readers.dsc3d.recording import (
+    Annotations,
+    Site,
+    find_map,
+    open_site,
+    read_recording,
+)
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics.route import driven_route

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.opendrive.areas import is_crosswalk, object_origin, object_rings
-from shiftsim.data.opendrive.curves import ReferenceLine, arc_length_deviation
-from shiftsim.data.opendrive.lanes import LaneKey, lane_links, section_borders
-from shiftsim.data.opendrive.reading import read_opendrive
-from shiftsim.data.opendrive.records import Lane, OpenDrive, Road
+from shiftsim.data.maps.opendrive.areas import is_crosswalk, object_origin, object_rings
+from shiftsim.data.maps.opendrive.curves import ReferenceLine, arc_length_deviation
+from shiftsim.data.maps.opendrive.lanes import LaneKey, lane_links, section_borders
+from shiftsim.data.maps.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.records import Lane, OpenDrive, Road
 from shiftsim.kernels import FloatArray
 from shiftsim.verify.files import Compare, Source, read_file, read_json, verify_files
 from shiftsim.verify.report import Report

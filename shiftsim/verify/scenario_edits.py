@@ -11,6 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.edits.density import safe_speed
+from shiftsim.edits.interplan import codes
+from shiftsim.edits.interplan.build import SORTS, Built, assemble, build
+from shiftsim.edits.spec import MANNERS, make_edit
 from shiftsim.errors import ConfigError, DataError, ShiftsimError
 from shiftsim.metrics import compute_metrics
 from shiftsim.metrics.interplan import (
@@ -21,15 +25,11 @@ from shiftsim.metrics.interplan import (
     role_of,
 )
 from shiftsim.planners.idm import Idm
-from shiftsim.runs.edits.interplan import codes
-from shiftsim.runs.edits.interplan.build import SORTS, Built, assemble, build
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.scripted import Scripted, share_walked
 from shiftsim.verify.files import Scenes, Source, read_file
 from shiftsim.verify.report import Report
-from shiftsim.world.edits.density import safe_speed
-from shiftsim.world.edits.spec import MANNERS, make_edit
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 

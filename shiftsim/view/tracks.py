@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.deepplan.recording import Converted
-from shiftsim.data.tracks.columns import KINDS
-from shiftsim.data.tracks.convert import Looked
-from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.data.readers.deepplan.recording import Converted
+from shiftsim.data.readers.tracks.columns import KINDS
+from shiftsim.data.readers.tracks.convert import Inspection
+from shiftsim.data.readers.tracks.reading import TrackTable
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
 from shiftsim.world.map import VectorMap
@@ -20,7 +20,7 @@ _MAX_POINTS = 200_000
 _MAX_EGOS = 40
 
 
-def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> None:
+def save_tracks_picture(path: Path, looked: Inspection, made: Converted | None) -> None:
     """Draw map, tracks and, if scenarios were made, their egos.
 
     Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
@@ -59,7 +59,7 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
     save_picture(figure, path)
 
 
-def _panel(axes: Any, looked: Looked, made: Converted | None, extent: FloatArray) -> None:
+def _panel(axes: Any, looked: Inspection, made: Converted | None, extent: FloatArray) -> None:
     low, high = extent[:2], extent[2:]
     pad = _MARGIN * max(float((high - low).max()), 10.0)
     _draw_road(axes, looked.road, np.concatenate([low - pad, high + pad]))

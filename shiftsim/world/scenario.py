@@ -12,7 +12,7 @@ import numpy as np
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray, IntArray, readonly
 from shiftsim.world.map import VectorMap
-from shiftsim.world.script import Script
+from shiftsim.world.script import RolloutEvents
 from shiftsim.world.state import Tracks, TrafficLights
 
 FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks
@@ -76,7 +76,7 @@ class Scenario:
     mission_goal: FloatArray | None
     mapping: tuple[float, float, float]
     is_short: bool = False
-    script: Script | None = None
+    script: RolloutEvents | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_us", "ego", "iteration_rows", "mission_goal"):
@@ -130,7 +130,7 @@ class Scenario:
             print(parked.token, parked.script.words)
             ```
         """
-        from shiftsim.world.edits.apply import edit_scenario
+        from shiftsim.edits.apply import edit_scenario
 
         return edit_scenario(self, name, **tables)
 

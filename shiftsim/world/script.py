@@ -14,7 +14,7 @@ OFF, ASSERTIVE, WARY, MIXED, DEFAULT = -1, 0, 1, 2, 3  # how reactive agents tre
 
 
 @dataclass(frozen=True, slots=True)
-class Walker:
+class ScriptedPedestrian:
     """A pedestrian that sets off once, and stands at the end of its way.
 
     Attributes:
@@ -56,7 +56,7 @@ class Crossing:
 
 
 @dataclass(frozen=True, slots=True)
-class Finish:
+class TerminationCondition:
     """A line that ends a rollout: the ego is beyond `progress` on a path.
 
     Attributes:
@@ -78,7 +78,7 @@ class Finish:
 
 
 @dataclass(frozen=True, slots=True)
-class Script:
+class RolloutEvents:
     """What an edit asks of a rollout.
 
     Attributes:
@@ -106,8 +106,8 @@ class Script:
     tokens: tuple[str, ...]
     behaviors: IntArray
     manner: int = OFF
-    walkers: tuple[Walker, ...] = ()
-    finish: Finish | None = None
+    walkers: tuple[ScriptedPedestrian, ...] = ()
+    finish: TerminationCondition | None = None
     seed: int = 0
     profile: str = "shiftsim"
     crossings: tuple[Crossing, ...] = ()

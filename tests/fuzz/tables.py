@@ -75,7 +75,7 @@ def read_track_table(folder: Path) -> Any:
     """As `shiftsim convert tracks` does it."""
     from fuzz.targets import read_store
 
-    from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
+    from shiftsim.data.readers.tracks.convert import convert_tracks, look_at, tracks_config
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml
 

@@ -203,8 +203,8 @@ def _roads(folder: Path) -> None:
 
 
 def _read_opendrive(folder: Path) -> Any:
-    from shiftsim.data.opendrive.map import build_road_map
-    from shiftsim.data.opendrive.reading import read_opendrive
+    from shiftsim.data.maps.opendrive.map import build_road_map
+    from shiftsim.data.maps.opendrive.reading import read_opendrive
 
     od = read_opendrive(folder / "map.xodr")
     road = build_road_map(od, name="x")[0]
@@ -259,9 +259,9 @@ def _sites(folder: Path) -> None:
 
 
 def _read_site(folder: Path) -> Any:
-    from shiftsim.data.deepplan.convert import convert_dsc3d
-    from shiftsim.data.deepplan.windows import ConversionConfig
-    from shiftsim.data.dsc3d.recording import open_site, read_recording
+    from shiftsim.data.readers.deepplan.convert import convert_dsc3d
+    from shiftsim.data.readers.deepplan.windows import ConversionConfig
+    from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
 
     site = open_site(folder)
     recordings = [read_recording(site, name) for name in site.recordings]
@@ -284,10 +284,10 @@ def _py123d(folder: Path) -> None:
 
 
 def _read_scenes(name: str, folder: Path) -> Any:
-    from shiftsim.data.open_data.av2 import Av2Reader
-    from shiftsim.data.open_data.commonroad import CommonRoadReader
-    from shiftsim.data.open_data.py123d import Py123dReader
-    from shiftsim.data.open_data.scenes import convert_scene
+    from shiftsim.data.readers.open_data.av2 import Av2Reader
+    from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
+    from shiftsim.data.readers.open_data.py123d import Py123dReader
+    from shiftsim.data.readers.open_data.scenes import convert_scene
 
     reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name]()
     made = [convert_scene(reader.read(path)) for path in reader.find(folder)]

@@ -13,8 +13,8 @@ from hypothesis import given
 from strategies import seeds
 
 from shiftsim.data.demo.scenes import demo_sites
-from shiftsim.data.opendrive.map import build_road_map
-from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.errors import MapError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.metrics.drivable_area import DrivableArea, judge, measure

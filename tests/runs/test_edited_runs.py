@@ -7,11 +7,11 @@ from commands import call
 
 import shiftsim
 from shiftsim.benchmarks import published
+from shiftsim.edits.interplan.codes import import_names
 from shiftsim.errors import ConfigError
 from shiftsim.report.data_tables import benchmark_comparison, own_statistics
 from shiftsim.report.groups import read_groups
-from shiftsim.runs.edits.edited import EditedStore, edits_text, make_edits
-from shiftsim.runs.edits.interplan.codes import import_names
+from shiftsim.runs.edited import EditedStore, edits_text, make_edits
 from shiftsim.runs.scenarios import open_run_store
 
 EDITS = """

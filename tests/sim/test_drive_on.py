@@ -11,7 +11,7 @@ from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.sim.loop import Rollout, drive, simulate
 from shiftsim.sim.traffic import LogReplay
-from shiftsim.world.script import Script
+from shiftsim.world.script import RolloutEvents
 from shiftsim.world.state import AgentKind
 
 
@@ -94,7 +94,7 @@ def test_recorded_plans_are_driven_at_once_as_far_as_they_reach(noise, future, m
 
 
 def edited():
-    script = Script("base", "edit", "digest", (), (), np.zeros(1, np.int64))
+    script = RolloutEvents("base", "edit", "digest", (), (), np.zeros(1, np.int64))
     return replace(scene(), script=script)
 
 

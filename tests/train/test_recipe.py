@@ -14,7 +14,7 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, Start, Student
+from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start
 from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
 from shiftsim.train.settings import Settings
@@ -96,7 +96,7 @@ def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypat
 
     tokens = open_store(toy).tokens
     driver = Driver(str(toy), "deterministic:base")
-    monkeypatch.setattr(Student, "infer", veering)
+    monkeypatch.setattr(PolicyPlanner, "infer", veering)
     assert 0 < sum(urgent(0)) <= 2 * 15
     assert not any(urgent(-1))
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario, standing_tracks
 
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.density import safe_speed
+from shiftsim.edits.places import ego_path
+from shiftsim.edits.spec import At, make_edit
 from shiftsim.errors import ConfigError
 from shiftsim.sim.loop import simulate
-from shiftsim.world.edits.apply import apply_edit
-from shiftsim.world.edits.density import safe_speed
-from shiftsim.world.edits.places import ego_path
-from shiftsim.world.edits.spec import At, make_edit
 from shiftsim.world.scenario import duration_class
 from shiftsim.world.script import MIXED, STOPPED
 from shiftsim.world.state import VX, AgentKind, Command, LightStatus, center_poses

@@ -7,13 +7,13 @@ from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
-    Others,
+    Obstacles,
     first_faults,
     hits,
     is_at_fault,
     project_box,
 )
-from shiftsim.planners.proposals.places import Places
+from shiftsim.planners.proposals.places import ProposalStates
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.state import VX
@@ -22,7 +22,7 @@ TTC_STEPS = (2, 4, 6, 8)  # how far ahead a pose is projected
 
 
 def collisions(
-    places: Places, others: Others, near: IntArray, first_red: FloatArray
+    places: ProposalStates, others: Obstacles, near: IntArray, first_red: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of `others` that are `near`, red lights (P,) included.
 
@@ -53,7 +53,7 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 
 @kernel
-def times_to_collision(places: Places, others: Others, near: IntArray) -> FloatArray:
+def times_to_collision(places: ProposalStates, others: Obstacles, near: IntArray) -> FloatArray:
     """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
 
     Arguments as for `collisions`.

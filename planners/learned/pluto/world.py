@@ -7,7 +7,7 @@ import numpy as np
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners, meets_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
-from shiftsim.planners.proposals.contacts import Others, touches_boxes
+from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.tracker import SCORED
 from shiftsim.planners.routes.lights import red_lanes
 from shiftsim.sim.planner import Observation
@@ -46,7 +46,7 @@ class World(NamedTuple):
     """Everything a proposal can hit."""
 
     # static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored
-    others: Others
+    others: Obstacles
     lights: IntArray  # connectors of the route whose light is red
 
 
@@ -102,7 +102,7 @@ def make_world(
     centers = np.ascontiguousarray(poses[..., :2])
     boxes = np.empty((*poses.shape[:2], 4, 2))
     _place(poses, sizes, boxes)
-    others = Others(
+    others = Obstacles(
         boxes=boxes,
         centers=centers,
         centroids=centers,

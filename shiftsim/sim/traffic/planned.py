@@ -10,7 +10,7 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.plan_check import find_fault, plain
-from shiftsim.sim.planner import Planner, SceneInfo, Sight, rollout_rows
+from shiftsim.sim.planner import ObservationBuilder, Planner, SceneInfo, rollout_rows
 from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, choose_lane, lanes_of, next_lane
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -37,7 +37,7 @@ class _Driver:
     planner: Planner
     ego: FloatArray  # (B, 11) its states, by row of the rollout
     tracks: Tracks  # what it sees: the ego in its own place
-    sight: Sight
+    sight: ObservationBuilder
 
 
 class PlannedTraffic:
@@ -147,7 +147,9 @@ class PlannedTraffic:
                 log_name=scenario.log_name,
             )
         )
-        driver = _Driver(track, planner, ego, seen, Sight(self._time_us, ego, seen, self._lights))
+        driver = _Driver(
+            track, planner, ego, seen, ObservationBuilder(self._time_us, ego, seen, self._lights)
+        )
         for past in range(row + 1):
             self._show(driver, tracks, past)
         return driver

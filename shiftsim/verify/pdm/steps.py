@@ -14,7 +14,7 @@ from shiftsim.planners.pdm.planner import PdmClosed, Seen
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
 from shiftsim.planners.pdm.step import Step, choose
 from shiftsim.planners.proposals.areas import areas_of
-from shiftsim.planners.proposals.contacts import Others
+from shiftsim.planners.proposals.contacts import Obstacles
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS
 from shiftsim.planners.routes.lights import red_lights
@@ -136,7 +136,7 @@ def _settled(where: str, seen: Seen, step: Step, theirs: Source) -> Scores:
     return ours._replace(total=factor * weigh(ours.progress, ours.ttc, ours.comfort, DEFAULT))
 
 
-def _in_line(states: FloatArray, others: Others) -> BoolArray:
+def _in_line(states: FloatArray, others: Obstacles) -> BoolArray:
     """(N,) what is exactly ahead of the ego or behind it, from any of its states (P, T, 11)."""
     cos, sin = np.cos(states[..., HEADING, None]), np.sin(states[..., HEADING, None])
     out, times = np.zeros(len(others.radii), np.bool_), np.arange(states.shape[1])

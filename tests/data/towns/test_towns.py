@@ -11,8 +11,8 @@ from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.paths import arc_at
 from shiftsim.data.demo.scenes import demo_sites
 from shiftsim.data.demo.traffic import DT
-from shiftsim.data.opendrive.map import build_road_map
-from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter

@@ -13,7 +13,14 @@ import pytest
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.planners.learned import owner
-from shiftsim.planners.learned.owner import LARGE, Ask, Owner, new_address, receive, send
+from shiftsim.planners.learned.owner import (
+    LARGE,
+    InferenceClient,
+    InferenceServer,
+    new_address,
+    receive,
+    send,
+)
 
 pytestmark = pytest.mark.skipif(
     sys.platform not in ("linux", "win32"), reason="devices of torch's CUDA are there only"
@@ -52,8 +59,12 @@ class Slowly:
 def asking():
     address = new_address()
     slowly = Slowly()
-    held = Owner({"doubling": Doubling, "slowly": lambda: slowly}, address)
-    return lambda name, key=address.key: Ask(address._replace(key=key), name), held, slowly
+    held = InferenceServer({"doubling": Doubling, "slowly": lambda: slowly}, address)
+    return (
+        lambda name, key=address.key: InferenceClient(address._replace(key=key), name),
+        held,
+        slowly,
+    )
 
 
 @pytest.mark.parametrize("size", [0, LARGE // 8 - 1, LARGE // 8, 10 * LARGE])
@@ -118,7 +129,7 @@ def test_what_travels_has_no_connection_and_makes_its_own(asking):
 
 def test_without_an_owner_it_waits_once_and_says_so(monkeypatch):
     monkeypatch.setattr(owner, "PATIENCE", 0.3)
-    ask = Ask(new_address(), "plantf")
+    ask = InferenceClient(new_address(), "plantf")
     took = []
     for _ in range(2):
         began = time.monotonic()

@@ -1,0 +1,252 @@
+"""OpenDRIVE to the semantic map of nuPlan's kind."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import TypeVar
+
+import numpy as np
+import shapely
+
+from shiftsim.data.maps.builder import (
+    LIGHT_KIND,
+    PASS_THROUGH,
+    STOP_SIGN_KIND,
+    MapBuilder,
+    ShapedConnector,
+    ShapedLane,
+    block_pairs,
+)
+from shiftsim.data.maps.opendrive import areas, control
+from shiftsim.data.maps.opendrive.check import check_map
+from shiftsim.data.maps.opendrive.control import LIGHT, STOP, YIELD
+from shiftsim.data.maps.opendrive.graph import LaneGraph, Piece, build_lane_graph
+from shiftsim.data.maps.opendrive.lanes import LaneKey
+from shiftsim.data.maps.opendrive.overlaps import (
+    Levels,
+    cut_crossings,
+    overlapping,
+    subtract_overlaps,
+)
+from shiftsim.data.maps.opendrive.preparation import prepare
+from shiftsim.data.maps.opendrive.records import OpenDrive
+from shiftsim.data.maps.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
+
+STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
+_Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where an edge of the map comes from: its id, and one piece of one OpenDRIVE lane."""
+
+    id: str
+    key: LaneKey
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
+class MapReport:
+    """What the conversion did."""
+
+    warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
+    origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
+    checks: dict[str, bool] = field(default_factory=dict)  # self-checks: whether the map passes
+    figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
+
+
+def build_road_map(
+    od: OpenDrive,
+    *,
+    name: str,
+    offset: tuple[float, float] = (0.0, 0.0),
+    epsg: int = 0,
+    country: str = "DE",
+) -> tuple[VectorMap, MapReport]:
+    """The semantic map of an OpenDRIVE file.
+
+    Args:
+        od: The file.
+        name: Name of the map.
+        offset: Added to all coordinates: UTM position of the local origin [m].
+        epsg: Code of the coordinate system that results; 0 for a local frame.
+        country: Whose default speed limits hold where the file has none.
+
+    Returns:
+        The map, without lanes where the file has none that cars may use, and the report.
+
+    Raises:
+        MapError: The file has more road than one map can hold.
+    """
+    warnings = Counter(od.warnings)
+    placed = prepare(od, warnings)
+    graph = build_lane_graph(placed, warnings)
+    return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
+
+
+def _chains(graph: LaneGraph) -> list[list[Piece]]:
+    return [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+
+
+def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
+    return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
+
+
+class _Maker:
+    def __init__(
+        self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
+    ) -> None:
+        self.od, self.warnings, self.country = od, warnings, country
+        self.shapes = _shapes_of(od, graph)
+        self.graph, crossings = cut_crossings(od, graph, self.shapes)
+        if crossings:
+            warnings["lanes that cross without a junction, made an intersection"] += crossings
+            self.shapes = _shapes_of(od, self.graph)
+        self.controls = control.connector_controls(od, self.graph)
+
+    def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
+        lanes, stacked = self._lanes()
+        polygons = [lane.polygon for lane in lanes]
+        stops = control.stop_lines(self.od, self.graph, self.shapes, self.controls, polygons)
+        connectors = self._connectors([lane.line for lane in lanes], stops)
+        blocks = [lane.block for lane in lanes]
+        stacked_blocks = {
+            (min(blocks[i], blocks[j]), max(blocks[i], blocks[j])) for i, j in stacked
+        }
+        parts = MapBuilder(
+            lanes,
+            connectors,
+            groups=self._groups([connector.polygon for connector in connectors]),
+            num_stops=len(stops),
+            stacked=stacked_blocks,
+        )
+        edges, block_specs = parts.edges(), parts.blocks()
+        layers = self._areas(parts, [edge.polygon for edge in edges])
+        layers["stop_polygons"] = parts.stop_polygons(
+            (line.polygon, STOP_KINDS[line.control]) for line in stops
+        )
+        vector_map = build_map(
+            name,
+            edges=_moved(edges, offset),
+            blocks=_moved(block_specs, offset),
+            epsg=epsg,
+            **{layer: _moved(specs, offset) for layer, specs in layers.items()},
+        )
+        levels = {(parts.lane_ids[i], parts.lane_ids[j]) for i, j in stacked}
+        levels |= {(parts.block_ids[a], parts.block_ids[b]) for a, b in stacked_blocks}
+        checks, figures = check_map(vector_map, levels)
+        origins = tuple(self._origins([*parts.lane_ids, *parts.connector_ids]))
+        return vector_map, MapReport(dict(self.warnings), origins, checks, figures)
+
+    def _lanes(self) -> tuple[list[ShapedLane], set[tuple[int, int]]]:
+        """All lanes, and the pairs of them that lie on different levels."""
+        lanes = self.graph.lanes
+        borders = [self.shapes.joined_borders(lane.pieces) for lane in lanes]
+        polygons = [lane_polygon(*pair) for pair in borders]
+        levels = Levels(self.od, self.shapes, [lane.pieces for lane in lanes], polygons)
+        stacked = {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
+        lengths = [sum(piece.length for piece in lane.pieces) for lane in lanes]
+        polygons, overlaps = subtract_overlaps(polygons, lengths, stacked)
+        if overlaps:
+            self.warnings["overlap of two lanes, taken from the longer one"] += overlaps
+        shaped = [
+            ShapedLane(
+                *borders[number],
+                self.shapes.baseline(lane.pieces),
+                polygons[number],
+                control.speed_limit(self.od, lane.pieces, self.country),
+                lane.block,
+                lane.index,
+                number > 0 and _touch(lanes[number - 1].pieces[0], lane.pieces[0]),
+            )
+            for number, lane in enumerate(lanes)
+        ]
+        return shaped, stacked
+
+    def _connectors(
+        self, lines: Sequence[FloatArray], stops: Sequence[control.StopLine]
+    ) -> list[ShapedConnector]:
+        """All connectors; `lines` are the baselines of the lanes."""
+        lanes, out = self.graph.lanes, []
+        for connector, controls in zip(self.graph.connectors, self.controls, strict=True):
+            left, right = self.shapes.joined_borders(connector.pieces)
+            before = self.shapes.widths(lanes[connector.source].pieces)[1]
+            after = self.shapes.widths(lanes[connector.target].pieces)[0]
+            left, right = widen(left, right, min(before, after))
+            source, target = lines[connector.source], lines[connector.target]
+            line = self.shapes.baseline(connector.pieces, source[-1], target[0])
+            here = [i for i, stop in enumerate(stops) if stop.lane == connector.source]
+            out.append(
+                ShapedConnector(
+                    left,
+                    right,
+                    bend_ends(line, source, target),
+                    lane_polygon(left, right),
+                    control.speed_limit(self.od, connector.pieces, self.country),
+                    connector.source,
+                    connector.target,
+                    has_light=bool(connector.junctions) and LIGHT in controls,
+                    stops=here if connector.junctions else (),
+                )
+            )
+        return out
+
+    def _groups(self, polygons: Sequence[shapely.Polygon]) -> IntArray:
+        connectors = self.graph.connectors
+        levels = Levels(self.od, self.shapes, [c.pieces for c in connectors], polygons)
+        pairs = block_pairs(self.graph.lanes, connectors)
+        return areas.group_connectors(connectors, polygons, pairs, levels.are_stacked)
+
+    def _kind(self, numbers: Sequence[int]) -> int:
+        """Kind of the intersection of some connectors."""
+        found = frozenset(control for i in numbers for control in self.controls[i])
+        if not any(self.graph.connectors[i].junctions for i in numbers):
+            return PASS_THROUGH
+        return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
+
+    def _areas(
+        self, parts: MapBuilder, edges: Sequence[shapely.Polygon]
+    ) -> dict[str, list[AreaSpec]]:
+        """Layers without links; `edges` are the areas of all lanes and connectors."""
+        intersections = parts.intersections(self._kind)
+        other = areas.lane_areas(self.od, self.shapes)
+        spaces = areas.parking_spaces(self.od, self.shapes)
+        car_parks = areas.merge_areas([*other.parking, *spaces], 0.5)
+        pieces = [piece for piece in self.graph.dropped if piece.length > 0.01]
+        dropped = [lane_polygon(*self.shapes.borders(piece)) for piece in pieces]
+        inner = [spec.polygon for spec in intersections if spec.kind != PASS_THROUGH]
+        drivable = areas.drivable_tiles([*edges, *inner, *other.paved, *car_parks, *dropped])
+        return {
+            "intersections": intersections,
+            "crosswalks": parts.areas(areas.crosswalk_polygons(self.od, self.shapes)),
+            "walkways": parts.areas(areas.merge_areas(other.walked, 0.05)),
+            "car_parks": parts.areas(car_parks),
+            "drivable_areas": parts.areas(drivable),
+        }
+
+    def _origins(self, ids: Sequence[str]) -> Iterator[Origin]:
+        for edge_id, pieces in zip(ids, _chains(self.graph), strict=True):
+            for piece in pieces:
+                yield Origin(edge_id, piece.key, piece.begin, piece.end)
+
+
+def _touch(left: Piece, right: Piece) -> bool:
+    """Whether no lane of another use lies between two lanes of one section."""
+    one, other = left.key.lane, right.key.lane
+    return abs(one - other) - (1 if one * other < 0 else 0) == 1
+
+
+def _moved(specs: Iterable[_Spec], offset: FloatArray) -> list[_Spec]:
+    """Edges, blocks or areas at their place in the world."""
+    out = []
+    for spec in specs:
+        lines = {name: getattr(spec, name, None) for name in ("baseline", "left", "right")}
+        shapes = {name: line + offset for name, line in lines.items() if line is not None}
+        polygon = shapely.transform(spec.polygon, lambda xy: xy + offset)
+        out.append(replace(spec, polygon=polygon, **shapes))
+    return out
