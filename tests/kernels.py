@@ -53,7 +53,7 @@ def compile_share(name: str) -> None:
 @cache
 def scene() -> Scenario:
     """A slow ego close behind a car, a cone on the lane, another car, in time for every model."""
-    scenario = cruise_scenario(speed=4.0, iterations=6, start=(205.0, 0.0, 0.0))
+    scenario = cruise_scenario(speed=4.0, iterations=12, start=(205.0, 0.0, 0.0))
     poses = np.array([[217.0, 0.0, 0.0], [240.0, 0.2, 0.0], [225.0, 3.5, 0.1]])
     kinds = [AgentKind.VEHICLE, AgentKind.TRAFFIC_CONE, AgentKind.VEHICLE]
     return replace(scenario, tracks=standing_tracks(len(scenario.time_us), poses, kinds))

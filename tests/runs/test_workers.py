@@ -8,7 +8,6 @@ from operator import itemgetter
 from pathlib import Path
 
 import pytest
-from numba.core import event
 
 from shiftsim.errors import ConfigError
 from shiftsim.runs.workers import map_unordered
@@ -129,20 +128,26 @@ def test_a_task_that_takes_too_long_is_ended_and_named(workers):
 
 
 class Compiles:
+    def __init__(self, path):
+        self.path = path
+
     def __call__(self, task):
-        with event.trigger_event("numba:compile"):
-            with event.trigger_event("numba:compile"):
-                time.sleep(1.0)
+        for _ in range(3):
             time.sleep(0.5)
+            self.path.touch()
         time.sleep(60.0 if task == 13 else 0.0)
         return task
 
 
 @pytest.mark.parametrize("alone", [0, 2])
-def test_the_clock_stands_still_while_kernels_are_compiled(alone, monkeypatch):
+def test_a_task_that_compiles_is_given_more_time(alone, tmp_path, monkeypatch):
     monkeypatch.setattr("shiftsim.runs.workers._TIME_TO_LOAD", 0.0)
-    tasks = map_unordered(Compiles, [13, 1], workers=1, alone=alone, limit=0.8)
-    outcomes = {o.task: o for o in tasks}
+    monkeypatch.setattr("shiftsim.runs.workers._TIME_TO_COMPILE", 1.0)
+    code = tmp_path / "kernel.nbc"
+    code.touch()
+    monkeypatch.setattr("shiftsim.runs.workers.machine_code", lambda: [code])
+    make = partial(Compiles, code)
+    outcomes = {o.task: o for o in map_unordered(make, [13, 1], workers=1, alone=alone, limit=0.8)}
     assert outcomes[1].result == 1
     assert outcomes[13].is_late
 
