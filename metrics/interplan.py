@@ -17,7 +17,7 @@ from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import RolloutEvents
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.state import center_poses
 
 LANES = "lane_changes_to_goal"

@@ -29,7 +29,7 @@ from shiftsim.edits.spec import (
 )
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.script import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
+from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
 from shiftsim.world.state import VX, AgentKind, LightStatus, TrafficLights
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class _Editor:
             behaviors=draft.behaviors,
             manner=MANNERS.index(edit.agents) if edit.agents else OFF,
             walkers=walkers,
-            finish=draft.finish,
+            termination=draft.termination,
             seed=self.seed,
         )
         return replace(

@@ -19,7 +19,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray
 from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
 from shiftsim.world.map import VectorMap
-from shiftsim.world.script import FOLLOW
+from shiftsim.world.events import FOLLOW
 from shiftsim.world.state import VX, center_poses
 
 NEAR_EGO = 10.0  # m, a vehicle nearer to the ego in its lane becomes the ego

@@ -10,7 +10,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.world.script import FOLLOW, STOPPED, ScriptedPedestrian, TerminationCondition
+from shiftsim.world.events import FOLLOW, STOPPED, ScriptedPedestrian, TerminationCondition
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -36,7 +36,7 @@ class ScenarioBuilder:
     walkers: list[tuple[str, ScriptedPedestrian]] = field(
         default_factory=list
     )  # with the token of their track
-    finish: TerminationCondition | None = None
+    termination: TerminationCondition | None = None
     waiting: list[tuple[Tracks, Sequence[int]]] = field(default_factory=list)  # new, as `known`
 
     @property

@@ -16,7 +16,7 @@ from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.kernels import FloatArray
 from shiftsim.world.lanes import find_start, pose_on_line
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import TerminationCondition
+from shiftsim.world.events import TerminationCondition
 from shiftsim.world.state import NUM_STATE, VX, center_poses, rear_poses
 
 TURNS = {"left": math.pi / 2.0, "straight": 0.0, "right": -math.pi / 2.0}  # rad
@@ -62,7 +62,7 @@ def reroute(draft: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     ids = [road.blocks.ids[block] for block in dict.fromkeys(road.block_of[lanes].tolist())]
     draft.change(ego=_drive(draft, line, total), route=tuple(ids), mission_goal=goal)
     if ends:
-        draft.finish = TerminationCondition(line, total - TOLERANCE, int(road.block_of[lanes[-1]]))
+        draft.termination = TerminationCondition(line, total - TOLERANCE, int(road.block_of[lanes[-1]]))
 
 
 def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[int]:

@@ -186,7 +186,7 @@ class TaskRunner:
             scores=scores,
             metrics=metrics,
             rollout=stored,
-            doubt=rollout.doubt,
+            doubt=rollout.warning,
         )
 
     def _setting(self, task: Task) -> Setting:

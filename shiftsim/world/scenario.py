@@ -12,7 +12,7 @@ import numpy as np
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray, IntArray, readonly
 from shiftsim.world.map import VectorMap
-from shiftsim.world.script import RolloutEvents
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.state import Tracks, TrafficLights
 
 FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks

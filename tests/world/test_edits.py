@@ -13,7 +13,7 @@ from shiftsim.edits.spec import At, make_edit
 from shiftsim.errors import ConfigError
 from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import duration_class
-from shiftsim.world.script import MIXED, STOPPED
+from shiftsim.world.events import MIXED, STOPPED
 from shiftsim.world.state import VX, AgentKind, Command, LightStatus, center_poses
 
 

@@ -27,7 +27,7 @@ from shiftsim.sim.traffic.scripted import PEDESTRIAN_SIZE
 from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import (
+from shiftsim.world.events import (
     CAUTIOUS,
     FOLLOW,
     LOGGED,
@@ -384,7 +384,7 @@ def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
         behaviors=draft.behaviors,
         manner=MANNERS.index(_manner(built, edit)),
         crossings=tuple(replace(w, track=places[w.token]) for w in built.pedestrians),
-        finish=TerminationCondition(plan.line[:, :2], plan.end),
+        termination=TerminationCondition(plan.line[:, :2], plan.end),
         profile="interplan",
         sorts=sorts,
         obstacles=np.array(obstacles).reshape(-1, 2),

@@ -49,7 +49,7 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
     """
     time_us = rows["time_us"].to_numpy()
     samples = scenario.iteration_rows[:-1]
-    if scenario.script is not None and scenario.script.finish is not None:
+    if scenario.script is not None and scenario.script.termination is not None:
         samples = samples[: len(time_us)]  # it may have ended before its time
     if not np.array_equal(time_us, scenario.time_us[samples]):
         raise DataError(

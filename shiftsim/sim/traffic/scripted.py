@@ -7,7 +7,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.sim.traffic import Traffic
 from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import ScriptedPedestrian
+from shiftsim.world.events import ScriptedPedestrian
 from shiftsim.world.state import Tracks, center_poses
 
 PEDESTRIAN_SIZE = (0.9000033778444835, 0.7913900336773054)  # length, width of interPlan's [m]

@@ -15,7 +15,7 @@ from shiftsim.sim.traffic.idm.scene import Courtesy, Scene
 from shiftsim.sim.traffic.idm.shapes import bound_ring, ring_gap
 from shiftsim.world.layers import contains
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import ASSERTIVE, DEFAULT, MIXED, OFF
+from shiftsim.world.events import ASSERTIVE, DEFAULT, MIXED, OFF
 from shiftsim.world.state import PACIFICA
 
 LOOK_AHEAD = 3.0  # s, at constant velocity

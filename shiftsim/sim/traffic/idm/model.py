@@ -37,7 +37,7 @@ from shiftsim.sim.traffic.lights import light_flags
 from shiftsim.world.lanes import find_start
 from shiftsim.world.map import NONE
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import CAUTIOUS, LOGGED, OFF
+from shiftsim.world.events import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
 
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])

@@ -98,7 +98,7 @@ class Scratch(NamedTuple):
 class Courtesy(NamedTuple):
     """What agents make of where the ego will be; A agents."""
 
-    manner: int  # as in `world.script`; OFF for nuPlan's agents, which do not look ahead
+    manner: int  # as in `world.events`; OFF for nuPlan's agents, which do not look ahead
     cautious: BoolArray  # (A,) to whom the ego always stands
     edges: Polygons  # areas of the lanes and connectors
     block_of: IntArray  # (E,) block of an edge

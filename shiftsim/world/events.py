@@ -91,7 +91,7 @@ class RolloutEvents:
         manner: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as interPlan's
             do, OFF as nuPlan's do.
         walkers: Pedestrians that move by themselves.
-        finish: Where a rollout ends before its time; None where it does not.
+        termination: Where a rollout ends before its time; None where it does not.
         seed: Of what is drawn during a rollout.
         profile: `shiftsim`, or `interplan` where its oddities are kept.
         crossings: Pedestrians of interPlan.
@@ -107,7 +107,7 @@ class RolloutEvents:
     behaviors: IntArray
     manner: int = OFF
     walkers: tuple[ScriptedPedestrian, ...] = ()
-    finish: TerminationCondition | None = None
+    termination: TerminationCondition | None = None
     seed: int = 0
     profile: str = "shiftsim"
     crossings: tuple[Crossing, ...] = ()
