@@ -6,13 +6,11 @@ Order: window, remove, move, slow, stop, reroute, density, spawn, block_lane, wa
 import random
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shiftsim.edits.builder import ScenarioBuilder, begin
 from shiftsim.edits.density import fill_lanes
-from shiftsim.edits.draft import ScenarioBuilder, begin
-from shiftsim.edits.movers import add_mover
 from shiftsim.edits.places import EgoPath, ego_path, require_on_map
 from shiftsim.edits.route import reroute
 from shiftsim.edits.spec import (
@@ -25,15 +23,12 @@ from shiftsim.edits.spec import (
     Slow,
     Spawn,
     digest_of,
-    make_edit,
 )
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VX, AgentKind, LightStatus, TrafficLights
-
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),
@@ -52,22 +47,23 @@ def edited_id(token: str, edit: Edit) -> str:
     return f"{token}-{edit.name}"
 
 
-def apply_edit(scenario: "Scenario", edit: Edit) -> "Scenario":
+def apply_edit(scenario: Scenario, edit: Edit) -> Scenario:
     """The scenario that an edit makes of a recorded one.
 
     Raises:
-        ConfigError: It cannot be applied; the message names scenario, edit and reason.
+        ConfigError: It cannot be applied, or is a code of interPlan, which `interplan.build` makes;
+            the message names scenario, edit and reason.
     """
     try:
+        if edit.code:
+            raise ConfigError(
+                f"the code {edit.code!r} is not applied here",
+                hint='write it into a file with profile = "interplan", and run that',
+            )
         return _Editor(scenario, edit).result()
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
-
-
-def edit_scenario(scenario: "Scenario", name: str = "edited", **tables: object) -> "Scenario":
-    """As `Scenario.edited`."""
-    return apply_edit(scenario, make_edit({"name": name, **tables}, "edited"))
 
 
 def seed_of(edit: Edit, token: str) -> int:
@@ -78,7 +74,7 @@ def seed_of(edit: Edit, token: str) -> int:
 
 
 class _Editor:
-    def __init__(self, scenario: "Scenario", edit: Edit) -> None:
+    def __init__(self, scenario: Scenario, edit: Edit) -> None:
         self.edit, self.base = edit, scenario
         self.draft = begin(scenario)
         self.seed = seed_of(edit, scenario.token)
@@ -93,7 +89,7 @@ class _Editor:
             self._path = ego_path(self.base)
         return self._path
 
-    def result(self) -> "Scenario":
+    def result(self) -> Scenario:
         edit, draft = self.edit, self.draft
         if edit.window_s is not None:
             _set_window(draft, edit.window_s)
@@ -118,10 +114,12 @@ class _Editor:
             draft.change(map=replace(road, speed_limits=road.speed_limits * edit.speed.limit))
         return self._finished()
 
-    def _finished(self) -> "Scenario":
+    def _finished(self) -> Scenario:
         edit, draft = self.edit, self.draft
         places = {token: i for i, token in enumerate(draft.tracks.tokens)}
-        walkers = tuple(replace(walker, track=places[token]) for token, walker in draft.walkers)
+        pedestrians = tuple(
+            replace(pedestrian, track=places[token]) for token, pedestrian in draft.pedestrians
+        )
         script = RolloutEvents(
             base=self.base.token,
             name=edit.name,
@@ -129,8 +127,8 @@ class _Editor:
             words=edit.words,
             tokens=tuple(token for token in draft.touched if token in places),
             behaviors=draft.behaviors,
-            manner=MANNERS.index(edit.agents) if edit.agents else OFF,
-            walkers=walkers,
+            yielding=MANNERS.index(edit.agents) if edit.agents else OFF,
+            pedestrians=pedestrians,
             termination=draft.termination,
             seed=self.seed,
         )
@@ -206,7 +204,7 @@ class _Editor:
             draft.require_free(pose[None], size, what)
             draft.add_standing([name], kind, size, pose[None])
             return
-        add_mover(draft, name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
+        draft.add_vehicle(name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
 
     def _block_lanes(self) -> None:
         for block in self.edit.block_lane:
@@ -251,37 +249,14 @@ class _Editor:
             start[2] = np.arctan2(step[1], step[0])
             draft.require_free(start[None], size, "pedestrian")
             name, speed = self.name("pedestrian"), max(walk.speed_mps, 1e-3)
-            begins = np.inf if walk.start_s is None else walk.start_s
-            poses, velocities, valid = stroll(
-                draft.seconds, start, end[:2], speed, begins, visible=walk.visible
+            pedestrian = ScriptedPedestrian(
+                -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
             )
+            start_time = np.inf if walk.start_s is None else walk.start_s
+            poses, velocities, valid = pedestrian.walk(draft.seconds, start_time)
             draft.add(name, AgentKind.PEDESTRIAN, size, poses, valid=valid, velocities=velocities)
             if walk.start_s is None:
-                walker = ScriptedPedestrian(
-                    -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
-                )
-                draft.walkers.append((name, walker))
-
-
-def stroll(
-    seconds: FloatArray,
-    start: FloatArray,
-    end: FloatArray,
-    speed: float,
-    begins: float,
-    *,
-    visible: bool,
-) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Poses (R, 3), velocities (R, 2) and presence (R,) of a walk at some times (R,) [s]."""
-    step = end - start[:2]
-    length = float(np.hypot(*step))
-    gone = np.clip((seconds - begins) * speed, 0.0, length) if begins < np.inf else 0.0 * seconds
-    poses = np.tile(start, (len(seconds), 1))
-    poses[:, :2] += (gone / length)[:, None] * step
-    walks = (seconds >= begins) & (gone < length)
-    velocities = np.where(walks[:, None], speed * step / length, 0.0)
-    valid = np.ones(len(seconds), np.bool_) if visible else seconds >= begins
-    return poses, velocities, valid
+                draft.pedestrians.append((name, pedestrian))
 
 
 def _ahead_of(pose: FloatArray, ahead: float, left: float) -> FloatArray:

@@ -12,14 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.edits.draft import ScenarioBuilder
-from shiftsim.edits.movers import add_mover
+from shiftsim.edits.builder import ScenarioBuilder
 from shiftsim.edits.spec import LEVELS, Density
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray
+from shiftsim.world.events import FOLLOW
 from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
 from shiftsim.world.map import VectorMap
-from shiftsim.world.events import FOLLOW
 from shiftsim.world.state import VX, center_poses
 
 NEAR_EGO = 10.0  # m, a vehicle nearer to the ego in its lane becomes the ego
@@ -59,7 +58,7 @@ def fill_lanes(
         draft.change(ego=ego)
     for slot in slots:
         try:
-            add_mover(draft, name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
+            draft.add_vehicle(name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
         except ConfigError:
             continue  # no space: density is a matter of chance
 

@@ -1,7 +1,6 @@
 """Places beside the recorded path of the ego, so that one edit fits many scenarios."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,10 +9,8 @@ from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import BoolArray, FloatArray, kernel
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
-
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
 
 _SPACING = 0.2  # m, of the vertices of the path; nearer ones say nothing of its heading
 _BEYOND = 300.0  # m, how far the path goes on along the lanes
@@ -40,7 +37,7 @@ class EgoPath:
         return np.array([x, y, wrap_angle(heading + at.turn)])
 
 
-def ego_path(scenario: "Scenario") -> EgoPath:
+def ego_path(scenario: Scenario) -> EgoPath:
     """The path that places of a scenario are counted along."""
     now = int(scenario.iteration_rows[0])
     centers = center_poses(scenario.ego[:, :3])
@@ -78,7 +75,7 @@ def _mark_spaced(xy: FloatArray, kept: BoolArray) -> None:
             kept[index], last = True, index
 
 
-def _lanes_ahead(scenario: "Scenario", path: FloatArray) -> FloatArray:
+def _lanes_ahead(scenario: Scenario, path: FloatArray) -> FloatArray:
     """(K, 2) centre lines from the end of a path on, along the route where there is a choice."""
     road, end = scenario.map, path[-1]
     step = path[-1] - path[-2]

@@ -16,6 +16,7 @@ from shiftsim.edits.interplan.build import apply_code
 from shiftsim.edits.spec import PROFILES, Edit, digest_of, make_edit
 from shiftsim.errors import ConfigError, DataError, beginning, nearest
 from shiftsim.files import read_toml
+from shiftsim.metrics.interplan import driven_lanes
 from shiftsim.world.scenario import Scenario
 
 FOLDER = "edits"  # below that of a store
@@ -192,7 +193,7 @@ class EditedStore(ScenarioStore):
         """
         recorded = super().read(self.base(token), plausible=plausible)
         edit = self.edited[token].edit
-        return apply_code(recorded, edit) if edit.code else apply_edit(recorded, edit)
+        return apply_code(recorded, edit, driven_lanes) if edit.code else apply_edit(recorded, edit)
 
 
 def describe(edited: Mapping[str, Edited]) -> dict[str, Any]:

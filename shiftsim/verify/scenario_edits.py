@@ -20,6 +20,7 @@ from shiftsim.metrics import compute_metrics
 from shiftsim.metrics.interplan import (
     LaneChanges,
     add_interplan,
+    driven_lanes,
     final_score,
     interplan_score,
     role_of,
@@ -152,11 +153,11 @@ def _edited(
     scenario: Scenario, code: str, details: Mapping[str, Any], manner: str = ""
 ) -> tuple[Built, Scenario]:
     edit = make_edit({"name": code, "code": code, "details": details}, f"code {code}")
-    built = build(scenario, code, details)
+    built = build(scenario, code, details, driven_lanes)
     made = assemble(scenario, built, edit)
     if manner and made.script:
         index = MANNERS.index(manner.lower())
-        made = replace(made, script=replace(made.script, manner=index))
+        made = replace(made, script=replace(made.script, yielding=index))
     return built, made
 
 
@@ -166,7 +167,7 @@ def _compare_build(case: Source, where: str, scenario: Scenario, details: Any) -
         expected = [ours for text, ours in _FAILURES.items() if theirs.startswith(text)]
         case.match(where, {"token": scenario.token})
         try:
-            build(scenario, case["code"], details)
+            build(scenario, case["code"], details, driven_lanes)
         except ShiftsimError as error:
             fits = bool(expected) and expected[0] in error.message
             case.report.compare("build error", where, fits, True)

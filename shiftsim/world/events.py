@@ -11,6 +11,7 @@ from shiftsim.world.map import VectorMap
 
 FOLLOW, STOPPED, CAUTIOUS, LOGGED = 0, 1, 2, 3  # how a track behaves under reactive traffic
 OFF, ASSERTIVE, WARY, MIXED, DEFAULT = -1, 0, 1, 2, 3  # how reactive agents treat the ego
+CROSSING_SIZE = (0.9000033778444835, 0.7913900336773054)  # length, width of a pedestrian's box [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,24 @@ class ScriptedPedestrian:
     speed: float
     ego_within: float
     visible: bool
+
+    def walk(
+        self, seconds: FloatArray, start_time: float
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Poses (R, 3), velocities (R, 2) and presence (R,) at times (R,), from one of them on [s].
+
+        Where the start time is infinite, it waits.
+        """
+        step = self.end - self.start[:2]
+        length = float(np.hypot(*step))
+        gone = np.zeros(len(seconds))
+        if start_time < np.inf:
+            gone = np.clip((seconds - start_time) * self.speed, 0.0, length)
+        poses = np.tile(self.start, (len(seconds), 1))
+        poses[:, :2] += (gone / length)[:, None] * step
+        walks = (seconds >= start_time) & (gone < length)
+        velocities = np.where(walks[:, None], self.speed * step / length, 0.0)
+        return poses, velocities, (seconds >= start_time) | self.visible
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +107,9 @@ class RolloutEvents:
         words: What was edited, one line each.
         tokens: Tokens of the tracks that the edit made or changed.
         behaviors: (N,) FOLLOW, STOPPED or CAUTIOUS of each track; LOGGED where it is not driven.
-        manner: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as interPlan's
-            do, OFF as nuPlan's do.
-        walkers: Pedestrians that move by themselves.
+        yielding: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as those of
+            interPlan do, OFF as nuPlan's do.
+        pedestrians: Pedestrians that move by themselves.
         termination: Where a rollout ends before its time; None where it does not.
         seed: Of what is drawn during a rollout.
         profile: `shiftsim`, or `interplan` where its oddities are kept.
@@ -105,8 +124,8 @@ class RolloutEvents:
     words: tuple[str, ...]
     tokens: tuple[str, ...]
     behaviors: IntArray
-    manner: int = OFF
-    walkers: tuple[ScriptedPedestrian, ...] = ()
+    yielding: int = OFF
+    pedestrians: tuple[ScriptedPedestrian, ...] = ()
     termination: TerminationCondition | None = None
     seed: int = 0
     profile: str = "shiftsim"
@@ -123,4 +142,4 @@ class RolloutEvents:
     @property
     def has_pedestrians(self) -> bool:
         """Whether there are pedestrians that look for the ego."""
-        return bool(self.walkers or self.crossings)
+        return bool(self.pedestrians or self.crossings)

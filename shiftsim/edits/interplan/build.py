@@ -15,20 +15,17 @@ import numpy as np
 import shapely
 
 from shiftsim.edits.apply import edited_id
+from shiftsim.edits.builder import EGO_SIZE, ScenarioBuilder, begin
 from shiftsim.edits.density import blocks_at, draw_slots
-from shiftsim.edits.draft import EGO_SIZE, ScenarioBuilder, begin
 from shiftsim.edits.interplan import codes
-from shiftsim.edits.interplan.path import Plan, make_plan
+from shiftsim.edits.interplan.path import DrivenLanes, Plan, make_plan
 from shiftsim.edits.spec import LEVELS, MANNERS, Edit
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angle
 from shiftsim.kernels import FloatArray
-from shiftsim.sim.traffic.scripted import PEDESTRIAN_SIZE
-from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
-from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
 from shiftsim.world.events import (
     CAUTIOUS,
+    CROSSING_SIZE,
     FOLLOW,
     LOGGED,
     STOPPED,
@@ -36,10 +33,13 @@ from shiftsim.world.events import (
     RolloutEvents,
     TerminationCondition,
 )
+from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VX, VY, AgentKind, center_poses, rear_poses
 
 BUS = np.array([7.455735206604004, 2.0785977840423584])  # length, width [m]
-PEDESTRIAN = np.array(PEDESTRIAN_SIZE)
+PEDESTRIAN = np.array(CROSSING_SIZE)
 CONE = np.array([0.5, 0.5])
 CORRIDOR_S = 2  # s, how far ahead of new vehicles others must not be
 HISTORY = 23  # samples before iteration 0
@@ -81,21 +81,23 @@ class Built:
     past: FloatArray = field(repr=False)  # (23, V, 3) poses of the vehicles before iteration 0
 
 
-def apply_code(scenario: Scenario, edit: Edit) -> Scenario:
+def apply_code(scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes) -> Scenario:
     """The scenario that an edit with a code makes of a recorded one.
 
     Raises:
         ConfigError: interPlan fails there, too; the message names scenario, edit and reason.
     """
     try:
-        built = build(scenario, edit.code, edit.details)
+        built = build(scenario, edit.code, edit.details, driven_lanes)
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
     return assemble(scenario, built, edit)
 
 
-def build(scenario: Scenario, code: str, details: Mapping[str, Any]) -> Built:
+def build(
+    scenario: Scenario, code: str, details: Mapping[str, Any], driven_lanes: DrivenLanes
+) -> Built:
     """What a code makes of a recorded scenario; `details` are those of its token."""
     changes = codes.changes_of(code, details)
     road, row = scenario.map, int(scenario.iteration_rows[0])
@@ -110,7 +112,7 @@ def build(scenario: Scenario, code: str, details: Mapping[str, Any]) -> Built:
     initial = logged.copy()
     if speed:  # nuPlan rule 706: a speed of 0 changes nothing
         initial[VX] = speed
-    plan = make_plan(scenario, changes, details, initial)
+    plan = make_plan(scenario, changes, details, initial, driven_lanes)
     if codes.edits_agents(changes) and not vehicles and not cast.cones:
         cast.fill()  # interPlan takes an empty list for one that was not made yet
         vehicles = tuple(cast.vehicles)
@@ -382,7 +384,7 @@ def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
         words=edit.words,
         tokens=tuple(draft.touched),
         behaviors=draft.behaviors,
-        manner=MANNERS.index(_manner(built, edit)),
+        yielding=MANNERS.index(_manner(built, edit)),
         crossings=tuple(replace(w, track=places[w.token]) for w in built.pedestrians),
         termination=TerminationCondition(plan.line[:, :2], plan.end),
         profile="interplan",

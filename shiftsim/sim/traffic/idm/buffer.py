@@ -20,28 +20,25 @@ _CLOSING = 80.0  # closing points of an inner turn lie this much nearer to the c
 _PER_VERTEX = 4  # most curve vertices of a join, fillets apart
 
 
-@kernel
 def curve_capacity(num_points: int) -> int:
     """Most vertices the buffer curve of a polyline can have, whatever its turns add up to."""
     return 2 * num_points * (_PER_VERTEX + 2 * QUADRANT_SEGMENTS) + 8
 
 
 @kernel
-def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray) -> int:
+def buffer_curve(line: FloatArray, distance: float, out: FloatArray) -> int:
     """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
-    `keep` (K,) is scratch; `out` (V, 2) receives the curve.
+    `out` (V, 2) receives the curve, V being at least `curve_capacity(K)`.
 
     Returns:
-        How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
+        How many vertices the curve has, the closing one not repeated.
     """
-    count = 0
+    keep, count = np.empty(len(line), np.bool_), 0
     for side in range(2):
         _simplify(line, distance * _SIMPLIFY, side == 0, keep)
         count = _offset_side(line, distance, side == 0, keep, out, count)
-        if count < 0:
-            return -1
-    return int(count)
+    return count
 
 
 @kernel
@@ -61,9 +58,9 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
         middle = _walk(keep, size, index, 1)
         last = _walk(keep, size, middle, 1)
         while last < size:
-            if _side(line, index, middle, last) == concave and _is_shallow(
-                line, index, middle, last, tolerance
-            ):
+            ax, ay, bx, by = line[index, 0], line[index, 1], line[middle, 0], line[middle, 1]
+            side = orientation(ax, ay, bx, by, line[last, 0], line[last, 1])
+            if side == concave and _is_shallow(line, index, middle, last, tolerance):
                 keep[middle] = False
                 changed = True
                 index = last
@@ -71,14 +68,6 @@ def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -
                 index = middle
             middle = _walk(keep, size, index, 1)
             last = _walk(keep, size, middle, 1)
-
-
-@kernel
-def _side(line: FloatArray, before: int, at: int, after: int) -> int:
-    """Side to which a line turns at a vertex between two others: 1 left, -1 right, 0 none."""
-    ax, ay = line[before, 0], line[before, 1]
-    bx, by = line[at, 0], line[at, 1]
-    return orientation(ax, ay, bx, by, line[after, 0], line[after, 1])
 
 
 @kernel
@@ -109,11 +98,8 @@ def _offset_side(
     at = _walk(keep, size, at, step)
     x2, y2 = line[at, 0], line[at, 1]
     ux, uy = _offset(x1, y1, x2, y2, distance)
-    limit = len(out) - _PER_VERTEX - 2 * QUADRANT_SEGMENTS
     at = _walk(keep, size, at, step)
     while 0 <= at < size:
-        if count > limit:
-            return -1
         x0, y0, x1, y1 = x1, y1, x2, y2
         x2, y2 = line[at, 0], line[at, 1]
         vx, vy = ux, uy

@@ -10,12 +10,12 @@ import numpy as np
 
 from shiftsim.kernels import BoolArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
+from shiftsim.sim.traffic.idm.gaps import bound_ring, ring_gap
 from shiftsim.sim.traffic.idm.paths import set_box
-from shiftsim.sim.traffic.idm.scene import Courtesy, Scene
-from shiftsim.sim.traffic.idm.shapes import bound_ring, ring_gap
+from shiftsim.sim.traffic.idm.scene import Scene, Yielding
+from shiftsim.world.events import ASSERTIVE, DEFAULT, MIXED, OFF
 from shiftsim.world.layers import contains
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.events import ASSERTIVE, DEFAULT, MIXED, OFF
 from shiftsim.world.state import PACIFICA
 
 LOOK_AHEAD = 3.0  # s, at constant velocity
@@ -25,31 +25,23 @@ _LENGTH, _WIDTH = PACIFICA.length, PACIFICA.width
 _TOUCH = 1e-6  # m
 
 
-def make_courtesy(
-    road: VectorMap, manner: int, cautious: BoolArray, seed: int, num_steps: int
-) -> Courtesy:
+def make_yielding(
+    road: VectorMap, policy: int, cautious: BoolArray, seed: int, num_steps: int
+) -> Yielding:
     """What agents, of which some are `cautious` (A,), make of the ego."""
-    draws = np.zeros(1, np.int64)
-    if manner == MIXED:
+    draws = [0]
+    if policy == MIXED:
         coin = random.Random(seed)
-        count = max(1, num_steps * len(cautious))
-        draws = np.array([coin.randint(0, 1) for _ in range(count)], np.int64)
-    return Courtesy(
-        manner=manner,
+        draws = [coin.randint(0, 1) for _ in range(max(1, num_steps * len(cautious)))]
+    return Yielding(
+        policy=policy,
         cautious=cautious,
         edges=road.edges.polygons,
         block_of=road.block_of,
-        draws=draws,
-        drawn=np.zeros(1, np.int64),
+        draws=np.array(draws, np.int64),
+        num_drawn=np.zeros(1, np.int64),
         ego_block=np.full(1, NONE, np.int64),
-        line=np.zeros((5, 2)),
-        keep=np.zeros(5, np.bool_),
     )
-
-
-def no_courtesy(road: VectorMap, num_agents: int) -> Courtesy:
-    """That of nuPlan's agents."""
-    return make_courtesy(road, OFF, np.zeros(num_agents, np.bool_), 0, 0)
 
 
 @kernel
@@ -58,14 +50,14 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
 
     The ego's centre is at x, y [m], its velocity vx, vy is in its own frame [m/s].
     """
-    courtesy, footprints = scene.courtesy, scene.footprints
-    if courtesy.manner == OFF:
+    footprints = scene.footprints
+    if scene.yielding.policy == OFF:
         return
     place = len(scene.agents) + 1
     set_box(footprints, place, x, y, heading, _LENGTH, _WIDTH)
     cos, sin = np.cos(heading), np.sin(heading)
     half, reach = 0.5 * _LENGTH, 0.5 * _WIDTH
-    line = courtesy.line
+    line = np.empty((4, 2))
     line[0, 0], line[0, 1] = x - (half + reach) * cos, y - (half + reach) * sin
     line[1, 0], line[1, 1] = x, y
     line[2, 0], line[2, 1] = x + half * cos, y + half * sin
@@ -80,8 +72,7 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
         line[2, 0] += reach * cos
         line[2, 1] += reach * sin
     curve = footprints.curve[place]
-    made = buffer_curve(line[:count], reach, courtesy.keep, curve)
-    footprints.curve_size[place] = max(made, 0)
+    footprints.curve_size[place] = buffer_curve(line[:count], reach, curve)
     bound_ring(curve[: footprints.curve_size[place]], footprints.bounds[place])
 
 
@@ -89,30 +80,30 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
 def ignores_ego_ahead(scene: Scene, agent: int) -> bool:
     """Whether an agent, in whose corridor the ego will be, does not mind.
 
-    nuPlan rule 703: in its own lane never; in its own roadblock by its manner, unless the ego is
-    behind; elsewhere all yield but for the default manner and those that the ego drives into.
+    nuPlan rule 703: in its own lane never; in its own roadblock by the policy, unless the ego is
+    behind; elsewhere all yield but for the default policy and those that the ego drives into.
     """
-    courtesy, fleet, footprints = scene.courtesy, scene.fleet, scene.footprints
+    yielding, fleet, footprints = scene.yielding, scene.fleet, scene.footprints
     ego, ahead = len(scene.agents), len(scene.agents) + 1
     ego_x = 0.5 * (footprints.box[ego, 0, 0] + footprints.box[ego, 2, 0])
     ego_y = 0.5 * (footprints.box[ego, 0, 1] + footprints.box[ego, 2, 1])
     x, y, heading = fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2]
     lane = -1
     for segment in range(fleet.route_size[agent]):
-        if contains(courtesy.edges, fleet.route[agent, segment], x, y):
+        if contains(yielding.edges, fleet.route[agent, segment], x, y):
             lane = fleet.route[agent, segment]
             break
-    if lane >= 0 and contains(courtesy.edges, lane, ego_x, ego_y):
+    if lane >= 0 and contains(yielding.edges, lane, ego_x, ego_y):
         return True
-    if lane >= 0 and courtesy.block_of[lane] == courtesy.ego_block[0]:
+    if lane >= 0 and yielding.block_of[lane] == yielding.ego_block[0]:
         if (ego_x - x) * np.cos(heading) + (ego_y - y) * np.sin(heading) < 0.0:
             return True
-        if courtesy.manner == MIXED:
-            drawn = courtesy.drawn[0] % len(courtesy.draws)
-            courtesy.drawn[0] += 1
-            return courtesy.draws[drawn] == 1
-        return courtesy.manner == ASSERTIVE
-    if courtesy.manner == DEFAULT:
+        if yielding.policy == MIXED:
+            drawn = yielding.num_drawn[0] % len(yielding.draws)
+            yielding.num_drawn[0] += 1
+            return yielding.draws[drawn] == 1
+        return yielding.policy == ASSERTIVE
+    if yielding.policy == DEFAULT:
         return True
     box = footprints.box[agent]
     curve = footprints.curve[ahead, : footprints.curve_size[ahead]]

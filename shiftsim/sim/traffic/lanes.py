@@ -1,4 +1,4 @@
-"""Lanes that agents follow on their own: the one they are on, and the next one where lanes fork."""
+"""Lanes that agents follow on their own, the next one where lanes fork, and lights along them."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,11 @@ from shiftsim.geometry.polylines import point_on_polyline, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.layers import Lists, Polygons, Polylines, containing
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import LightStatus
 
 NO_LANE = -1
+GREEN, RED = 1, 2  # lights of an edge, added up where several are listed
 CANDIDATES = 16  # lanes that may hold a point
 _TURN, _ASIDE = 1.0, 3.0  # rad and m from a lane beyond which an agent does not follow it
 _KEPT = 0.4  # rad that another lane must fit better to take the place of the one followed
@@ -93,3 +96,17 @@ def next_lane(lanes: Lanes, edge: int) -> int:
         if bend < least:
             best, least = after, bend
     return best
+
+
+def light_flags(scenario: Scenario) -> tuple[IntArray, IntArray]:
+    """(L,) edges with a light, and (T, L) which lights are listed at each iteration."""
+    lights, index = scenario.traffic_lights, scenario.map.edges.index
+    status = lights.status[scenario.iteration_rows]
+    flags = GREEN * (status == LightStatus.GREEN) + RED * (status == LightStatus.RED)
+    known = [i for i, name in enumerate(lights.connector_ids) if name in index]
+    named = np.array([index[lights.connector_ids[i]] for i in known], np.int64)
+    edges, place = np.unique(named, return_inverse=True)
+    out = np.zeros((len(edges), len(status)), np.int64)
+    # nuPlan rule 429: whoever asks for green finds green, whoever asks for red finds red
+    np.bitwise_or.at(out, place, flags[:, known].T)
+    return edges, np.ascontiguousarray(out.T)

@@ -1,16 +1,18 @@
-"""A scenario while it is edited: its arrays, writable, and what the edit has made so far."""
+"""The builder of edited scenarios: writable arrays, and what the edit has made so far."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.polylines import arc_lengths
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.events import FOLLOW, STOPPED, ScriptedPedestrian, TerminationCondition
+from shiftsim.world.lanes import find_start
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -19,9 +21,6 @@ from shiftsim.world.state import (
     center_poses,
 )
 
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
-
 EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
 
@@ -29,15 +28,16 @@ EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 class ScenarioBuilder:
     """A scenario while it is edited."""
 
-    scenario: "Scenario"  # as recorded, but for what does not move
+    scenario: Scenario  # as recorded, but for what does not move
     joined: Tracks
-    known: IntArray  # (N,) behaviours of these tracks, as in `RolloutEvents`
+    joined_behaviors: IntArray  # (N,) behaviours of these tracks, as in `RolloutEvents`
     touched: list[str] = field(default_factory=list)  # tokens of tracks made or changed
-    walkers: list[tuple[str, ScriptedPedestrian]] = field(
-        default_factory=list
-    )  # with the token of their track
+    # with the token of their track
+    pedestrians: list[tuple[str, ScriptedPedestrian]] = field(default_factory=list)
     termination: TerminationCondition | None = None
-    waiting: list[tuple[Tracks, Sequence[int]]] = field(default_factory=list)  # new, as `known`
+    waiting: list[tuple[Tracks, Sequence[int]]] = field(
+        default_factory=list
+    )  # new, with their behaviours
 
     @property
     def tracks(self) -> Tracks:
@@ -49,7 +49,7 @@ class ScenarioBuilder:
     def behaviors(self) -> IntArray:
         """(N,) behaviours of the tracks, as in `RolloutEvents`."""
         self._join()
-        return self.known
+        return self.joined_behaviors
 
     def _join(self) -> None:
         """Put new tracks where they belong."""
@@ -72,8 +72,8 @@ class ScenarioBuilder:
         )
         tokens = tuple(token for part, where in runs for token in part.tokens[where])
         self.joined = Tracks(valid, poses, velocities, sizes, kinds[order], tokens)
-        behaviors = [self.known, *(np.array(known, np.int64) for _, known in self.waiting)]
-        self.known = np.concatenate(behaviors)[order]
+        behaviors = [self.joined_behaviors, *(np.array(new, np.int64) for _, new in self.waiting)]
+        self.joined_behaviors = np.concatenate(behaviors)[order]
         self.waiting = []
 
     @property
@@ -117,7 +117,7 @@ class ScenarioBuilder:
 
     def keep(self, which: BoolArray) -> None:
         """Keep some of the tracks (a mask) only."""
-        self.joined, self.known = self.tracks.select(which), self.behaviors[which]
+        self.joined, self.joined_behaviors = self.tracks.select(which), self.behaviors[which]
 
     def add(
         self,
@@ -201,8 +201,56 @@ class ScenarioBuilder:
                 hint="choose another place, or remove that track first",
             )
 
+    def add_vehicle(
+        self, token: str, pose: FloatArray, size: FloatArray, speed: float, behavior: int
+    ) -> None:
+        """Add a vehicle that drives from the first iteration on; until then it came along its lane.
 
-def begin(scenario: "Scenario") -> ScenarioBuilder:
-    """A draft of a scenario in which nothing is changed yet."""
+        Raises:
+            ConfigError: It is on no lane, or on something.
+        """
+        road = self.scenario.map
+        start = find_start(road, pose)
+        if start is None:
+            raise ConfigError(
+                f"spawned vehicle at ({pose[0]:.1f}, {pose[1]:.1f}) is on no lane, so it cannot "
+                "drive",
+                hint='put it on a lane, or give behavior = "stopped"',
+            )
+        self.require_free(start.pose[None], size, "spawned vehicle")
+        seconds, lanes, driven = self.seconds, [start.edge], start.progress
+        while driven < -seconds[0] * speed:
+            before = road.incoming.at(lanes[-1]).tolist()
+            if not before or before[0] in lanes:
+                break
+            lanes.append(before[0])
+            driven += road.baselines.length(before[0])
+        lines = [road.baselines.at(edge) for edge in reversed(lanes)]
+        xy = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
+        arc = arc_lengths(xy, np.array([0, len(xy)]))
+        along = start.progress + np.minimum(seconds, 0.0) * speed
+        poses = poses_along(xy, arc, along + arc[-1] - road.baselines.length(start.edge))
+        headings = poses[:, 2]
+        self.add(
+            token,
+            AgentKind.VEHICLE,
+            size,
+            poses,
+            valid=seconds <= 0.0,
+            velocities=speed * np.stack([np.cos(headings), np.sin(headings)], -1),
+            behavior=behavior,
+        )
+
+
+def poses_along(xy: FloatArray, arc: FloatArray, along: FloatArray) -> FloatArray:
+    """(N, 3) poses at arc lengths (N,) of a line with vertices (K, 2) and arc lengths (K,) [m]."""
+    steps = np.diff(xy, axis=0)
+    segment = np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(steps) - 1)
+    x, y = (np.interp(along, arc, xy[:, column]) for column in (0, 1))
+    return np.column_stack([x, y, np.arctan2(steps[segment, 1], steps[segment, 0])])
+
+
+def begin(scenario: Scenario) -> ScenarioBuilder:
+    """A builder of a scenario in which nothing is changed yet."""
     tracks = scenario.tracks
     return ScenarioBuilder(scenario, tracks, np.full(tracks.num_tracks, FOLLOW, np.int64))
