@@ -24,7 +24,6 @@ LAYER = {package: number for number, layer in enumerate(LAYERS) for package in l
 NEIGHBOURS = {
     "planners": (
         "sim.dynamics",
-        "sim.execute",
         "sim.loop",
         "sim.noise",
         "sim.plan_check",

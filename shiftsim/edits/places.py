@@ -7,7 +7,7 @@ import numpy as np
 from shiftsim.edits.spec import At
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import BoolArray, FloatArray, kernel
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
@@ -62,17 +62,11 @@ def ego_path(scenario: Scenario) -> EgoPath:
 
 def _spaced(xy: FloatArray) -> FloatArray:
     """The first of the points (N, 2), and those that are far enough from the one before."""
-    kept = np.zeros(len(xy), np.bool_)
-    _mark_spaced(np.ascontiguousarray(xy), kept)
-    return xy[kept]
-
-
-@kernel
-def _mark_spaced(xy: FloatArray, kept: BoolArray) -> None:
-    kept[0], last = True, 0
+    chosen = [0]
     for index in range(1, len(xy)):
-        if np.hypot(xy[index, 0] - xy[last, 0], xy[index, 1] - xy[last, 1]) >= _SPACING:
-            kept[index], last = True, index
+        if np.hypot(*(xy[index] - xy[chosen[-1]])) >= _SPACING:
+            chosen.append(index)
+    return xy[chosen]
 
 
 def _lanes_ahead(scenario: Scenario, path: FloatArray) -> FloatArray:

@@ -26,25 +26,25 @@ _MAX_DEPTH = 200  # lanes of a route
 _MIN_LENGTH = 5.0  # m
 
 
-def reroute(draft: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
+def reroute(builder: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     """Change route, goal and expert; the expert drives evenly along the lanes of the new route.
 
     Raises:
         ConfigError: There is no such route.
     """
-    road, now = draft.scenario.map, draft.now
-    center = center_poses(draft.scenario.ego[now : now + 1, :3])[0]
+    road, now = builder.scenario.map, builder.now
+    center = center_poses(builder.scenario.ego[now : now + 1, :3])[0]
     start = find_start(road, center)
     if start is None:
         raise ConfigError("reroute: the ego is on no lane at the start")
     first = int(road.block_of[start.edge])
-    times = draft.scenario.iteration_times
+    times = builder.scenario.iteration_times
     seconds = float(times[-1] - times[0]) * 1e-6
     if wanted.goal:
         goal_edge = edge_at(road, *wanted.goal)
         lanes = plan_lanes(road, first, goal_edge, set(range(len(road.edges))), _MAX_DEPTH)
     else:
-        blocks = _blocks(road, wanted, first, max(3, len(draft.scenario.route)))
+        blocks = _blocks(road, wanted, first, max(3, len(builder.scenario.route)))
         goal_edge = int(road.block_edges.at(blocks[-1])[-1])
         within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
         lanes = plan_lanes(road, first, goal_edge, within, len(blocks))
@@ -60,9 +60,9 @@ def reroute(draft: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     if total < _MIN_LENGTH:
         raise ConfigError(f"reroute: the goal is {total:.1f} m ahead, at least 5 m are needed")
     ids = [road.blocks.ids[block] for block in dict.fromkeys(road.block_of[lanes].tolist())]
-    draft.change(ego=_drive(draft, line, total), route=tuple(ids), mission_goal=goal)
+    builder.change(ego=_drive(builder, line, total), route=tuple(ids), mission_goal=goal)
     if ends:
-        draft.termination = TerminationCondition(
+        builder.termination = TerminationCondition(
             line, total - TOLERANCE, int(road.block_of[lanes[-1]])
         )
 
@@ -81,10 +81,10 @@ def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[in
     return blocks[blocks.index(first) :]
 
 
-def _drive(draft: ScenarioBuilder, line: FloatArray, total: float) -> FloatArray:
+def _drive(builder: ScenarioBuilder, line: FloatArray, total: float) -> FloatArray:
     """(R, 11) ego states that go evenly along a path (K, 2) in the window, and stand at its end."""
-    scenario, now = draft.scenario, draft.now
-    ego, seconds = np.array(scenario.ego), draft.seconds
+    scenario, now = builder.scenario, builder.now
+    ego, seconds = np.array(scenario.ego), builder.seconds
     duration = seconds[scenario.iteration_rows[-1]]
     after = np.arange(now + 1, len(ego))
     along = np.minimum(seconds[after] / duration, 1.0) * total

@@ -19,7 +19,7 @@ LETTERS = {
 }
 DENSITIES = {"l": "low", "m": "medium", "h": "high"}
 COMMANDS = {"l": "left", "r": "right", "s": "straight"}
-_MANNERS = {"a": "assertive", "c": "cautious", "m": "mixed"}
+POLICIES = {"a": "assertive", "c": "cautious", "m": "mixed"}
 _EDITS_AGENTS = ("density", "amount_of_agents", "special_scenario")
 DETAILS = "modification_details_dictionary"
 
@@ -135,7 +135,7 @@ def manners_in_force(names: Iterable[str], details: Mapping[str, Any]) -> dict[s
     for token, codes in sorted(group_names(names).items()):
         for code in codes:
             changes = changes_of(code, details.get(token) or {})
-            mode = _MANNERS.get(changes.get("observation", ""), mode)
+            mode = POLICIES.get(changes.get("observation", ""), mode)
             out[f"{token}-{code}"] = mode
     return out
 

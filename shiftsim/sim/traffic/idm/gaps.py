@@ -10,6 +10,8 @@ import numpy as np
 from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
 from shiftsim.kernels import FloatArray, kernel
 
+_ROUNDING = 1.0 + 1e-9  # factor on a square below which bounds of distances are equal
+
 
 @kernel
 def bound_ring(ring: FloatArray, bounds: FloatArray) -> None:
@@ -60,19 +62,15 @@ def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     px, py = a[-1, 0], a[-1, 1]
     for edge in range(len(a)):
         qx, qy = a[edge, 0], a[edge, 1]
-        x0, x1, y0, y1 = (
-            min(px, qx) - best,
-            max(px, qx) + best,
-            min(py, qy) - best,
-            max(py, qy) + best,
-        )
-        if x0 < high_x and x1 > low_x and y0 < high_y and y1 > low_y:
+        x0, x1, y0, y1 = min(px, qx), max(px, qx), min(py, qy), max(py, qy)
+        dx, dy = max(low_x - x1, x0 - high_x, 0.0), max(low_y - y1, y0 - high_y, 0.0)
+        if dx * dx + dy * dy <= best * best * _ROUNDING:
             rx, ry = b[-1, 0], b[-1, 1]
             for vertex in range(len(b)):
                 sx, sy = b[vertex, 0], b[vertex, 1]
-                if not (
-                    max(rx, sx) < x0 or min(rx, sx) > x1 or max(ry, sy) < y0 or min(ry, sy) > y1
-                ):
+                dx = max(min(rx, sx) - x1, x0 - max(rx, sx), 0.0)
+                dy = max(min(ry, sy) - y1, y0 - max(ry, sy), 0.0)
+                if dx * dx + dy * dy <= best * best * _ROUNDING:
                     if segments_meet(px, py, qx, qy, rx, ry, sx, sy):
                         return 0.0
                     best = min(best, point_segment_distance(qx, qy, rx, ry, sx, sy))

@@ -103,21 +103,19 @@ def _touches_corridor(
 ) -> bool:
     """Whether a ring with the given bounds (4,) meets the corridor of a line (K, 2)."""
     # a buffer lies within 2 % of its distance: round joins are segmented, shallow vertices left out
-    reach, nearest = _OUTER * half_width, np.inf
+    reach, nearest, starts_outside = _OUTER * half_width, np.inf, False
     for vertex in range(1, len(line)):
-        px, py, qx, qy = line[vertex - 1, 0], line[vertex - 1, 1], line[vertex, 0], line[vertex, 1]
+        a, b = line[vertex - 1], line[vertex]
         if (
-            min(px, qx) <= bounds[2] + reach
-            and max(px, qx) >= bounds[0] - reach
-            and min(py, qy) <= bounds[3] + reach
-            and max(py, qy) >= bounds[1] - reach
+            min(a[0], b[0]) <= bounds[2] + reach
+            and max(a[0], b[0]) >= bounds[0] - reach
+            and min(a[1], b[1]) <= bounds[3] + reach
+            and max(a[1], b[1]) >= bounds[1] - reach
         ):
-            gap = ring_segment_distance(
-                ring, line[vertex - 1], line[vertex], reach, nearest < np.inf
-            )
+            gap = ring_segment_distance(ring, a, b, reach, starts_outside)
             if gap == 0.0:
                 return True
-            nearest = min(nearest, gap)
+            nearest, starts_outside = min(nearest, gap), True
     if nearest == np.inf:
         return False
     if scratch.outline_size[0] < 0:
