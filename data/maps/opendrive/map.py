@@ -21,7 +21,7 @@ from shiftsim.data.maps.builder import (
 from shiftsim.data.maps.opendrive import areas, control
 from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.maps.opendrive.control import LIGHT, STOP, YIELD
-from shiftsim.data.maps.opendrive.graph import LaneGraph, Piece, build_lane_graph
+from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment, build_lane_graph
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.overlaps import (
     Levels,
@@ -89,18 +89,16 @@ def build_road_map(
     return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
 
 
-def _chains(graph: LaneGraph) -> list[list[Piece]]:
-    return [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+def _chains(graph: Graph) -> list[list[LaneSegment]]:
+    return [lane.segments for lane in graph.lanes] + [c.segments for c in graph.connectors]
 
 
-def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
+def _shapes_of(od: OpenDrive, graph: Graph) -> Shapes:
     return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
 
 
 class _Maker:
-    def __init__(
-        self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
-    ) -> None:
+    def __init__(self, od: OpenDrive, graph: Graph, warnings: Counter[str], country: str) -> None:
         self.od, self.warnings, self.country = od, warnings, country
         self.shapes = _shapes_of(od, graph)
         self.graph, crossings = cut_crossings(od, graph, self.shapes)
@@ -146,23 +144,23 @@ class _Maker:
     def _lanes(self) -> tuple[list[ShapedLane], set[tuple[int, int]]]:
         """All lanes, and the pairs of them that lie on different levels."""
         lanes = self.graph.lanes
-        borders = [self.shapes.joined_borders(lane.pieces) for lane in lanes]
+        borders = [self.shapes.joined_borders(lane.segments) for lane in lanes]
         polygons = [lane_polygon(*pair) for pair in borders]
-        levels = Levels(self.od, self.shapes, [lane.pieces for lane in lanes], polygons)
+        levels = Levels(self.od, self.shapes, [lane.segments for lane in lanes], polygons)
         stacked = {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
-        lengths = [sum(piece.length for piece in lane.pieces) for lane in lanes]
+        lengths = [sum(piece.length for piece in lane.segments) for lane in lanes]
         polygons, overlaps = subtract_overlaps(polygons, lengths, stacked)
         if overlaps:
             self.warnings["overlap of two lanes, taken from the longer one"] += overlaps
         shaped = [
             ShapedLane(
                 *borders[number],
-                self.shapes.baseline(lane.pieces),
+                self.shapes.baseline(lane.segments),
                 polygons[number],
-                control.speed_limit(self.od, lane.pieces, self.country),
+                control.speed_limit(self.od, lane.segments, self.country),
                 lane.block,
                 lane.index,
-                number > 0 and _touch(lanes[number - 1].pieces[0], lane.pieces[0]),
+                number > 0 and _touch(lanes[number - 1].segments[0], lane.segments[0]),
             )
             for number, lane in enumerate(lanes)
         ]
@@ -174,12 +172,12 @@ class _Maker:
         """All connectors; `lines` are the baselines of the lanes."""
         lanes, out = self.graph.lanes, []
         for connector, controls in zip(self.graph.connectors, self.controls, strict=True):
-            left, right = self.shapes.joined_borders(connector.pieces)
-            before = self.shapes.widths(lanes[connector.source].pieces)[1]
-            after = self.shapes.widths(lanes[connector.target].pieces)[0]
+            left, right = self.shapes.joined_borders(connector.segments)
+            before = self.shapes.widths(lanes[connector.source].segments)[1]
+            after = self.shapes.widths(lanes[connector.target].segments)[0]
             left, right = widen(left, right, min(before, after))
             source, target = lines[connector.source], lines[connector.target]
-            line = self.shapes.baseline(connector.pieces, source[-1], target[0])
+            line = self.shapes.baseline(connector.segments, source[-1], target[0])
             here = [i for i, stop in enumerate(stops) if stop.lane == connector.source]
             out.append(
                 ShapedConnector(
@@ -187,7 +185,7 @@ class _Maker:
                     right,
                     bend_ends(line, source, target),
                     lane_polygon(left, right),
-                    control.speed_limit(self.od, connector.pieces, self.country),
+                    control.speed_limit(self.od, connector.segments, self.country),
                     connector.source,
                     connector.target,
                     has_light=bool(connector.junctions) and LIGHT in controls,
@@ -198,7 +196,7 @@ class _Maker:
 
     def _groups(self, polygons: Sequence[shapely.Polygon]) -> IntArray:
         connectors = self.graph.connectors
-        levels = Levels(self.od, self.shapes, [c.pieces for c in connectors], polygons)
+        levels = Levels(self.od, self.shapes, [c.segments for c in connectors], polygons)
         pairs = block_pairs(self.graph.lanes, connectors)
         return areas.group_connectors(connectors, polygons, pairs, levels.are_stacked)
 
@@ -235,7 +233,7 @@ class _Maker:
                 yield Origin(edge_id, piece.key, piece.begin, piece.end)
 
 
-def _touch(left: Piece, right: Piece) -> bool:
+def _touch(left: LaneSegment, right: LaneSegment) -> bool:
     """Whether no lane of another use lies between two lanes of one section."""
     one, other = left.key.lane, right.key.lane
     return abs(one - other) - (1 if one * other < 0 else 0) == 1
