@@ -17,7 +17,7 @@ from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
 from shiftsim.benchmarks.coverage import coverage
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file, write_text
+from shiftsim.files import atomic_write, write_text
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.avoidable import grade
@@ -210,7 +210,7 @@ def run_bench(
     if plan.edits:
         write_text(plan.folder / EDITS, plan.edits)
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
-    with whole_file(plan.folder / MANIFEST) as partial:
+    with atomic_write(plan.folder / MANIFEST) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
     total = _Total(plan.num_tasks, on_progress)
     out = []

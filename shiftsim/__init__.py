@@ -2,6 +2,8 @@
 
 import sys
 
+from shiftsim._version import __version__ as __version__
+
 TYPE_CHECKING = False  # type checkers take this name for true; nothing is imported for it
 if TYPE_CHECKING:
     from typing import Any
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from shiftsim.world.state import Tracks as Tracks
     from shiftsim.world.state import Trajectory as Trajectory
 
-__version__ = "0.1.0"
 # public name -> where it is; imported when it is first used, so that `import shiftsim` is instant
 _PUBLIC = {
     "Command": "shiftsim.world.state:Command",

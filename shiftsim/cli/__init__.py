@@ -339,7 +339,7 @@ def _options(
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:
-        from shiftsim import __version__
+        from shiftsim._version import __version__
 
         typer.echo(__version__)
         raise typer.Exit

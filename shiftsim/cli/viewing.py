@@ -52,11 +52,11 @@ def view(
     debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
-    from shiftsim.files import below
+    from shiftsim.files import safe_join
     from shiftsim.view.build import page_name, write_site
 
     found = _galleries([run, *(others or ())], planner, noise, seed, store)
-    folder = out or below(run, "view")
+    folder = out or safe_join(run, "view")
     if token is not None:
         gallery, token = _holding(found, token)
         folder.mkdir(parents=True, exist_ok=True)

@@ -92,7 +92,7 @@ def _work(job: str, payload: bytes, task: Any) -> list[Outcome[Any, Any]]:
             _POOLS.pop(other).close()  # of a run whose main process was killed
         paths, make, limit, pieces = pickle.loads(payload)
         here = [*sys.path, *(path for path in paths if path not in sys.path)]
-        _POOLS[key] = Pool(pickle.dumps((here, make, limit > 0.0)), 1, limit, pieces)
+        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, pieces)
     return list(_POOLS[key].run([task], 0))
 
 

@@ -212,14 +212,14 @@ def _networks_beside(
         yield planners, traffic
         return
     from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
-    from shiftsim.runs.workers import beside
+    from shiftsim.processes import in_background
 
     known = planners | ({name: traffic} if traffic else {})
     address = new_address()
     asking = {
         who: replace(known[who], ask=InferenceClient(address, who)) for who in prepared.shared
     }
-    with beside(
+    with in_background(
         partial(InferenceServer, {who: known[who].make for who in prepared.shared}, address)
     ):
         yield {who: asking.get(who, planners[who]) for who in planners}, asking.get(name, traffic)

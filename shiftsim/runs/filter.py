@@ -23,7 +23,7 @@ import pyarrow as pa
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import Table, write_blocks
 from shiftsim.errors import ConfigError, DataError, one_of
-from shiftsim.files import below
+from shiftsim.files import safe_join
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
 from shiftsim.runs import verdicts
 from shiftsim.runs.config import default_workers
@@ -145,7 +145,7 @@ def filter_store(
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
     number = max(1, min(workers or default_workers(), len(opened)))
-    unfinished = below(path, _UNFINISHED)
+    unfinished = safe_join(path, _UNFINISHED)
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
     try:

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import below, draft, whole_file, write_text
+from shiftsim.files import atomic_write, safe_join, temp_path, write_text
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import (
     JOURNAL,
@@ -88,7 +88,7 @@ class RunWriter:
         """
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
-        self.rollouts = below(path, FOLDER)
+        self.rollouts = safe_join(path, FOLDER)
         self._journal = Journal(path / JOURNAL, keep=resume)
         self.ended = dict(self._entries())
         before = _finished(path)
@@ -250,7 +250,7 @@ class _SortedTable:
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self.path, self.schema = path, schema
-        self._partial = draft(path)
+        self._partial = temp_path(path)
         self._writer = TableWriter(self._partial, schema, **WRITE_OPTIONS)
         self._pending = schema.empty_table()
 
@@ -288,7 +288,7 @@ def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        with whole_file(target) as partial:
+        with atomic_write(target) as partial:
             shutil.copyfile(source, partial)
 
 

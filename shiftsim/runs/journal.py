@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import below, locked
+from shiftsim.files import lock, safe_join
 
 _SETTINGS = (
     "locking_mode = exclusive",  # no third file, whose memory is shared between processes
@@ -39,10 +39,10 @@ class Journal:
         Raises:
             ConfigError: Another process works with it.
         """
-        self.path = below(path.parent, path.name)
-        self._appended = below(path.parent, f"{path.name}-wal")
+        self.path = safe_join(path.parent, path.name)
+        self._appended = safe_join(path.parent, f"{path.name}-wal")
         try:
-            self._lock = locked(path)
+            self._lock = lock(path)
         except BlockingIOError as error:
             raise ConfigError(
                 f"another process is working on {str(path.parent)!r}",

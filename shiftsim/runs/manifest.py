@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import PACKAGE, sources
 from shiftsim.runs.config import RunConfig

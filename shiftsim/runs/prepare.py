@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import require_no_import

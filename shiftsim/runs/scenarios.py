@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest
-from shiftsim.files import below, read_toml, store_path
+from shiftsim.files import read_toml, safe_join, store_path
 from shiftsim.runs.config import DEFAULT_STORE
 from shiftsim.runs.results import Run
 
@@ -101,9 +101,9 @@ def open_edits(name: str, store: ScenarioStore) -> "EditSet":
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
     """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    target = below(folder, BUNDLE)
+    target = safe_join(folder, BUNDLE)
     if not target.exists():
-        partial = below(folder, f".{BUNDLE}.tmp")
+        partial = safe_join(folder, f".{BUNDLE}.tmp")
         shutil.rmtree(partial, ignore_errors=True)
         _copy(store, partial, set(tokens))
         partial.rename(target)

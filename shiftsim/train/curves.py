@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import MissingExtraError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
 
 Say = Callable[[str], None]
@@ -16,7 +16,7 @@ Say = Callable[[str], None]
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write rows as Parquet."""
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         pq.write_table(pa.Table.from_pylist(rows), partial)
 
 

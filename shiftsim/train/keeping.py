@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from shiftsim.errors import CheckpointError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 from shiftsim.train.network import State
 
 
@@ -27,7 +27,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
     """Keep what a training needs to go on."""
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         torch.save(state, partial)
 
 
@@ -36,5 +36,5 @@ def write_network(path: Path, state: State) -> None:
     from safetensors.torch import save_file
 
     tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         save_file(tensors, partial, {"planner": "carl"})

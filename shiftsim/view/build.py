@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError, beginning
-from shiftsim.files import below, write_text
+from shiftsim.files import safe_join, write_text
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.report.words import REASONS
 from shiftsim.runs.results import Run
@@ -197,7 +197,7 @@ def write_site(
     The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
     subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
     """
-    pages = below(folder, "replay")
+    pages = safe_join(folder, "replay")
     pages.mkdir(parents=True, exist_ok=True)
     found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
     found = found[:limit] if limit else found

@@ -16,7 +16,7 @@ import torch
 
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
@@ -114,5 +114,5 @@ def _collected(
 
 def write_weights(path: Path, weights: Weights) -> None:
     """Write weights as `LearnedTraffic` reads them."""
-    with whole_file(path) as partial_file, partial_file.open("wb") as stream:
+    with atomic_write(path) as partial_file, partial_file.open("wb") as stream:
         np.savez(stream, **weights._asdict())

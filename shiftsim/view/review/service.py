@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-import shiftsim
+from shiftsim._version import __version__
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import (
     ACCEPT,
@@ -129,7 +129,7 @@ class ReviewService:
         recorded = self.store.read_recorded(token)
         review = self._reviews.get(token, Review(token))
         review = replace(review, **_checked(values, recorded))
-        review = replace(review, reviewer=self.reviewer, version=shiftsim.__version__)
+        review = replace(review, reviewer=self.reviewer, version=__version__)
         reviews = self._reviews.with_review(review)
         write_reviews(self.store.path, reviews)
         self._reviews = reviews
