@@ -135,7 +135,7 @@ def _announce(plan: "Plan") -> None:
     for name, prepared in plan.runs.items():
         found = len({task.token for task in prepared.tasks})
         say(
-            f"run         {name}: split {prepared.split}, {plural(found, 'scenario')}, "
+            f"run         {name}: split {prepared.selection.split}, {plural(found, 'scenario')}, "
             f"traffic {prepared.config.traffic}, thresholds {prepared.config.thresholds}"
         )
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")

@@ -15,8 +15,8 @@ from shiftsim import cli
 from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
-    from shiftsim.runs.execute import Progress, Watch
-    from shiftsim.runs.prepare import Prepared
+    from shiftsim.runs.execute import OnProgress, Progress
+    from shiftsim.runs.prepare import RunPlan
     from shiftsim.runs.results import Run
     from shiftsim.world.scenario import Scenario
 
@@ -87,7 +87,7 @@ def run_config(
 
 
 @contextmanager
-def interruptible(folder: Path, again: list[str], *, quiet: bool) -> "Iterator[Watch]":
+def interruptible(folder: Path, again: list[str], *, quiet: bool) -> "Iterator[OnProgress]":
     """Yields what shows progress; an interrupt, or a request to end, keeps what is finished.
 
     It then says in which folder that is kept, and the words of the command that goes on with it.
@@ -111,8 +111,8 @@ def interruptible(folder: Path, again: list[str], *, quiet: bool) -> "Iterator[W
 
 @contextmanager
 def watched(
-    runs: "Sequence[Prepared]", folder: Path, live: bool, show: "Watch"
-) -> "Iterator[Watch]":
+    runs: "Sequence[RunPlan]", folder: Path, live: bool, show: "OnProgress"
+) -> "Iterator[OnProgress]":
     """Yields what shows progress, on a page as well where that is wanted, as long as this lasts."""
     if not live:
         yield show
@@ -121,7 +121,7 @@ def watched(
     from shiftsim.view.live import LiveRun, LiveServer
 
     def read(token: str) -> "Scenario":
-        stores = [open_named_store(run.store) for run in runs if token in run.tokens]
+        stores = [open_named_store(run.store) for run in runs if token in run.selection.tokens]
         return stores[0].read(token)
 
     def tell(progress: "Progress") -> None:
@@ -151,14 +151,14 @@ def progress_note(progress: "Progress") -> str:
     return f"{text} · {progress.failed} failed" if progress.failed else text
 
 
-def announce_data(runs: "Sequence[Prepared]", *, as_json: bool) -> None:
+def announce_data(runs: "Sequence[RunPlan]", *, as_json: bool) -> None:
     """Say before anything else that scenarios were made up, where they were."""
-    for made in dict.fromkeys(tuple(run.generator.items()) for run in runs if run.generator):
+    for made in dict.fromkeys(tuple(run.provenance.items()) for run in runs if run.provenance):
         told = ", ".join(str(value) if k == "name" else f"{k} {value}" for k, value in made)
         typer.echo(f"data        generated, not recorded: {told}", err=as_json)
 
 
-def say_dry_run(runs: "Sequence[Prepared]", *, as_json: bool) -> None:
+def say_dry_run(runs: "Sequence[RunPlan]", *, as_json: bool) -> None:
     """What a run would have been."""
     if as_json:
         say_json([{"run": str(run.folder), "tasks": len(run.tasks)} for run in runs])
@@ -166,9 +166,9 @@ def say_dry_run(runs: "Sequence[Prepared]", *, as_json: bool) -> None:
         say("dry run: everything checked, nothing simulated")
 
 
-def _announce(prepared: "Prepared") -> None:
+def _announce(prepared: "RunPlan") -> None:
     """Every setting, defaults included."""
-    config = prepared.config
+    config, scenarios = prepared.config, prepared.selection
     found = len({task.token for task in prepared.tasks})
     missing = len({task.token for task in prepared.missing})
     for name in config.planners:
@@ -179,11 +179,11 @@ def _announce(prepared: "Prepared") -> None:
             say(f"weights     {name}, {weights}")
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
     say(
-        f"split       {prepared.split}  {found} of {plural(found + missing, 'scenario')} found"
+        f"split       {scenarios.split}  {found} of {plural(found + missing, 'scenario')} found"
         f"   store {prepared.store}"
     )
-    if prepared.num_dropped:
-        say(f"filter      {prepared.num_dropped} dropped scenarios left out (--all keeps them)")
+    if scenarios.num_dropped:
+        say(f"filter      {scenarios.num_dropped} dropped scenarios left out (--all keeps them)")
     say(
         f"settings    traffic {config.traffic}   controller {config.controller}"
         f"   thresholds {config.thresholds}"
@@ -191,7 +191,7 @@ def _announce(prepared: "Prepared") -> None:
     if config.metrics:
         say(f"metrics     {' '.join(config.metrics)}")
     is_learned = any(entry.in_batches for entry in prepared.planners.values())
-    if is_learned or prepared.determining["batch_size"] > 1:
+    if is_learned or prepared.fingerprint["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
         say(f"networks    batch size {config.batch_size}{strict}")
     where = f"workers {prepared.workers} x 1 thread"

@@ -5,15 +5,18 @@ their maps, so that the folder alone is enough to score, view and plot it anywhe
 """
 
 import hashlib
+import json
 import shutil
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import ConfigError, DataError, nearest
+from shiftsim.errors import ConfigError, DataError, nearest, one_of
 from shiftsim.files import read_toml, safe_join, store_path
 from shiftsim.runs.config import DEFAULT_STORE
 from shiftsim.runs.results import Run
@@ -208,4 +211,63 @@ def read_split(path: Path) -> Split:
                 f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
                 hint="the file was edited or cut off; fetch or write it again",
             )
+    return split
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
+
+    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
+    and `wanted` values by column, none for any.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        head = f'name = {json.dumps(split.name)}\ncount = {len(tokens)}\nhash = "{split.hash}"'
+        lines = [head, "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
     return split

@@ -12,8 +12,8 @@ from time import monotonic
 from typing import Any
 
 from shiftsim.planners.learned.device import resolve_device
+from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split, open_named_store
-from shiftsim.runs.verdicts import read_verdicts
 from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
 from shiftsim.train.keeping import read_state, write_network, write_state
@@ -53,7 +53,7 @@ class Training:
         self._settings, self._say = settings, say
         self.device = resolve_device(settings.device)
         store = open_named_store(settings.store)
-        verdicts = read_verdicts(store.path, store.hash)
+        verdicts = read_filter_results(store.path, store.hash)
         usable = verdicts.accepted if verdicts else store.tokens
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)

@@ -22,9 +22,9 @@ from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import REASONS
 from shiftsim.runs.execute import Progress
-from shiftsim.runs.results import OK, TaskResult
 from shiftsim.runs.rollouts import complete_rollout
 from shiftsim.runs.rollouts.columns import decode_rows
+from shiftsim.runs.tables import OK, TaskResult
 from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
 from shiftsim.view.page import framed, replay_page
 from shiftsim.view.scene import Shown

@@ -12,8 +12,8 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import prepare
-from shiftsim.runs.results import FAILED, OK, TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.tables import FAILED, OK, TaskResult
 from shiftsim.view.live import LiveRun, LiveServer
 
 

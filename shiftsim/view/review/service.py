@@ -22,7 +22,7 @@ from shiftsim.data.store.review import (
     write_reviews,
 )
 from shiftsim.errors import ConfigError
-from shiftsim.runs.verdicts import read_verdicts
+from shiftsim.runs.filter import read_filter_results
 from shiftsim.sim.log import as_recorded
 from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.scene import (
@@ -55,7 +55,7 @@ class ReviewService:
         """
         self.store = open_store(store)
         self.reviewer = reviewer or _login()
-        found = read_verdicts(self.store.path, self.store.hash)
+        found = read_filter_results(self.store.path, self.store.hash)
         self._verdicts = {row["token"]: row for row in (found.rows if found else ())}
         self._reviews = read_reviews(self.store.path)
 
