@@ -281,3 +281,9 @@ for _kind, _shown in (
     (SimulationLog, _table_of),
 ):
     setattr(_kind, "_repr_html_", _shown)  # noqa: B010
+
+
+def __getattr__(name: str) -> Any:
+    from shiftsim import deprecated_name
+
+    return deprecated_name(__name__, name)

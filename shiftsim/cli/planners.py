@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show, values
+from shiftsim.cli import Debug, Json, new_app, plural, say, say_json, show, stdout_to_stderr, values
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -91,7 +91,7 @@ def check_one_planner(
     others = [row for row in rows if row["token"] != scenario.token]
     # of another map where there is one: a planner that keeps the map of the first shows there
     others.sort(key=lambda row: row["city"] == scenario.city)
-    with output_kept():
+    with stdout_to_stderr():
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
         findings = check_planner(

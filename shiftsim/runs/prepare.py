@@ -353,8 +353,9 @@ def _workers(
         for entry in entries
         if entry.name not in shared
     )
-    memory = {"memory_each": _MEMORY_OF_NETWORK} if any(large) else {}
-    workers = config.workers or default_workers(**memory)
+    workers = config.workers
+    if not workers:
+        workers = default_workers(_MEMORY_OF_NETWORK) if any(large) else default_workers()
     return 1 if stuck else max(1, min(workers, num_batches))
 
 

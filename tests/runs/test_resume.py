@@ -105,14 +105,6 @@ def test_what_a_power_failure_took_is_made_again(stopped, toy, undisturbed, cut)
         assert run.rollout_rows(task)["x_m"] == undisturbed.rollout_rows(task)["x_m"]
 
 
-def test_an_unfinished_run_of_an_earlier_version_is_not_gone_on_with(stopped, toy):
-    (stopped / "unfinished.jsonl").write_text("{}")
-    for resume in (False, True):
-        with pytest.raises(ConfigError, match="of an earlier version") as caught:
-            prepare(settings(toy, stopped, resume=resume, **NOISY))
-        assert "run again" in caught.value.hint
-
-
 def test_halves_of_files_that_a_killed_process_leaves_do_no_harm(stopped, toy, undisturbed):
     for name in (".scores.parquet.tmp", ".manifest.json.tmp", "rollouts/.part-00000.parquet.tmp"):
         (stopped / name).write_bytes(b"half")

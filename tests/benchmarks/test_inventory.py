@@ -18,12 +18,12 @@ def place(tmp_path, monkeypatch):
 
 
 def rows(**wanted):
-    found = stock.take_stock()["rows"]
+    found = stock.list_available_data()["rows"]
     return [row for row in found if all(row[name] == value for name, value in wanted.items())]
 
 
 def test_where_nothing_is_there_every_row_names_what_to_get(place):
-    found = stock.take_stock()
+    found = stock.list_available_data()
     assert found["stores"] == []
     assert len(found["rows"]) == 16
     [row] = rows(track="state-drift", planner="plantf")
@@ -46,7 +46,7 @@ def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
     (store / "splits" / "other.toml").write_text('tokens = ["not-here"]')
     (place / "checkpoints").mkdir()
     (place / "checkpoints" / "planTF.ckpt").touch()
-    [found] = stock.take_stock()["stores"]
+    [found] = stock.list_available_data()["stores"]
     assert [(one["name"], one["scenarios"]) for one in found["sets"]] == [
         ("toy", 4),
         ("toy:half", 1),
@@ -72,7 +72,7 @@ def test_a_damaged_store_is_named_and_the_others_are_listed(place):
     write_toy_store(place / "stores" / "toy")
     broken = write_toy_store(place / "stores" / "broken")
     (broken / "store.json").write_text("{")
-    first, second = stock.take_stock()["stores"]
+    first, second = stock.list_available_data()["stores"]
     assert "store.json" in first["problem"]
     assert (second["name"], second["problem"]) == ("toy", "")
 
